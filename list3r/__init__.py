@@ -1,0 +1,3 @@
+"""Object memory for long videos."""
+
+__version__ = "0.1.0"

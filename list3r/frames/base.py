@@ -1,0 +1,99 @@
+"""What comes in: a frame, what is known of its source, and the protocol every reader keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; pixel (0, 0) is the centre of the upper left pixel."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """OpenCV's (k1, k2, p1, p2, k3), empty for none. Frames handed out by a source are already undistorted."""
+
+    def matrix(self) -> NDArray[np.float64]:
+        """The intrinsic matrix, px. Shape (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def pinhole(self) -> Camera:
+        """The same camera without lens distortion."""
+        return replace(self, distortion=())
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame as every later stage sees it: undistorted colour, depth registered into it, pose where given."""
+
+    index: int
+    """Number in the source, from 0 (before `every` thins it out, so that it names the same picture for ever)."""
+    time_s: float
+    """Seconds of the source's own clock; index / 30 where it has none."""
+    color: NDArray[np.uint8]
+    """RGB. Shape (H, W, 3)."""
+    depth: NDArray[np.float32] | None
+    """Depth along the colour camera's z, metres, 0 where unknown, on the colour image's pixels. Shape (H, W)."""
+    T_source_cam: NDArray[np.float64] | None
+    """Given pose of the colour camera in the source's own world, if the source has one. Shape (4, 4)."""
+
+
+@dataclass(frozen=True)
+class SourceInfo:
+    """What was recognised in a source, and what is missing from it."""
+
+    kind: str
+    """7scenes, tum, replica, images, video."""
+    path: str
+    frame_count: int
+    """Frames that will be handed out, after `every`."""
+    fps: float
+    camera: Camera | None
+    """Pinhole camera of the frames handed out, None where the intrinsics are unknown."""
+    has_depth: bool
+    has_poses: bool
+    scale_kind: str
+    """metric or relative."""
+    fingerprint: str
+    """Changes when the source or the options that shape its frames change; guards `--resume`."""
+    depth_camera: Camera | None = None
+    """The depth sensor's own camera where it is not the colour camera; None when depth comes registered."""
+    T_color_depth: NDArray[np.float64] | None = None
+    """Rigid transform from depth to colour camera, metres. Shape (4, 4). None when depth comes registered."""
+    depth_scale: float | None = None
+    """Stored depth units per metre."""
+    notes: tuple[str, ...] = field(default=())
+    """What was assumed, one sentence each."""
+    missing: tuple[str, ...] = field(default=())
+    """What is missing and which option supplies it, one sentence each."""
+
+
+@dataclass(frozen=True)
+class BadFrame:
+    """A frame that could not be decoded."""
+
+    index: int
+    reason: str
+
+
+class FrameSource(Protocol):
+    """Frames by position. A source can be opened again in another process by `open_source` with the same options."""
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was recognised. Cheap: nothing is decoded beyond a first frame."""
+        ...
+
+    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
+        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
+        ...

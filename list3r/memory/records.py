@@ -1,0 +1,292 @@
+"""The records that cross the borders of the memory. Plain, frozen, and nothing in them knows of SQLite."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import OrientedBox, Sim3
+
+# ---------------------------------------------------------------------------------------------- one chunk
+
+
+@dataclass(frozen=True)
+class Support:
+    """Surface points of an instance."""
+
+    points: NDArray[np.float32]
+    """Chunk coordinates (or world, where said). Shape (N, 3)."""
+    confidence: NDArray[np.float32]
+    """In [0, 1]. Shape (N,)."""
+    rgb: NDArray[np.uint8]
+    """Colour. Shape (N, 3)."""
+
+
+@dataclass(frozen=True)
+class MaskTrack:
+    """Where a local instance is seen, V frames."""
+
+    frames: NDArray[np.int64]
+    """Frame.index of the visible frames, ascending (the paper's V). Shape (V,)."""
+    boxes_xyxy: NDArray[np.float32]
+    """Bounding boxes, px. Shape (V, 4)."""
+    centers_xy: NDArray[np.float32]
+    """Centroids of the masks, px (the paper's P). Shape (V, 2)."""
+    areas_px: NDArray[np.int32]
+    """Mask areas. Shape (V,)."""
+    visible_fraction: NDArray[np.float32]
+    """Share of the instance's support inside the frame that nothing hides, in [0, 1]. Shape (V,)."""
+    masks: tuple[NDArray[np.uint32], ...]
+    """Run-length codes at the colour image's size (the paper's M), see `memory.masks`; one for each frame."""
+    image_size: tuple[int, int]
+    """(height, width) of the masks, px."""
+
+
+@dataclass(frozen=True)
+class LocalInstance:
+    """One thing followed through one chunk (paper 3.1: a, M, V, P, z, and its geometric evidence)."""
+
+    local_id: int
+    """Unique within the chunk, from 0."""
+    track: MaskTrack
+    feature: NDArray[np.float32]
+    """Unit-length mean of the candidates' features (the paper's z). Shape (D,)."""
+    support: Support
+    """Chunk coordinates."""
+    stability: float
+    """Mean agreement of the propagated masks with the images, in [0, 1]."""
+    plane: NDArray[np.float64] | None = None
+    """Plane (n, d), n . p + d = 0 in chunk coordinates, n towards the cameras, if it is flat. Shape (4,)."""
+    structure: bool = False
+    """True for a large flat surface that bounds the room rather than standing in it, as far as the chunk can tell."""
+
+
+@dataclass(frozen=True)
+class LocalLibrary:
+    """The local instance library of one chunk."""
+
+    instances: tuple[LocalInstance, ...]
+    cannot_link: NDArray[np.int32]
+    """Pairs of local ids seen side by side in one frame with disjoint masks: two things, not one. Shape (P, 2)."""
+    feature_space: str
+    """Name of the embedding space of the features, `model@revision/dim`."""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """What a chunk remembers of one frame so that a later one can be placed against it."""
+
+    frame_index: int
+    T_chunk_cam: NDArray[np.float64]
+    """Pose of the colour camera. Shape (4, 4)."""
+    descriptor: NDArray[np.float32]
+    """Unit-length descriptor of the whole frame. Shape (D,)."""
+    keypoints_xy: NDArray[np.float32]
+    """Local features, px. Shape (N, 2)."""
+    keypoint_descriptors: NDArray[np.uint8]
+    """Their descriptors. Shape (N, B)."""
+    points_cam: NDArray[np.float32]
+    """The features in camera coordinates, chunk units, NaN where depth is unknown. Shape (N, 3)."""
+    depth_small: NDArray[np.float32]
+    """Depth along z for dense checks, chunk units, 0 where unknown. Shape (h, w)."""
+    camera_small: tuple[float, float, float, float]
+    """fx, fy, cx, cy of `depth_small`, px."""
+    jpeg: bytes = b""
+    """The colour image, empty where keyframe pictures are not kept."""
+
+
+@dataclass(frozen=True)
+class OverlapSamples:
+    """Points of the frames that a chunk may share with the next or the previous one, on one fixed pixel grid."""
+
+    frame: NDArray[np.int64]
+    """Frame.index of each sample. Shape (S,)."""
+    pixel: NDArray[np.int32]
+    """Row-major number of the sample's pixel in the colour image. Shape (S,)."""
+    points: NDArray[np.float32]
+    """Chunk coordinates. Shape (S, 3)."""
+    confidence: NDArray[np.float32]
+    """In [0, 1]. Shape (S,)."""
+
+
+@dataclass(frozen=True)
+class ChunkResult:
+    """All that one chunk hands to association and the store."""
+
+    index: int
+    """Number of the chunk in its session, from 0."""
+    frame_indices: NDArray[np.int64]
+    """Frame.index of each decoded frame. Shape (F,)."""
+    times_s: NDArray[np.float64]
+    """Seconds. Shape (F,)."""
+    posed: NDArray[np.bool_]
+    """Shape (F,)."""
+    T_chunk_cam: NDArray[np.float64]
+    """Shape (F, 4, 4)."""
+    T_source_cam: NDArray[np.float64] | None
+    """Given poses of the source, NaN where a frame has none. Shape (F, 4, 4)."""
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy, px."""
+    image_size: tuple[int, int]
+    """(height, width), px."""
+    scale_kind: str
+    keyframes: tuple[Keyframe, ...]
+    overlap: OverlapSamples
+    library: LocalLibrary
+    bad_frames: tuple[tuple[int, str], ...] = ()
+    """(Frame.index, reason) of frames that could not be decoded."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """CPU seconds by stage."""
+
+
+# ---------------------------------------------------------------------------------------------- the memory
+
+
+@dataclass(frozen=True)
+class Session:
+    """One video that was added to the memory."""
+
+    session_id: int
+    source: str
+    fingerprint: str
+    settings: dict[str, object]
+    frame_count: int
+    state: str
+    """building, complete."""
+
+
+@dataclass(frozen=True)
+class ChunkRow:
+    """One chunk as the memory keeps it."""
+
+    chunk_id: int
+    session_id: int
+    index: int
+    first_frame: int
+    last_frame: int
+    component: int
+    """Chunks of one component share one frame of reference; the smallest chunk id names it."""
+    S_world_chunk: Sim3
+    intrinsics: tuple[float, float, float, float]
+    image_size: tuple[int, int]
+    scale_kind: str
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A measured relation of two chunks."""
+
+    u: int
+    """Chunk id."""
+    v: int
+    """Chunk id."""
+    kind: str
+    """adjacent or loop."""
+    S_v_u: Sim3
+    confidence: float
+    """m_uv of the paper (A.4), in [0, 1]."""
+    weight: float
+    """Weight in the graph, in [0, 1], the strongest edge 1."""
+    inliers: int
+    residual_m: float
+    """RMS of the inliers' residuals, chunk units."""
+    accepted: bool
+    reason: str
+    """Why it was accepted or rejected, one sentence."""
+    scores: dict[str, float] = field(default_factory=dict)
+    frames: tuple[int, int] | None = None
+    """Frame.index in u and in v of the pair that proposed a loop."""
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One frame of the trajectory."""
+
+    session_id: int
+    frame_index: int
+    time_s: float
+    chunk_id: int
+    """The chunk whose geometry places it."""
+    state: str
+    """posed, lost (could not be followed), bad (could not be decoded)."""
+    T_chunk_cam: NDArray[np.float64]
+    """Shape (4, 4), NaN unless posed."""
+
+
+@dataclass(frozen=True)
+class BestView:
+    """The frame in which an instance is seen best."""
+
+    session_id: int
+    frame_index: int
+    box_xyxy: tuple[float, float, float, float]
+    """px."""
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One physical thing of the world (paper 3.3)."""
+
+    id: int
+    label: str | None
+    description: str
+    """Words from colour, size and shape: "small white cylinder, 9 cm"."""
+    center: NDArray[np.float64]
+    """Centre of the box, world. Shape (3,)."""
+    aabb: NDArray[np.float64]
+    """Lower and upper corner, world. Shape (2, 3)."""
+    box: OrientedBox
+    """Upright where gravity is known."""
+    confidence: float
+    """In [0, 1]: grows with the number of frames and chunks that agree."""
+    observations: int
+    """Frames in which it is seen."""
+    first_seen_s: float
+    last_seen_s: float
+    state: str
+    """present, moved, removed, added, unseen."""
+    structure: str | None
+    """floor, ceiling, wall or plane for what bounds the room, else None."""
+    color_rgb: tuple[int, int, int]
+    """Median colour."""
+    color_name: str
+    component: int
+    """The frame of reference it lives in, see `ChunkRow`."""
+    best_view: BestView | None
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One local instance that belongs to a global one."""
+
+    instance_id: int
+    chunk_id: int
+    local_id: int
+
+
+@dataclass(frozen=True)
+class Relation:
+    """subject predicate object, with how sure and how near to the decision it is."""
+
+    subject: int
+    predicate: str
+    object: int
+    confidence: float
+    """In [0, 1]."""
+    margin: float
+    """Distance to the decision boundary, world units."""
+
+
+@dataclass(frozen=True)
+class MergeDecision:
+    """One entry of the log: why two things became one, or did not."""
+
+    kind: str
+    """merge, refuse, alias, split."""
+    a: str
+    """What was joined: `chunk_id:local_id` for a local instance, `#id` for a global one."""
+    b: str
+    scores: dict[str, float]
+    reason: str

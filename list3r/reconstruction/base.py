@@ -1,0 +1,58 @@
+"""The border of every reconstruction model: frames in, poses and depth with confidence out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Geometry of one chunk, in the chunk's own frame and units."""
+
+    frame_indices: NDArray[np.int64]
+    """Frame.index of each frame. Shape (F,)."""
+    posed: NDArray[np.bool_]
+    """False where the camera could not be followed; such a frame's pose means nothing. Shape (F,)."""
+    T_chunk_cam: NDArray[np.float64]
+    """Pose of the colour camera in the chunk. Shape (F, 4, 4)."""
+    camera: Camera
+    """Pinhole camera shared by the frames, px."""
+    depth: NDArray[np.float32]
+    """Depth along the camera's z, chunk units, 0 where unknown. Shape (F, H, W)."""
+    confidence: NDArray[np.float16]
+    """In [0, 1]; 0 where depth is unknown. Shape (F, H, W)."""
+    scale_kind: str
+    """metric or relative."""
+    keyframes: NDArray[np.int64]
+    """Positions (into F) of the keyframes, ascending. Shape (K,)."""
+
+    def __post_init__(self) -> None:
+        count = len(self.frame_indices)
+        assert self.posed.shape == (count,)
+        assert self.T_chunk_cam.shape == (count, 4, 4)
+        assert self.depth.shape == self.confidence.shape == (count, self.camera.height, self.camera.width)
+
+
+class Reconstructor(Protocol):
+    """A reconstruction model."""
+
+    def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
+        """Reconstruct a chunk, or a joint window of frames from two places.
+
+        Raises `TrackingError` when no two frames can be related.
+        """
+        ...
+
+
+def backproject(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """Points of a depth image in camera coordinates, the depth's units. Shape (H, W) -> (H, W, 3)."""
+    x = (np.arange(camera.width, dtype=np.float32) - camera.cx) / camera.fx
+    y = (np.arange(camera.height, dtype=np.float32) - camera.cy) / camera.fy
+    return np.stack([depth * x[None, :], depth * y[:, None], depth], axis=-1)
