@@ -1,0 +1,84 @@
+"""One image file to one array, or a `FrameError` that says what is wrong with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.errors import FrameError
+
+_TAIL = 8192
+_ENDINGS = ((b"\xff\xd8", b"\xff\xd9"), (b"\x89PNG", b"IEND"))
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """An RGB image, turned upright by its EXIF tag. Shape (H, W, 3). Raises `FrameError`."""
+    image = _decode(path, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+def read_raw_depth(path: Path) -> NDArray[np.generic]:
+    """Depth as stored, any number type. Shape (H, W). Raises `FrameError`."""
+    if path.suffix.lower() == ".npy":
+        raw = _load_npy(path)
+    else:
+        raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.ndim == 3 and raw.shape[2] == 1:
+        raw = raw[..., 0]
+    if raw.ndim != 2:
+        raise FrameError(f"{path.name} has {raw.shape[-1]} channels; depth has one")
+    return raw
+
+
+def clean_depth(raw: NDArray[np.generic], scale: float, max_depth_m: float | None) -> NDArray[np.float32]:
+    """Depth in metres, 0 where unknown.
+
+    Unknown is 0, the largest value of an unsigned integer type, NaN, infinite, negative, and beyond `max_depth_m`.
+    `raw` has shape (H, W), in `scale` units per metre.
+    """
+    depth = np.multiply(raw, np.float32(1.0 / scale), dtype=np.float32, casting="unsafe")
+    far = np.inf if max_depth_m is None else max_depth_m
+    if raw.dtype.kind == "u" and raw.dtype.itemsize <= 2:
+        far = min(far, float(np.iinfo(raw.dtype).max - 0.5) / scale)
+        depth[depth > far] = 0.0
+        return depth
+    with np.errstate(invalid="ignore"):
+        depth[~((depth > 0.0) & (depth <= far) & (depth < np.inf))] = 0.0
+    return depth
+
+
+def _decode(path: Path, flags: int) -> NDArray[np.generic]:
+    """Decode a file with OpenCV, and refuse one whose end is missing, which OpenCV would fill with grey."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise FrameError(f"{path.name} is missing") from None
+    except OSError as error:
+        raise FrameError(f"{path.name} cannot be read ({error.strerror})") from None
+    if not data:
+        raise FrameError(f"{path.name} is empty")
+    for head, end in _ENDINGS:
+        if data.startswith(head) and end not in data[-_TAIL:]:
+            raise FrameError(f"{path.name} is cut off")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FrameError(f"{path.name} cannot be decoded")
+    return np.asarray(image)
+
+
+def _load_npy(path: Path) -> NDArray[np.generic]:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise FrameError(f"{path.name} is missing") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise FrameError(f"{path.name} cannot be read ({error})") from None
+    if array.dtype.kind not in "uif":
+        raise FrameError(f"{path.name} holds {array.dtype}, not depth")
+    return np.asarray(array)

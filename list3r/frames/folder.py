@@ -1,0 +1,149 @@
+"""Frames from the files of a recognised folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.decode import read_color, read_raw_depth
+from list3r.frames.layout import FrameFile, Layout, pose_matrix, read_numbers
+from list3r.frames.options import SourceOptions
+from list3r.frames.rig import build_rig, merge_optics
+from list3r.memory.errors import FrameError, OptionError, SourceError
+
+DEFAULT_FPS = 30.0
+_PROBES = 9
+
+
+class FolderSource:
+    """A `FrameSource` over files; nothing is kept between frames."""
+
+    def __init__(self, root: Path, layout: Layout, options: SourceOptions) -> None:
+        """Raises `SourceError` and `OptionError` where the first images and the cameras do not fit together."""
+        self._layout, self._options = layout, options
+        self._numbers = selected_frames(len(layout.files), options, root)
+        self._fps = options.fps or _rate(layout.files) or DEFAULT_FPS
+        optics, notes = merge_optics(layout, options)
+        self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files[:_PROBES])
+        sizes = self._probe(root)
+        self._rig = build_rig(optics, *sizes, options.max_depth_m)
+        self._T_depth_color = np.eye(4)
+        if layout.poses_of == "depth" and optics.T_color_depth is not None:
+            self._T_depth_color = np.linalg.inv(optics.T_color_depth)
+        self._info = self._describe(root, notes)
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was recognised."""
+        return self._info
+
+    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
+        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
+        for number in self._numbers[start:stop]:
+            try:
+                yield self._frame(number)
+            except FrameError as error:
+                yield BadFrame(number, str(error))
+
+    def _frame(self, number: int) -> Frame:
+        file = self._layout.files[number]
+        color = self._rig.color(read_color(file.color))
+        depth = None
+        if self._has_depth:
+            if file.depth is None:
+                raise FrameError(f"{file.color.name} has no depth image")
+            depth = self._rig.depth(read_raw_depth(file.depth))
+        time_s = number / self._fps if file.time_s is None or self._options.fps else file.time_s
+        return Frame(number, time_s, color, depth, self._pose(file))
+
+    def _pose(self, file: FrameFile) -> NDArray[np.float64] | None:
+        """The colour camera's pose, None where the file has none or an invalid one."""
+        T_source_given = file.T_source_camera
+        if file.pose is not None:
+            try:
+                T_source_given = pose_matrix(v for row in read_numbers(file.pose) for v in row)
+            except SourceError:
+                return None
+        return None if T_source_given is None else T_source_given @ self._T_depth_color
+
+    def _probe(self, root: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
+        """Image sizes of the first frame that decodes, among the first and some spread over the source."""
+        spread = np.linspace(0, len(self._numbers) - 1, _PROBES).astype(int).tolist()
+        tried = dict.fromkeys([*range(min(3, len(self._numbers))), *spread])
+        reason = ""
+        for position in tried:
+            file = self._layout.files[self._numbers[position]]
+            try:
+                color = read_color(file.color)
+                if not self._has_depth:
+                    return color.shape[:2], None
+                if file.depth is not None:
+                    return color.shape[:2], read_raw_depth(file.depth).shape
+            except FrameError as error:
+                reason = reason or str(error)
+        raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
+
+    def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
+        layout, rig = self._layout, self._rig
+        missing = list(layout.missing)
+        if rig.camera is None:
+            missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
+        has_poses = any(f.pose is not None or f.T_source_camera is not None for f in layout.files)
+        separate = rig.registration
+        return SourceInfo(
+            kind=layout.kind,
+            path=str(root),
+            frame_count=len(self._numbers),
+            fps=self._fps,
+            camera=rig.camera,
+            has_depth=self._has_depth,
+            has_poses=has_poses,
+            scale_kind="metric" if self._has_depth else "relative",
+            fingerprint=fingerprint(layout.kind, _listing(layout.files, root), self._options),
+            depth_camera=separate.depth_camera if separate else None,
+            T_color_depth=separate.T_color_depth if separate else None,
+            depth_scale=rig.depth_scale if self._has_depth else None,
+            notes=(*layout.notes, *notes),
+            missing=tuple(missing),
+        )
+
+
+def selected_frames(count: int, options: SourceOptions, root: Path) -> range:
+    """Frame numbers that the options leave of `count`. Raises `OptionError` when none is left."""
+    chosen = range(count)[options.start : options.stop : options.every]
+    if not chosen:
+        raise OptionError(f"frames {options.start}:{options.stop} leave nothing of {root}, which has {count} frames")
+    return chosen
+
+
+def fingerprint(kind: str, listing: list[tuple[str, int]], options: SourceOptions) -> str:
+    """Hash of the files' names and sizes and of every option that shapes frames. 32 hexadecimal digits."""
+    said = replace(options, kind="auto")
+    text = repr((kind, listing, sorted(asdict(said).items())))
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:
+    paths = [p for f in files for p in (f.color, f.depth, f.pose) if p is not None]
+    out = []
+    for path in paths:
+        try:
+            out.append(
+                (path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, path.stat().st_size)
+            )
+        except OSError:
+            out.append((path.name, -1))
+    return out
+
+
+def _rate(files: tuple[FrameFile, ...]) -> float | None:
+    """Median frame rate of a source with a clock, None without."""
+    times = np.array([f.time_s for f in files if f.time_s is not None])
+    gaps = np.diff(times)
+    return float(1.0 / np.median(gaps)) if len(times) == len(files) > 1 and np.median(gaps) > 0 else None

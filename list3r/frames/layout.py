@@ -1,0 +1,128 @@
+"""What a reader of a folder finds, before any image is decoded."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
+from list3r.memory.errors import OptionError, SourceError
+
+IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """The files of one frame."""
+
+    color: Path
+    depth: Path | None = None
+    pose: Path | None = None
+    """A text file with a 4x4 pose."""
+    T_source_camera: NDArray[np.float64] | None = None
+    """A pose that was read with the listing, of the camera that `Layout.poses_of` names. Shape (4, 4)."""
+    time_s: float | None = None
+    """Seconds of the source's clock, if it has one."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Cameras of a source as far as they are known."""
+
+    intrinsics: Intrinsics | None = None
+    """Colour camera, px."""
+    distortion: tuple[float, ...] = ()
+    """Colour camera, OpenCV."""
+    depth_intrinsics: Intrinsics | None = None
+    """Depth camera, px; None where depth lies on the colour pixels."""
+    T_color_depth: NDArray[np.float64] | None = None
+    """Depth to colour camera, metres; None where depth lies on the colour pixels. Shape (4, 4)."""
+    depth_scale: float | None = None
+    """Stored units per metre."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A folder that was recognised."""
+
+    kind: str
+    files: tuple[FrameFile, ...]
+    optics: Optics
+    poses_of: str = "color"
+    """The camera whose poses are given: color or depth."""
+    registered_intrinsics: Intrinsics | None = None
+    """Colour camera to use when the user says that depth is registered after all, px."""
+    notes: tuple[str, ...] = field(default=())
+    missing: tuple[str, ...] = field(default=())
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key under which `frame2` comes before `frame10`."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.lower()) if part]
+
+
+def read_numbers(path: Path) -> list[list[float]]:
+    """Rows of numbers of a text file; `#` starts a comment. Raises `SourceError` naming file and line."""
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            raise SourceError(f"{path}: line {number} is not numbers; mend or remove it") from None
+    return rows
+
+
+def read_text(path: Path) -> str:
+    """The text of a file. Raises `SourceError`."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
+
+
+def pose_matrix(values: Iterable[float]) -> NDArray[np.float64] | None:
+    """A 4x4 rigid pose of 12 or 16 numbers row by row, None when they are no rigid motion (NaN, zeros)."""
+    v = np.array(list(values), dtype=np.float64)
+    if len(v) not in (12, 16) or not np.isfinite(v).all():
+        return None
+    matrix = np.eye(4)
+    matrix[:3] = v.reshape(-1, 4)[:3]
+    u, scales, vt = np.linalg.svd(matrix[:3, :3])
+    if np.abs(scales - 1.0).max() > 0.05 or np.linalg.det(matrix[:3, :3]) < 0:
+        return None
+    matrix[:3, :3] = u @ vt
+    return matrix
+
+
+def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
+    """Intrinsics and distortion from `calibration.txt`, one line `fx fy cx cy [k1 k2 p1 p2 k3]`, if it is there.
+
+    Raises `SourceError` when it is there and says something else.
+    """
+    path = root / "calibration.txt"
+    if not path.is_file():
+        return None
+    values = [v for row in read_numbers(path) for v in row]
+    if not 4 <= len(values) <= 9:
+        raise SourceError(f"{path} has {len(values)} numbers; one line fx fy cx cy [k1 k2 p1 p2 k3] is needed")
+    try:
+        return check_intrinsics(values[:4]), check_distortion(values[4:]) if values[4:] else ()
+    except OptionError as error:
+        raise SourceError(f"{path}: {error}") from None
+
+
+def read_json(path: Path) -> object:
+    """Parsed JSON. Raises `SourceError`."""
+    try:
+        return json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise SourceError(f"{path} is not JSON (line {error.lineno}); mend or remove it") from None

@@ -1,0 +1,178 @@
+"""What a user may say about a source, and how the words of the command line become numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from list3r.memory.errors import OptionError
+
+KINDS = ("auto", "7scenes", "tum", "replica", "images", "video")
+
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy, px."""
+Rows = tuple[tuple[float, ...], ...]
+"""A 4x4 matrix as nested tuples, so that options can be compared and hashed."""
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """All that can be said about a source; what is left out is found in the source or known for its layout."""
+
+    kind: str = "auto"
+    """auto, 7scenes, tum, replica, images, video."""
+    every: int = 1
+    """Hand out every n-th frame."""
+    start: int | None = None
+    """First frame number handed out, counted in the source from 0, before `every`."""
+    stop: int | None = None
+    """Frame number to stop before."""
+    intrinsics: Intrinsics | None = None
+    """fx, fy, cx, cy of the colour camera, px."""
+    distortion: tuple[float, ...] | None = None
+    """k1, k2, p1, p2, k3 of the colour camera (OpenCV); trailing zeros may be left out."""
+    depth_intrinsics: Intrinsics | None = None
+    """fx, fy, cx, cy of the depth camera, px, where it is not the colour camera."""
+    T_color_depth: Rows | None = None
+    """Rigid transform from the depth to the colour camera, metres. Shape (4, 4)."""
+    registered: bool = False
+    """Depth already lies on the colour image's pixels, whatever the layout usually means."""
+    depth_scale: float | None = None
+    """Stored depth units per metre."""
+    fps: float | None = None
+    """Frames per second of a source without a clock."""
+    max_depth_m: float | None = None
+    """Depth beyond this counts as unknown, metres."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise OptionError(f"source kind {self.kind!r} is unknown; choose one of {', '.join(KINDS)}")
+        if self.every < 1:
+            raise OptionError(f"every {self.every}: take every n-th frame with n of at least 1")
+        if (self.start or 0) < 0 or (self.stop is not None and self.stop <= (self.start or 0)):
+            raise OptionError(f"frames {self.start} to {self.stop}: start must be 0 or more and stop greater than it")
+        for name in ("depth_scale", "fps", "max_depth_m"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise OptionError(f"{name.replace('_', ' ')} {value}: a positive number is needed")
+        for name in ("intrinsics", "depth_intrinsics"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, check_intrinsics(getattr(self, name), name.replace("_", " ")))
+        if self.distortion is not None:
+            object.__setattr__(self, "distortion", check_distortion(self.distortion))
+        if self.T_color_depth is not None:
+            rows = check_rigid(np.asarray(self.T_color_depth, dtype=np.float64), "depth to color")
+            object.__setattr__(self, "T_color_depth", tuple(tuple(float(v) for v in row) for row in rows))
+        if self.registered and (self.depth_intrinsics or self.T_color_depth):
+            raise OptionError(
+                "depth that is registered has no camera of its own: leave out its intrinsics and transform"
+            )
+
+
+def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intrinsics:
+    """Four finite numbers with positive focal lengths, px. Raises `OptionError`."""
+    if len(values) != 4 or not all(math.isfinite(v) for v in values) or values[0] <= 0 or values[1] <= 0:
+        raise OptionError(
+            f"{name} {_show(values)}: four numbers fx,fy,cx,cy in pixels are needed, like 525,525,320,240"
+        )
+    return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))
+
+
+def check_distortion(values: Sequence[float]) -> tuple[float, ...]:
+    """OpenCV's k1, k2, p1, p2, k3, filled up with zeros; empty when all are zero. Raises `OptionError`."""
+    if not 1 <= len(values) <= 5 or not all(math.isfinite(v) for v in values):
+        raise OptionError(f"distortion {_show(values)}: one to five numbers k1,k2,p1,p2,k3 are needed")
+    full = tuple(float(v) for v in values) + (0.0,) * (5 - len(values))
+    return full if any(full) else ()
+
+
+def check_rigid(matrix: NDArray[np.float64], name: str = "transform") -> NDArray[np.float64]:
+    """A rigid 4x4 matrix with its rotation made exact. Raises `OptionError` for anything else."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise OptionError(f"{name}: a 4x4 rigid matrix with last row 0,0,0,1 is needed")
+    u, scales, vt = np.linalg.svd(matrix[:3, :3])
+    if np.abs(scales - 1.0).max() > 0.01 or np.linalg.det(matrix[:3, :3]) < 0:
+        raise OptionError(f"{name}: the upper left 3x3 block is not a rotation")
+    out = matrix.copy()
+    out[:3, :3] = u @ vt
+    return out
+
+
+def parse_numbers(text: str, name: str) -> list[float]:
+    """Numbers parted by commas, semicolons or white space. Raises `OptionError` naming the word that is none."""
+    words = text.replace(",", " ").replace(";", " ").split()
+    out = []
+    for word in words:
+        try:
+            out.append(float(word))
+        except ValueError:
+            raise OptionError(f"{name} {text!r}: {word!r} is not a number") from None
+    return out
+
+
+def parse_intrinsics(text: str, name: str = "intrinsics") -> Intrinsics:
+    """`fx,fy,cx,cy` in px. Raises `OptionError`."""
+    return check_intrinsics(parse_numbers(text, name), name)
+
+
+def parse_distortion(text: str) -> tuple[float, ...]:
+    """`k1,k2,p1,p2,k3`, trailing zeros may be left out. Raises `OptionError`."""
+    return check_distortion(parse_numbers(text, "distortion"))
+
+
+def parse_transform(text: str, name: str = "depth to color", quaternion: Literal["xyzw", "wxyz"] = "xyzw") -> Rows:
+    """A rigid transform from text, or from a text file that is named.
+
+    16 numbers are a 4x4 matrix row by row, 12 its upper three rows, 7 are `tx,ty,tz` in metres and a quaternion in
+    the order that `quaternion` says, 3 a translation. Raises `OptionError`.
+    """
+    words = _file_text(text) or text
+    v = np.array(parse_numbers(words, name))
+    matrix = np.eye(4)
+    if len(v) in (12, 16):
+        matrix[: len(v) // 4] = v.reshape(-1, 4)
+    elif len(v) in (3, 7):
+        matrix[:3, 3] = v[:3]
+        if len(v) == 7:
+            xyzw = v[3:] if quaternion == "xyzw" else np.roll(v[3:], -1)
+            if not abs(np.linalg.norm(xyzw) - 1.0) < 0.01:
+                raise OptionError(f"{name} {text!r}: the last four numbers must be a unit quaternion {quaternion}")
+            matrix[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
+    else:
+        order = ",".join("q" + letter for letter in quaternion)
+        raise OptionError(f"{name} {text!r}: 16 numbers (4x4) or tx,ty,tz,{order} are needed, not {len(v)}")
+    return tuple(tuple(float(x) for x in row) for row in check_rigid(matrix, name))
+
+
+def parse_range(text: str) -> tuple[int | None, int | None]:
+    """`start:stop` frame numbers, either may be left out. Raises `OptionError`."""
+    first, colon, last = text.partition(":")
+    try:
+        start, stop = int(first) if first.strip() else None, int(last) if last.strip() else None
+    except ValueError:
+        start, colon, stop = None, "", None
+    if not colon or (start or 0) < 0 or (stop is not None and stop <= (start or 0)):
+        raise OptionError(f"frames {text!r}: start:stop with start below stop is needed, like 100:400")
+    return start, stop
+
+
+def _file_text(text: str) -> str | None:
+    """The contents of the file that `text` names, None if it names none."""
+    if any(sign in text for sign in ",;\n") or not text.strip():
+        return None
+    try:
+        path = Path(text)
+        return path.read_text(encoding="utf-8") if path.is_file() else None
+    except (OSError, ValueError):
+        return None
+
+
+def _show(values: Sequence[float]) -> str:
+    return ",".join(f"{v:g}" for v in values)

@@ -1,0 +1,172 @@
+"""Depth of one camera onto the pixels of another: forward projection with a z-buffer, and no invented surfaces."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+
+_FAR = np.iinfo(np.int64).max
+# Two neighbouring depth pixels lie on one surface when their depths differ by less than this share of the depth for
+# every radian between them (a slant of 80 degrees), or by less than the sensor's own noise, quadratic in depth.
+_SLANT = math.tan(math.radians(80.0))
+_NOISE_PER_M = 0.006
+
+
+class Registration:
+    """Moves depth images of one camera onto the pixels of another, with everything that does not change tabulated."""
+
+    def __init__(self, depth_camera: Camera, color_camera: Camera, T_color_depth: NDArray[np.float64]) -> None:
+        """`color_camera` is taken as a pinhole; `T_color_depth` is rigid, metres, shape (4, 4)."""
+        ratio = max(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy)
+        self.depth_camera, self.color_camera, self.T_color_depth = depth_camera, color_camera, T_color_depth
+        self.factor = max(1, math.ceil(ratio - 0.15))
+        """Samples for each depth pixel and axis, so that neighbours land at most about one colour pixel apart."""
+        self._source = _finer(depth_camera, self.factor)
+        self._jump = _SLANT / min(self._source.fx, self._source.fy)
+        rotation, translation = T_color_depth[:3, :3], T_color_depth[:3, 3]
+        x = (np.arange(self._source.width) - self._source.cx) / self._source.fx
+        y = (np.arange(self._source.height) - self._source.cy) / self._source.fy
+        rays = np.stack([np.broadcast_to(x, (len(y), len(x))), np.broadcast_to(y[:, None], (len(y), len(x)))], axis=-1)
+        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1).reshape(-1, 3)
+        projection = color_camera.matrix() @ rotation
+        slope = (rays @ projection.T).astype(np.float32)
+        # u = (slope_u z + shift_u) / (slope_w z + shift_w); half a pixel is added so that truncation rounds.
+        self._shift = (color_camera.matrix() @ translation).astype(np.float32)
+        self._slope = np.ascontiguousarray(slope.T)
+        self._straight = bool(np.allclose(slope[:, 2], 1.0, atol=1e-7)) and abs(float(self._shift[2])) < 1e-9
+
+    def __call__(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth along the colour camera's z on its pixels, metres, 0 where unknown.
+
+        `depth` is the depth camera's, metres, 0 where unknown, shape (H, W) of the depth camera.
+        """
+        fine = _refine(depth, self.factor, self._jump) if self.factor > 1 else depth
+        height, width = self.color_camera.height, self.color_camera.width
+        source, target, z = self._project(fine.ravel())
+        # The bits of a positive float order as the float does, so one minimum finds the nearest depth and its pixel.
+        key = (z.view(np.int32).astype(np.int64) << 32) | source
+        nearest = np.full(height * width, _FAR, dtype=np.int64)
+        np.minimum.at(nearest, target, key)
+        hit = nearest != _FAR
+        out = np.where(hit, (nearest >> 32).astype(np.int32).view(np.float32), np.float32(0.0)).reshape(height, width)
+        origin = np.where(hit, nearest & 0xFFFFFFFF, -1).astype(np.int32).reshape(height, width)
+        return self._close_gaps(out, origin, fine)
+
+    def _project(self, z: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+        """Source pixels that land in the colour image, where they land, and their depth there."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            if self._straight:
+                inverse, out = 1.0 / z, z
+                u = self._slope[0] + self._shift[0] * inverse
+                v = self._slope[1] + self._shift[1] * inverse
+            else:
+                out = self._slope[2] * z + self._shift[2]
+                inverse = 1.0 / out
+                u = (self._slope[0] * z + self._shift[0]) * inverse
+                v = (self._slope[1] * z + self._shift[1]) * inverse
+        u += np.float32(0.5)
+        v += np.float32(0.5)
+        camera = self.color_camera
+        inside = (z > 0) & (out > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        source = np.flatnonzero(inside)
+        target = v[source].astype(np.int32) * camera.width + u[source].astype(np.int32)
+        return source, target, out[source]
+
+    def _close_gaps(
+        self, out: NDArray[np.float32], origin: NDArray[np.int32], fine: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Fill pixels that rounding missed, and those where a far surface shows through such a gap in a near one.
+
+        A pixel is filled from two opposite neighbours when the depth pixels these came from are themselves close
+        neighbours on one surface, with depth known between them. A true hole or an edge is left as it is.
+        """
+        height, width = out.shape
+        flat_out, flat_origin, flat_fine = out.ravel(), origin.ravel(), fine.ravel()
+        filled = out.copy()
+        flat_filled = filled.ravel()
+        for step, view in ((1, np.s_[:, 1:-1]), (width, np.s_[1:-1, :])):
+            before = np.roll(flat_out, step).reshape(height, width)[view]
+            after = np.roll(flat_out, -step).reshape(height, width)[view]
+            here = out[view]
+            limit = np.maximum(before, after) * np.float32(1.0 + 2.0 * self._jump)
+            candidate = np.zeros((height, width), dtype=bool)
+            candidate[view] = (before > 0) & (after > 0) & ((here == 0) | (here > limit))
+            at = np.flatnonzero(candidate.ravel())
+            at = at[self._one_surface(flat_origin[at - step], flat_origin[at + step], flat_fine)]
+            value = 0.5 * (flat_out[at - step] + flat_out[at + step])
+            still = (flat_filled[at] == 0) | (flat_filled[at] > value)
+            flat_filled[at[still]] = value[still]
+        return filled
+
+    def _one_surface(self, a: NDArray[np.int32], b: NDArray[np.int32], fine: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Whether pixels a and b of the depth image are at most three apart on one surface. Shape (N,)."""
+        width = self._source.width
+        (ay, ax), (by, bx) = np.divmod(a, width), np.divmod(b, width)
+        near = (np.abs(ay - by) <= 3) & (np.abs(ax - bx) <= 3)
+        middle = ((ay + by) // 2) * width + (ax + bx) // 2
+        za, zb, zm = fine[a], fine[b], fine[middle]
+        allowed = 3.0 * self._jump * zm + _NOISE_PER_M * zm * zm
+        return np.asarray(near & (zm > 0) & (np.abs(za - zm) <= allowed) & (np.abs(zb - zm) <= allowed))
+
+
+def _finer(camera: Camera, factor: int) -> Camera:
+    """The camera of an image with `factor` samples for each pixel and axis, sharing the first pixel's centre."""
+    return Camera(
+        (camera.width - 1) * factor + 1,
+        (camera.height - 1) * factor + 1,
+        camera.fx * factor,
+        camera.fy * factor,
+        camera.cx * factor,
+        camera.cy * factor,
+    )
+
+
+def _refine(depth: NDArray[np.float32], factor: int, jump: float) -> NDArray[np.float32]:
+    """Depth with samples between neighbours of one surface, none between others. Shape (H, W) -> finer."""
+    for axis in (0, 1):
+        depth = _refine_axis(depth, factor, jump * factor, axis)
+    return depth
+
+
+def _refine_axis(depth: NDArray[np.float32], factor: int, jump: float, axis: int) -> NDArray[np.float32]:
+    lines = np.moveaxis(depth, axis, 0)
+    a, b = lines[:-1], lines[1:]
+    smooth = (a > 0) & (b > 0) & (np.abs(a - b) <= jump * np.minimum(a, b) + _NOISE_PER_M * a * b)
+    out = np.zeros(((len(lines) - 1) * factor + 1, *lines.shape[1:]), dtype=np.float32)
+    out[::factor] = lines
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse_a, inverse_b = 1.0 / a, 1.0 / b
+    for k in range(1, factor):
+        w = k / factor
+        with np.errstate(invalid="ignore"):
+            between = 1.0 / ((1 - w) * inverse_a + w * inverse_b)
+        out[k::factor] = np.where(smooth, between, 0.0)
+    return np.ascontiguousarray(np.moveaxis(out, 0, axis))
+
+
+class Undistortion:
+    """Takes images of a lens to those of the pinhole camera with the same focal length and centre."""
+
+    def __init__(self, camera: Camera) -> None:
+        size = (camera.width, camera.height)
+        coefficients = np.array(camera.distortion, dtype=np.float64)
+        matrix = camera.matrix()
+        self._maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_16SC2)
+        self.seen = self._remap(np.ones(size[::-1], np.uint8), cv2.INTER_NEAREST) > 0
+        """False where the pinhole image looks beyond the lens's picture. Shape (H, W)."""
+
+    def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Bilinear, black beyond the picture. Shape (H, W, 3)."""
+        return self._remap(image, cv2.INTER_LINEAR)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Nearest pixel, for depth that lies on the lens's picture. Shape (H, W)."""
+        return self._remap(depth, cv2.INTER_NEAREST)
+
+    def _remap(self, image: NDArray, method: int) -> NDArray:  # type: ignore[type-arg]
+        return np.asarray(cv2.remap(image, self._maps[0], self._maps[1], method, borderMode=cv2.BORDER_CONSTANT))

@@ -1,0 +1,74 @@
+"""The 7-Scenes layout: `frame-NNNNNN.color.*`, `.depth.png`, `.pose.txt`.
+
+The Kinect of 7-Scenes delivers colour and depth unregistered. Its `camera-intrinsics.txt` (585, 585, 320, 240) and
+its poses belong to the depth camera (Shotton et al., "Scene coordinate regression forests", 2013).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from list3r.frames.layout import FrameFile, Layout, Optics, natural_key, read_numbers
+from list3r.frames.options import Intrinsics, SourceOptions
+from list3r.memory.errors import SourceError
+
+_COLOR = re.compile(r"^frame-(\d+)\.color\.(png|jpg|jpeg)$", re.IGNORECASE)
+KINECT_DEPTH: Intrinsics = (585.0, 585.0, 320.0, 240.0)
+KINECT_COLOR: Intrinsics = (524.0, 524.0, 320.0, 240.0)
+KINECT_DISTORTION = (-0.025, 0.0, 0.0, 0.0, 0.0)
+KINECT_T_COLOR_DEPTH = np.array(
+    [[1.0, 0.0, 0.0, -0.023], [0.0, 1.0, 0.0, -0.008], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+def find(root: Path, options: SourceOptions) -> Layout | None:
+    """The layout, or None when the folder has another. Raises `SourceError` for several sequences in one folder."""
+    folder = _sequence_folder(root)
+    if folder is None:
+        return None
+    names = sorted((p.name for p in folder.iterdir() if _COLOR.match(p.name)), key=natural_key)
+    present = {p.name for p in folder.iterdir()}
+    files = tuple(_files(folder, name, present) for name in names)
+    intrinsics, note = _file_intrinsics(folder, root)
+    if _is_kinect(intrinsics):
+        optics = Optics(KINECT_COLOR, KINECT_DISTORTION, intrinsics, KINECT_T_COLOR_DEPTH, 1000.0)
+        known = "depth and colour are not registered in 7-Scenes: the known constants of its Kinect are used"
+        return Layout("7scenes", files, optics, "depth", intrinsics, (note, known))
+    other = (
+        "the intrinsics are not those of the 7-Scenes Kinect, so depth is taken as registered into the colour image; "
+        "give --depth-intrinsics and --depth-to-color if it is not"
+    )
+    return Layout("7scenes", files, Optics(intrinsics, depth_scale=1000.0), "color", intrinsics, (note, other))
+
+
+def _is_kinect(intrinsics: Intrinsics) -> bool:
+    return max(abs(a - b) for a, b in zip(intrinsics, KINECT_DEPTH, strict=True)) <= 1.0
+
+
+def _sequence_folder(root: Path) -> Path | None:
+    if any(_COLOR.match(p.name) for p in root.iterdir()):
+        return root
+    inside = sorted(p for p in root.glob("seq-*") if p.is_dir() and any(_COLOR.match(q.name) for q in p.iterdir()))
+    if len(inside) > 1:
+        raise SourceError(f"{root} holds {len(inside)} sequences; name one of them, like {inside[0]}")
+    return inside[0] if inside else None
+
+
+def _files(folder: Path, name: str, present: set[str]) -> FrameFile:
+    stem = name.split(".", 1)[0]
+    depth = next((f for f in (f"{stem}.depth.png", f"{stem}.depth.npy") if f in present), f"{stem}.depth.png")
+    pose = f"{stem}.pose.txt"
+    return FrameFile(folder / name, folder / depth, folder / pose if pose in present else None)
+
+
+def _file_intrinsics(folder: Path, root: Path) -> tuple[Intrinsics, str]:
+    for path in (folder / "camera-intrinsics.txt", root / "camera-intrinsics.txt"):
+        if path.is_file():
+            rows = read_numbers(path)
+            if len(rows) < 2 or len(rows[0]) < 3 or len(rows[1]) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
+                raise SourceError(f"{path} is not a 3x3 camera matrix; mend or remove it")
+            return (rows[0][0], rows[1][1], rows[0][2], rows[1][2]), f"intrinsics of {path.name}"
+    return KINECT_DEPTH, "no camera-intrinsics.txt: the depth camera of 7-Scenes (585, 585, 320, 240) is assumed"
