@@ -1,0 +1,423 @@
+"""Sessions, chunks, frames, edges, keyframes and local instances: what is measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.codec import (
+    checksum,
+    dequantise,
+    pack,
+    pack_sim3,
+    quantise,
+    raw_array,
+    to_json,
+    unpack,
+    unpack_sim3,
+)
+from list3r.memory.connection import Connection
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import (
+    ChunkResult,
+    ChunkRow,
+    Edge,
+    FrameRow,
+    Keyframe,
+    LocalInstance,
+    MaskTrack,
+    OverlapSamples,
+    Session,
+    Support,
+)
+
+
+@dataclass(frozen=True)
+class LocalNode:
+    """A local instance without its masks: what merging looks at."""
+
+    chunk_id: int
+    local_id: int
+    session_id: int
+    stability: float
+    structure: bool
+    plane: NDArray[np.float64] | None
+    """Chunk coordinates. Shape (4,)."""
+    feature: NDArray[np.float32]
+    """Shape (D,)."""
+    support: Support
+    """Chunk coordinates."""
+    frames: NDArray[np.int64]
+    """Frame.index of the visible frames. Shape (V,)."""
+    boxes_xyxy: NDArray[np.float32]
+    """Shape (V, 4)."""
+    areas_px: NDArray[np.int32]
+    """Shape (V,)."""
+    visible_fraction: NDArray[np.float32]
+    """Shape (V,)."""
+
+
+class ChunkVerbs(Connection):
+    """Writing and reading what the chunks measured. Writing verbs are called inside `transaction()`."""
+
+    # ------------------------------------------------------------------ sessions
+
+    def add_session(self, source: str, fingerprint: str, settings: Mapping[str, object], frame_count: int) -> int:
+        """A new session in the state `building`; its id."""
+        cursor = self._database.execute(
+            "INSERT INTO sessions (source, fingerprint, settings, frame_count, state) VALUES (?, ?, ?, ?, 'building')",
+            (source, fingerprint, to_json(settings), frame_count),
+        )
+        return int(cursor.lastrowid or 0)
+
+    def complete_session(self, session_id: int) -> None:
+        """Mark a session as wholly built."""
+        self._database.execute("UPDATE sessions SET state = 'complete' WHERE session_id = ?", (session_id,))
+
+    def sessions(self) -> list[Session]:
+        """All sessions in order."""
+        query = "SELECT session_id, source, fingerprint, settings, frame_count, state FROM sessions ORDER BY session_id"
+        return [Session(r[0], r[1], r[2], json.loads(r[3]), r[4], r[5]) for r in self._rows(query)]
+
+    # ------------------------------------------------------------------ chunks
+
+    def add_chunk(self, session_id: int, result: ChunkResult) -> int:
+        """Store one chunk as its own component with the identity as `S_world_chunk`; its id.
+
+        Of the frames that it shares with the chunk before, the second half comes to be placed by the new chunk.
+        """
+        overlap = pack(
+            {
+                "frame": result.overlap.frame,
+                "pixel": result.overlap.pixel,
+                "points": result.overlap.points,
+                "confidence": result.overlap.confidence,
+            }
+        )
+        links = result.library.cannot_link.astype("<i4").tobytes()
+        cursor = self._database.execute(
+            "INSERT INTO chunks (session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy,"
+            " cx, cy, height, width, scale_kind, feature_space, cannot_link, overlap, seconds, crc)"
+            " VALUES (?, ?, ?, ?, 0, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                session_id,
+                result.index,
+                int(result.frame_indices[0]),
+                int(result.frame_indices[-1]),
+                pack_sim3(Sim3.identity()),
+                *result.intrinsics,
+                *result.image_size,
+                result.scale_kind,
+                result.library.feature_space,
+                links,
+                overlap,
+                to_json(result.seconds),
+                checksum(links, overlap),
+            ),
+        )
+        chunk_id = int(cursor.lastrowid or 0)
+        self._database.execute("UPDATE chunks SET component = chunk_id WHERE chunk_id = ?", (chunk_id,))
+        self._add_frames(session_id, chunk_id, result)
+        self._database.executemany(
+            "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)",
+            [_keyframe_row(chunk_id, keyframe) for keyframe in result.keyframes],
+        )
+        for instance in result.library.instances:
+            self._add_local_instance(chunk_id, instance)
+        return chunk_id
+
+    def _add_frames(self, session_id: int, chunk_id: int, result: ChunkResult) -> None:
+        known = {
+            r[0]: r[1]
+            for r in self._rows(
+                "SELECT frame_index, state FROM frames WHERE session_id = ? AND frame_index >= ?",
+                (session_id, int(min(result.frame_indices[0], *[b[0] for b in result.bad_frames], 2**62))),
+            )
+        }
+        shared = [int(i) for i in result.frame_indices if int(i) in known]
+        switch = shared[len(shared) // 2] if shared else -1
+        rows = []
+        for k, index in enumerate(int(i) for i in result.frame_indices):
+            posed = bool(result.posed[k])
+            if index in known and not (posed and (index >= switch or known[index] != "posed")):
+                continue
+            pose = result.T_chunk_cam[k] if posed else np.full((4, 4), np.nan)
+            state = "posed" if posed else "lost"
+            rows.append((session_id, index, float(result.times_s[k]), chunk_id, state, _f8(pose), ""))
+        for index, reason in result.bad_frames:
+            if index not in known:
+                rows.append((session_id, index, float("nan"), chunk_id, "bad", _f8(np.full((4, 4), np.nan)), reason))
+        self._database.executemany(
+            "INSERT OR REPLACE INTO frames VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [(*r[:2], 0.0 if np.isnan(r[2]) else r[2], *r[3:]) for r in rows],
+        )
+
+    def _add_local_instance(self, chunk_id: int, instance: LocalInstance) -> None:
+        track = pack(_track_arrays(instance.track))
+        feature = instance.feature.astype("<f4").tobytes()
+        plane = None if instance.plane is None else _f8(instance.plane)
+        self._database.execute(
+            "INSERT INTO local_instances VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                chunk_id,
+                instance.local_id,
+                float(instance.stability),
+                int(instance.structure),
+                plane,
+                feature,
+                track,
+                checksum(feature, track),
+            ),
+        )
+        grid, points = quantise(instance.support.points)
+        confidence = np.round(np.clip(instance.support.confidence, 0, 1) * 255).astype(np.uint8).tobytes()
+        rgb = instance.support.rgb.astype(np.uint8).tobytes()
+        self._database.execute(
+            "INSERT INTO supports VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                chunk_id,
+                instance.local_id,
+                len(instance.support.points),
+                grid,
+                points,
+                confidence,
+                rgb,
+                checksum(grid, points, confidence, rgb),
+            ),
+        )
+
+    def chunks(self, session_id: int | None = None) -> list[ChunkRow]:
+        """The chunks in order, of one session or of all."""
+        where, arguments = ("", ()) if session_id is None else ("WHERE session_id = ?", (session_id,))
+        query = (
+            "SELECT chunk_id, session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy, cx,"
+            f" cy, height, width, scale_kind FROM chunks {where} ORDER BY chunk_id"
+        )
+        return [
+            ChunkRow(*r[:6], unpack_sim3(r[6]), (r[7], r[8], r[9], r[10]), (r[11], r[12]), r[13])
+            for r in self._rows(query, arguments)
+        ]
+
+    def place_chunks(self, poses: Mapping[int, Sim3], components: Mapping[int, int]) -> None:
+        """Rewrite `S_world_chunk` and the component of chunks: all that a loop closure moves."""
+        self._database.executemany(
+            "UPDATE chunks SET S_world_chunk = ?, component = ? WHERE chunk_id = ?",
+            [(pack_sim3(S_world_chunk), components[k], k) for k, S_world_chunk in poses.items()],
+        )
+
+    def overlap_samples(self, chunk_id: int) -> OverlapSamples:
+        """The points that a chunk shares with its neighbours, chunk coordinates."""
+        blob = self._rows("SELECT overlap FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0]
+        return OverlapSamples(**unpack(blob, f"the overlap of chunk {chunk_id}"))
+
+    def cannot_links(self, chunk_id: int) -> NDArray[np.int32]:
+        """Pairs of local ids of a chunk that are two things. Shape (P, 2)."""
+        blob = self._rows("SELECT cannot_link FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0]
+        return np.frombuffer(blob, "<i4").reshape(-1, 2).astype(np.int32)
+
+    def feature_space(self, chunk_id: int) -> str:
+        """The embedding space of a chunk's local features."""
+        return str(self._rows("SELECT feature_space FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0])
+
+    def stage_seconds(self) -> dict[str, float]:
+        """CPU seconds spent so far by stage, over all chunks."""
+        total: dict[str, float] = {}
+        for (text,) in self._rows("SELECT seconds FROM chunks ORDER BY chunk_id"):
+            for stage, seconds in json.loads(text).items():
+                total[stage] = total.get(stage, 0.0) + seconds
+        return total
+
+    # ------------------------------------------------------------------ edges
+
+    def add_edges(self, edges: Iterable[Edge]) -> None:
+        """Store measured relations of chunks; one measured again replaces the old one."""
+        self._database.executemany(
+            "INSERT OR REPLACE INTO edges VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [
+                (
+                    e.u,
+                    e.v,
+                    e.kind,
+                    *(e.frames or (-1, -1)),
+                    pack_sim3(e.S_v_u),
+                    e.confidence,
+                    e.weight,
+                    e.inliers,
+                    e.residual_m,
+                    int(e.accepted),
+                    e.reason,
+                    to_json(e.scores),
+                )
+                for e in edges
+            ],
+        )
+
+    def edges(self) -> list[Edge]:
+        """All measured relations of chunks, accepted or not."""
+        query = (
+            "SELECT u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u,"
+            " frame_v FROM edges ORDER BY u, v, kind, frame_u, frame_v"
+        )
+        return [
+            Edge(
+                *r[:3],
+                unpack_sim3(r[3]),
+                *r[4:8],
+                accepted=bool(r[8]),
+                reason=r[9],
+                scores=json.loads(r[10]),
+                frames=None if r[11] < 0 else (r[11], r[12]),
+            )
+            for r in self._rows(query)
+        ]
+
+    # ------------------------------------------------------------------ frames and keyframes
+
+    def frames(self, session_id: int | None = None) -> list[FrameRow]:
+        """The trajectory: every frame seen, in order, poses in their chunks."""
+        where, arguments = ("", ()) if session_id is None else ("WHERE session_id = ?", (session_id,))
+        query = (
+            "SELECT session_id, frame_index, time_s, chunk_id, state, T_chunk_cam FROM frames"
+            f" {where} ORDER BY session_id, frame_index"
+        )
+        return [
+            FrameRow(*r[:5], raw_array(r[5], "<f8", (4, 4), f"the pose of frame {r[1]}"))
+            for r in self._rows(query, arguments)
+        ]
+
+    def bad_frames(self) -> list[tuple[int, int, str]]:
+        """(session id, Frame.index, reason) of the frames that could not be decoded."""
+        query = "SELECT session_id, frame_index, note FROM frames WHERE state = 'bad' ORDER BY session_id, frame_index"
+        return [(r[0], r[1], r[2]) for r in self._rows(query)]
+
+    def camera_poses(self, session_id: int | None = None) -> list[tuple[FrameRow, Sim3]]:
+        """Every posed frame with its `S_world_cam`; the scale is the chunk's."""
+        chunks = {c.chunk_id: c.S_world_chunk for c in self.chunks()}
+        return [
+            (f, chunks[f.chunk_id] @ Sim3.from_matrix(f.T_chunk_cam))
+            for f in self.frames(session_id)
+            if f.state == "posed"
+        ]
+
+    def keyframes(self, chunk_id: int) -> list[Keyframe]:
+        """The keyframes of a chunk in order."""
+        query = "SELECT frame_index, descriptor, features, jpeg FROM keyframes WHERE chunk_id = ? ORDER BY frame_index"
+        return [_keyframe(chunk_id, *row) for row in self._rows(query, (chunk_id,))]
+
+    def keyframe(self, chunk_id: int, frame_index: int) -> Keyframe:
+        """One keyframe. Raises `MemoryFileError` when the memory has none there."""
+        query = "SELECT frame_index, descriptor, features, jpeg FROM keyframes WHERE chunk_id = ? AND frame_index = ?"
+        rows = self._rows(query, (chunk_id, frame_index))
+        if not rows:
+            raise MemoryFileError(f"{self.path} has no keyframe {frame_index} in chunk {chunk_id}")
+        return _keyframe(chunk_id, *rows[0])
+
+    def keyframe_descriptors(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """All keyframes: (chunk id, Frame.index) of shape (K, 2) and descriptors of shape (K, D)."""
+        rows = self._rows("SELECT chunk_id, frame_index, descriptor FROM keyframes ORDER BY chunk_id, frame_index")
+        keys = np.array([(r[0], r[1]) for r in rows], dtype=np.int64).reshape(-1, 2)
+        return keys, np.array([np.frombuffer(r[2], "<f4") for r in rows], dtype=np.float32)
+
+    # ------------------------------------------------------------------ local instances
+
+    def local_nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]:
+        """Local instances without masks, of some chunks or of all, in the order of (chunk, local id)."""
+        where = "" if chunk_ids is None else f"WHERE l.chunk_id IN ({','.join('?' * len(chunk_ids))})"
+        query = (
+            "SELECT l.chunk_id, l.local_id, c.session_id, l.stability, l.structure, l.plane, l.feature, l.track,"
+            " s.count, s.grid, s.points, s.confidence, s.rgb FROM local_instances l JOIN chunks c USING (chunk_id)"
+            f" JOIN supports s USING (chunk_id, local_id) {where} ORDER BY l.chunk_id, l.local_id"
+        )
+        return [_local_node(row) for row in self._rows(query, tuple(chunk_ids or ()))]
+
+    def mask_track(self, chunk_id: int, local_id: int) -> MaskTrack:
+        """The masks of one local instance. Raises `MemoryFileError` when it is not there."""
+        rows = self._rows("SELECT track FROM local_instances WHERE chunk_id = ? AND local_id = ?", (chunk_id, local_id))
+        if not rows:
+            raise MemoryFileError(f"{self.path} has no local instance {local_id} in chunk {chunk_id}")
+        return _track(unpack(rows[0][0], f"the masks of local instance {chunk_id}:{local_id}"))
+
+
+def _f8(values: NDArray[np.float64]) -> bytes:
+    return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def _keyframe_row(chunk_id: int, keyframe: Keyframe) -> tuple[object, ...]:
+    descriptor = keyframe.descriptor.astype("<f4").tobytes()
+    features = pack(
+        {
+            "T_chunk_cam": keyframe.T_chunk_cam,
+            "keypoints_xy": keyframe.keypoints_xy.astype(np.float32),
+            "keypoint_descriptors": keyframe.keypoint_descriptors,
+            "points_cam": keyframe.points_cam.astype(np.float32),
+            "depth_small": keyframe.depth_small.astype(np.float32),
+            "camera_small": np.asarray(keyframe.camera_small, dtype=np.float64),
+        }
+    )
+    crc = checksum(descriptor, features, keyframe.jpeg)
+    return chunk_id, keyframe.frame_index, descriptor, features, keyframe.jpeg, crc
+
+
+def _keyframe(chunk_id: int, frame_index: int, descriptor: bytes, features: bytes, jpeg: bytes) -> Keyframe:
+    arrays: dict[str, Any] = unpack(features, f"keyframe {frame_index} of chunk {chunk_id}")
+    fx, fy, cx, cy = (float(x) for x in arrays.pop("camera_small"))
+    return Keyframe(
+        frame_index=frame_index,
+        descriptor=np.frombuffer(descriptor, "<f4").astype(np.float32),
+        camera_small=(fx, fy, cx, cy),
+        jpeg=jpeg,
+        **arrays,
+    )
+
+
+def _track_arrays(track: MaskTrack) -> dict[str, NDArray[Any]]:
+    lengths = np.array([len(m) for m in track.masks], dtype=np.int32)
+    runs = np.concatenate(track.masks) if track.masks else np.zeros(0, np.uint32)
+    return {
+        "frames": track.frames,
+        "boxes_xyxy": track.boxes_xyxy.astype(np.float32),
+        "centers_xy": track.centers_xy.astype(np.float32),
+        "areas_px": track.areas_px.astype(np.int32),
+        "visible_fraction": track.visible_fraction.astype(np.float32),
+        "image_size": np.asarray(track.image_size, dtype=np.int32),
+        "lengths": lengths,
+        "runs": runs.astype(np.uint32),
+    }
+
+
+def _track(arrays: dict[str, NDArray[Any]]) -> MaskTrack:
+    masks = tuple(np.split(arrays["runs"], np.cumsum(arrays["lengths"])[:-1])) if len(arrays["lengths"]) else ()
+    height, width = (int(n) for n in arrays["image_size"])
+    kept = {k: v for k, v in arrays.items() if k not in ("runs", "lengths", "image_size")}
+    return MaskTrack(**kept, masks=masks, image_size=(height, width))
+
+
+def _local_node(row: tuple[Any, ...]) -> LocalNode:
+    chunk_id, local_id, session_id, stability, structure, plane, feature, track, count, grid, points, weight, rgb = row
+    where = f"local instance {chunk_id}:{local_id}"
+    arrays = unpack(track, where)
+    support = Support(
+        dequantise(grid, points, count, where),
+        raw_array(weight, "u1", (count,), where).astype(np.float32) / 255.0,
+        raw_array(rgb, "u1", (count, 3), where).copy(),
+    )
+    return LocalNode(
+        chunk_id=chunk_id,
+        local_id=local_id,
+        session_id=session_id,
+        stability=stability,
+        structure=bool(structure),
+        plane=None if plane is None else raw_array(plane, "<f8", (4,), where).copy(),
+        feature=np.frombuffer(feature, "<f4").astype(np.float32),
+        support=support,
+        frames=arrays["frames"],
+        boxes_xyxy=arrays["boxes_xyxy"],
+        areas_px=arrays["areas_px"],
+        visible_fraction=arrays["visible_fraction"],
+    )

@@ -1,0 +1,87 @@
+"""Arrays to bytes and back. Nothing here can execute what it reads, and a lying header cannot take all memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.geometry import Sim3
+
+MAX_BLOB_BYTES = 256 * 2**20
+"""No array of one row is larger than this; a blob that claims more is damaged or hostile."""
+
+
+def checksum(*blobs: bytes) -> int:
+    """CRC-32 over blobs in order."""
+    value = 0
+    for blob in blobs:
+        value = zlib.crc32(blob, value)
+    return value
+
+
+def pack(arrays: Mapping[str, ArrayLike]) -> bytes:
+    """Named arrays as a compressed `.npz`; the same arrays give the same bytes."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+    return buffer.getvalue()
+
+
+def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """Named arrays of `pack`. `where` names the row in the `MemoryFileError` raised for damaged bytes."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(blob)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BLOB_BYTES:
+                raise MemoryFileError(f"{where} claims more than {MAX_BLOB_BYTES >> 20} MiB; the file is damaged")
+        with np.load(io.BytesIO(blob), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, MemoryError, zlib.error) as error:
+        raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error
+
+
+def pack_sim3(transform: Sim3) -> bytes:
+    """Scale, rotation row by row, translation: 13 little-endian doubles, exact."""
+    parts = [np.ravel(transform.scale), np.ravel(transform.rotation), np.ravel(transform.translation)]
+    return np.concatenate(parts).astype("<f8").tobytes()
+
+
+def unpack_sim3(blob: bytes) -> Sim3:
+    """The inverse of `pack_sim3`."""
+    values = raw_array(blob, "<f8", (13,), "transform")
+    return Sim3(values[0].reshape(()), values[1:10].reshape(3, 3).copy(), values[10:].copy())
+
+
+def raw_array(blob: bytes, dtype: str, shape: tuple[int, ...], where: str) -> NDArray[Any]:
+    """A raw little-endian blob as an array. Raises `MemoryFileError` when its length does not fit dtype and shape."""
+    expected = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    if len(blob) != expected:
+        raise MemoryFileError(f"{where} holds {len(blob)} bytes instead of {expected}; run `list3r verify` on the file")
+    return np.frombuffer(blob, dtype=dtype).reshape(shape)
+
+
+def quantise(points: NDArray[np.float32]) -> tuple[bytes, bytes]:
+    """Points as 16-bit steps over their own extent: (origin and step as 4 doubles, steps). Shape (N, 3)."""
+    p = points.astype(np.float64)
+    low = p.min(axis=0) if len(p) else np.zeros(3)
+    step = float((p - low).max() / 65535.0) if len(p) else 0.0
+    steps = np.round((p - low) / step) if step > 0 else np.zeros_like(p)
+    return np.append(low, step).astype("<f8").tobytes(), steps.astype("<u2").tobytes()
+
+
+def dequantise(grid: bytes, steps: bytes, count: int, where: str) -> NDArray[np.float32]:
+    """The inverse of `quantise`, exact to half a step (extent / 131,070). Shape (N, 3)."""
+    frame = raw_array(grid, "<f8", (4,), where)
+    values = raw_array(steps, "<u2", (count, 3), where)
+    return np.asarray(frame[:3] + values * frame[3], dtype=np.float32)
+
+
+def to_json(value: object) -> str:
+    """Compact JSON with sorted keys."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))

@@ -1,0 +1,253 @@
+"""Global instances, their observations, embeddings, relations, aliases and the merge log: what is concluded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from list3r.memory.chunk_verbs import ChunkVerbs
+from list3r.memory.codec import dequantise, raw_array, to_json
+from list3r.memory.errors import UnknownIdError
+from list3r.memory.geometry import OrientedBox
+from list3r.memory.records import BestView, Instance, MergeDecision, Observation, Relation, Support
+
+_COLUMNS = (
+    "id, label, description, geometry, confidence, observations, first_seen_s, last_seen_s, state, structure,"
+    " color_rgb, color_name, component, view_session, view_frame, view_box"
+)
+
+
+class InstanceVerbs(ChunkVerbs):
+    """Reading and writing the library. Writing verbs are called inside `transaction()`."""
+
+    # ------------------------------------------------------------------ instances
+
+    def instances(self, *, structure: bool | None = None) -> list[Instance]:
+        """All instances by id; only structure or only things where asked."""
+        where = {None: "", True: "WHERE structure IS NOT NULL", False: "WHERE structure IS NULL"}[structure]
+        return [_instance(row) for row in self._rows(f"SELECT {_COLUMNS} FROM instances {where} ORDER BY id")]
+
+    def instance(self, instance_id: int) -> Instance:
+        """One instance; an alias gives the instance it was merged into. Raises `UnknownIdError`."""
+        resolved = self.resolve(instance_id)
+        return _instance(self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id = ?", (resolved,))[0])
+
+    def resolve(self, instance_id: int) -> int:
+        """The id that stands for an id today. Raises `UnknownIdError` for an id the memory has never held."""
+        seen = set()
+        current = int(instance_id)
+        while current not in seen:
+            seen.add(current)
+            if self._rows("SELECT 1 FROM instances WHERE id = ?", (current,)):
+                return current
+            target = self._rows("SELECT instance FROM aliases WHERE id = ?", (current,))
+            if not target:
+                break
+            current = int(target[0][0])
+        raise UnknownIdError(f"{self.path} has no instance {instance_id}; `list3r list {self.path}` shows the ids")
+
+    def put_instances(self, instances: Iterable[Instance]) -> None:
+        """Write instances, new or changed, with their boxes in the R*Tree."""
+        rows = list(instances)
+        marks = ",".join("?" * 16)
+        self._database.executemany(
+            f"INSERT OR REPLACE INTO instances ({_COLUMNS}) VALUES ({marks})", [_instance_row(i) for i in rows]
+        )
+        self._database.executemany(
+            "INSERT OR REPLACE INTO instance_boxes VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [(i.id, *(float(x) for x in i.aabb.T.ravel())) for i in rows],
+        )
+
+    def drop_instance(self, instance_id: int, alias_of: int | None) -> None:
+        """Take an instance out; its id lives on as an alias of another, or resolves no more."""
+        for table, column in (("instances", "id"), ("instance_boxes", "id"), ("embeddings", "instance")):
+            self._database.execute(f"DELETE FROM {table} WHERE {column} = ?", (instance_id,))
+        self._database.execute("DELETE FROM relations WHERE subject = ? OR object = ?", (instance_id, instance_id))
+        if alias_of is not None:
+            self._database.execute("INSERT OR REPLACE INTO aliases VALUES (?, ?)", (instance_id, alias_of))
+
+    def next_id(self) -> int:
+        """The smallest id that was never used; ids are not used again."""
+        query = "SELECT max((SELECT coalesce(max(id), 0) FROM instances), (SELECT coalesce(max(id), 0) FROM aliases))"
+        return max(int(self._rows(query)[0][0]), int(self.get_value("last_id", 0))) + 1
+
+    def aliases(self) -> dict[int, int]:
+        """Every retired id and the id it was merged into."""
+        return {r[0]: r[1] for r in self._rows("SELECT id, instance FROM aliases ORDER BY id")}
+
+    def ids_in_box(self, lower: ArrayLike, upper: ArrayLike) -> list[int]:
+        """Ids whose axis-aligned boxes meet the box, from the R*Tree. World coordinates, shape (3,) each."""
+        low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+        query = (
+            "SELECT id FROM instance_boxes WHERE max_x >= ? AND min_x <= ? AND max_y >= ? AND min_y <= ?"
+            " AND max_z >= ? AND min_z <= ? ORDER BY id"
+        )
+        arguments = tuple(float(x) for pair in zip(low, high, strict=True) for x in pair)
+        return [r[0] for r in self._rows(query, arguments)]
+
+    # ------------------------------------------------------------------ observations and supports
+
+    def set_observations(self, observations: Iterable[Observation]) -> None:
+        """Say which instance each local instance belongs to."""
+        self._database.executemany(
+            "INSERT OR REPLACE INTO observations VALUES (?, ?, ?)",
+            [(o.chunk_id, o.local_id, o.instance_id) for o in observations],
+        )
+
+    def observations(self, instance_id: int | None = None) -> list[Observation]:
+        """Which local instances make up an instance, or all of them."""
+        where, arguments = ("", ()) if instance_id is None else ("WHERE instance = ?", (self.resolve(instance_id),))
+        query = f"SELECT instance, chunk_id, local_id FROM observations {where} ORDER BY chunk_id, local_id"
+        return [Observation(*r) for r in self._rows(query, arguments)]
+
+    def support(self, instance_id: int) -> Support:
+        """All surface points of an instance, in the world as it is placed now."""
+        chunks = {c.chunk_id: c.S_world_chunk for c in self.chunks()}
+        parts = self._support_parts(self.resolve(instance_id))
+        return Support(
+            np.concatenate([chunks[k].apply(s.points) for k, s in parts]).astype(np.float32)
+            if parts
+            else np.zeros((0, 3), np.float32),
+            np.concatenate([s.confidence for _, s in parts]) if parts else np.zeros(0, np.float32),
+            np.concatenate([s.rgb for _, s in parts]) if parts else np.zeros((0, 3), np.uint8),
+        )
+
+    def _support_parts(self, instance_id: int) -> list[tuple[int, Support]]:
+        query = (
+            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb FROM observations o"
+            " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
+        )
+        parts = []
+        for chunk_id, local_id, count, grid, points, weight, rgb in self._rows(query, (instance_id,)):
+            where = f"the support of local instance {chunk_id}:{local_id}"
+            support = Support(
+                dequantise(grid, points, count, where),
+                raw_array(weight, "u1", (count,), where).astype(np.float32) / 255.0,
+                raw_array(rgb, "u1", (count, 3), where).copy(),
+            )
+            parts.append((chunk_id, support))
+        return parts
+
+    # ------------------------------------------------------------------ embeddings
+
+    def put_embeddings(self, space: str, ids: Sequence[int], vectors: NDArray[np.float32]) -> None:
+        """Set the vectors of instances in a named space. `vectors` has shape (N, D)."""
+        self._database.executemany(
+            "INSERT OR REPLACE INTO embeddings VALUES (?, ?, ?)",
+            [(int(i), space, v.astype("<f4").tobytes()) for i, v in zip(ids, vectors, strict=True)],
+        )
+
+    def embeddings(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Ids of shape (N,) and vectors of shape (N, D) of a named space."""
+        rows = self._rows("SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance", (space,))
+        ids = np.array([r[0] for r in rows], dtype=np.int64)
+        return ids, np.array([np.frombuffer(r[1], "<f4") for r in rows], dtype=np.float32)
+
+    def embedding_spaces(self) -> list[str]:
+        """The named spaces that hold vectors."""
+        return [r[0] for r in self._rows("SELECT DISTINCT space FROM embeddings ORDER BY space")]
+
+    # ------------------------------------------------------------------ relations
+
+    def replace_relations(self, subjects: Iterable[int] | None, relations: Iterable[Relation]) -> None:
+        """Replace all relations that touch these instances (all relations when `subjects` is None)."""
+        if subjects is None:
+            self._database.execute("DELETE FROM relations")
+        else:
+            ids = [(int(i),) for i in subjects]
+            self._database.executemany("DELETE FROM relations WHERE subject = ?", ids)
+            self._database.executemany("DELETE FROM relations WHERE object = ?", ids)
+        self._database.executemany(
+            "INSERT OR REPLACE INTO relations VALUES (?, ?, ?, ?, ?)",
+            [(r.subject, r.predicate, r.object, float(r.confidence), float(r.margin)) for r in relations],
+        )
+
+    def relations(
+        self, subject: int | None = None, predicate: str | None = None, object: int | None = None
+    ) -> list[Relation]:
+        """Relations that match what is given; ids may be aliases."""
+        clauses: list[str] = []
+        arguments: list[int | str] = []
+        for column, value in (("subject", subject), ("object", object)):
+            if value is not None:
+                clauses.append(f"{column} = ?")
+                arguments.append(self.resolve(value))
+        if predicate is not None:
+            clauses.append("predicate = ?")
+            arguments.append(predicate)
+        where = f"WHERE {' AND '.join(clauses)}" if clauses else ""
+        query = (
+            f"SELECT subject, predicate, object, confidence, margin FROM relations {where}"
+            " ORDER BY subject, predicate, object"
+        )
+        return [Relation(*r) for r in self._rows(query, tuple(arguments))]
+
+    # ------------------------------------------------------------------ the merge log
+
+    def log_decisions(self, chunk_id: int, decisions: Iterable[MergeDecision]) -> None:
+        """Append to the merge log what was decided when a chunk arrived."""
+        self._database.executemany(
+            "INSERT INTO merges (chunk_id, kind, a, b, scores, reason) VALUES (?, ?, ?, ?, ?, ?)",
+            [(chunk_id, d.kind, d.a, d.b, to_json(d.scores), d.reason) for d in decisions],
+        )
+
+    def decisions(self) -> list[MergeDecision]:
+        """The merge log, oldest first."""
+        query = "SELECT kind, a, b, scores, reason FROM merges ORDER BY entry"
+        return [MergeDecision(r[0], r[1], r[2], json.loads(r[3]), r[4]) for r in self._rows(query)]
+
+
+def _instance_row(instance: Instance) -> tuple[object, ...]:
+    box = instance.box
+    geometry = np.concatenate([instance.center, instance.aabb.ravel(), box.center, box.size, box.rotation.ravel()])
+    r, g, b = instance.color_rgb
+    view = instance.best_view
+    return (
+        instance.id,
+        instance.label,
+        instance.description,
+        geometry.astype("<f8").tobytes(),
+        float(instance.confidence),
+        int(instance.observations),
+        float(instance.first_seen_s),
+        float(instance.last_seen_s),
+        instance.state,
+        instance.structure,
+        int(r) << 16 | int(g) << 8 | int(b),
+        instance.color_name,
+        int(instance.component),
+        None if view is None else view.session_id,
+        None if view is None else int(view.frame_index),
+        None if view is None else np.asarray(view.box_xyxy, dtype="<f8").tobytes(),
+    )
+
+
+def _instance(row: tuple[Any, ...]) -> Instance:
+    where = f"the geometry of instance {row[0]}"
+    g = raw_array(row[3], "<f8", (24,), where).copy()
+    view = None
+    if row[13] is not None:
+        x0, y0, x1, y1 = (float(x) for x in raw_array(row[15], "<f8", (4,), where))
+        view = BestView(row[13], row[14], (x0, y0, x1, y1))
+    return Instance(
+        id=row[0],
+        label=row[1],
+        description=row[2],
+        center=g[:3],
+        aabb=g[3:9].reshape(2, 3),
+        box=OrientedBox(g[9:12], g[12:15], g[15:24].reshape(3, 3)),
+        confidence=row[4],
+        observations=row[5],
+        first_seen_s=row[6],
+        last_seen_s=row[7],
+        state=row[8],
+        structure=row[9],
+        color_rgb=(row[10] >> 16 & 255, row[10] >> 8 & 255, row[10] & 255),
+        color_name=row[11],
+        component=row[12],
+        best_view=view,
+    )

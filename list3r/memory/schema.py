@@ -1,0 +1,68 @@
+"""The schema of a memory file: numbered migrations, append-only, applied on open inside one transaction."""
+
+from __future__ import annotations
+
+APPLICATION_ID = 0x4C335231
+"""ASCII "L3R1", written to the header of the SQLite file."""
+
+MIGRATIONS: tuple[str, ...] = (
+    # 1: the first released schema
+    """
+    CREATE TABLE memory (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+    CREATE TABLE sessions (
+        session_id INTEGER PRIMARY KEY, source TEXT NOT NULL, fingerprint TEXT NOT NULL, settings TEXT NOT NULL,
+        frame_count INTEGER NOT NULL, state TEXT NOT NULL);
+    CREATE TABLE chunks (
+        chunk_id INTEGER PRIMARY KEY, session_id INTEGER NOT NULL REFERENCES sessions, chunk_index INTEGER NOT NULL,
+        first_frame INTEGER NOT NULL, last_frame INTEGER NOT NULL, component INTEGER NOT NULL,
+        S_world_chunk BLOB NOT NULL, fx REAL NOT NULL, fy REAL NOT NULL, cx REAL NOT NULL, cy REAL NOT NULL,
+        height INTEGER NOT NULL, width INTEGER NOT NULL, scale_kind TEXT NOT NULL, feature_space TEXT NOT NULL,
+        cannot_link BLOB NOT NULL, overlap BLOB NOT NULL, seconds TEXT NOT NULL, crc INTEGER NOT NULL,
+        UNIQUE (session_id, chunk_index));
+    CREATE TABLE edges (
+        u INTEGER NOT NULL REFERENCES chunks, v INTEGER NOT NULL REFERENCES chunks, kind TEXT NOT NULL,
+        frame_u INTEGER NOT NULL, frame_v INTEGER NOT NULL, S_v_u BLOB NOT NULL, confidence REAL NOT NULL,
+        weight REAL NOT NULL, inliers INTEGER NOT NULL, residual_m REAL NOT NULL, accepted INTEGER NOT NULL,
+        reason TEXT NOT NULL, scores TEXT NOT NULL, PRIMARY KEY (u, v, kind, frame_u, frame_v)) WITHOUT ROWID;
+    CREATE TABLE frames (
+        session_id INTEGER NOT NULL REFERENCES sessions, frame_index INTEGER NOT NULL, time_s REAL NOT NULL,
+        chunk_id INTEGER NOT NULL REFERENCES chunks, state TEXT NOT NULL, T_chunk_cam BLOB NOT NULL,
+        note TEXT NOT NULL DEFAULT '', PRIMARY KEY (session_id, frame_index)) WITHOUT ROWID;
+    CREATE TABLE keyframes (
+        chunk_id INTEGER NOT NULL REFERENCES chunks, frame_index INTEGER NOT NULL, descriptor BLOB NOT NULL,
+        features BLOB NOT NULL, jpeg BLOB NOT NULL, crc INTEGER NOT NULL,
+        PRIMARY KEY (chunk_id, frame_index)) WITHOUT ROWID;
+    CREATE TABLE local_instances (
+        chunk_id INTEGER NOT NULL REFERENCES chunks, local_id INTEGER NOT NULL, stability REAL NOT NULL,
+        structure INTEGER NOT NULL, plane BLOB, feature BLOB NOT NULL, track BLOB NOT NULL, crc INTEGER NOT NULL,
+        PRIMARY KEY (chunk_id, local_id)) WITHOUT ROWID;
+    CREATE TABLE supports (
+        chunk_id INTEGER NOT NULL, local_id INTEGER NOT NULL, count INTEGER NOT NULL, grid BLOB NOT NULL,
+        points BLOB NOT NULL, confidence BLOB NOT NULL, rgb BLOB NOT NULL, crc INTEGER NOT NULL,
+        PRIMARY KEY (chunk_id, local_id)) WITHOUT ROWID;
+    CREATE TABLE instances (
+        id INTEGER PRIMARY KEY, label TEXT, description TEXT NOT NULL, geometry BLOB NOT NULL,
+        confidence REAL NOT NULL, observations INTEGER NOT NULL, first_seen_s REAL NOT NULL,
+        last_seen_s REAL NOT NULL, state TEXT NOT NULL, structure TEXT, color_rgb INTEGER NOT NULL,
+        color_name TEXT NOT NULL, component INTEGER NOT NULL, view_session INTEGER, view_frame INTEGER,
+        view_box BLOB);
+    CREATE TABLE observations (
+        chunk_id INTEGER NOT NULL, local_id INTEGER NOT NULL, instance INTEGER NOT NULL REFERENCES instances,
+        PRIMARY KEY (chunk_id, local_id)) WITHOUT ROWID;
+    CREATE INDEX observations_by_instance ON observations (instance);
+    CREATE TABLE embeddings (
+        instance INTEGER NOT NULL REFERENCES instances, space TEXT NOT NULL, vector BLOB NOT NULL,
+        PRIMARY KEY (instance, space)) WITHOUT ROWID;
+    CREATE TABLE relations (
+        subject INTEGER NOT NULL, predicate TEXT NOT NULL, object INTEGER NOT NULL, confidence REAL NOT NULL,
+        margin REAL NOT NULL, PRIMARY KEY (subject, predicate, object)) WITHOUT ROWID;
+    CREATE INDEX relations_by_object ON relations (object, predicate);
+    CREATE TABLE merges (
+        entry INTEGER PRIMARY KEY, chunk_id INTEGER NOT NULL, kind TEXT NOT NULL, a TEXT NOT NULL, b TEXT NOT NULL,
+        scores TEXT NOT NULL, reason TEXT NOT NULL);
+    CREATE TABLE aliases (id INTEGER PRIMARY KEY, instance INTEGER NOT NULL);
+    CREATE VIRTUAL TABLE instance_boxes USING rtree (id, min_x, max_x, min_y, max_y, min_z, max_z);
+    """,
+)
+
+SCHEMA_VERSION = len(MIGRATIONS)
