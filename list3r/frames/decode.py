@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
-def read_raw_depth(path: Path) -> NDArray[np.generic]:
+def read_raw_depth(path: Path) -> NDArray[Any]:
     """Depth as stored, any number type. Shape (H, W). Raises `FrameError`."""
     if path.suffix.lower() == ".npy":
         raw = _load_npy(path)
@@ -33,13 +34,13 @@ def read_raw_depth(path: Path) -> NDArray[np.generic]:
     return raw
 
 
-def clean_depth(raw: NDArray[np.generic], scale: float, max_depth_m: float | None) -> NDArray[np.float32]:
+def clean_depth(raw: NDArray[Any], scale: float, max_depth_m: float | None) -> NDArray[np.float32]:
     """Depth in metres, 0 where unknown.
 
     Unknown is 0, the largest value of an unsigned integer type, NaN, infinite, negative, and beyond `max_depth_m`.
     `raw` has shape (H, W), in `scale` units per metre.
     """
-    depth = np.multiply(raw, np.float32(1.0 / scale), dtype=np.float32, casting="unsafe")
+    depth: NDArray[np.float32] = np.multiply(raw, np.float32(1.0 / scale), dtype=np.float32, casting="unsafe")
     far = np.inf if max_depth_m is None else max_depth_m
     if raw.dtype.kind == "u" and raw.dtype.itemsize <= 2:
         far = min(far, float(np.iinfo(raw.dtype).max - 0.5) / scale)
@@ -50,7 +51,7 @@ def clean_depth(raw: NDArray[np.generic], scale: float, max_depth_m: float | Non
     return depth
 
 
-def _decode(path: Path, flags: int) -> NDArray[np.generic]:
+def _decode(path: Path, flags: int) -> NDArray[Any]:
     """Decode a file with OpenCV, and refuse one whose end is missing, which OpenCV would fill with grey."""
     try:
         data = path.read_bytes()
@@ -72,7 +73,7 @@ def _decode(path: Path, flags: int) -> NDArray[np.generic]:
     return np.asarray(image)
 
 
-def _load_npy(path: Path) -> NDArray[np.generic]:
+def _load_npy(path: Path) -> NDArray[Any]:
     try:
         array = np.load(path, allow_pickle=False)
     except FileNotFoundError:

@@ -33,9 +33,9 @@ class FolderSource:
         self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files[:_PROBES])
         sizes = self._probe(root)
         self._rig = build_rig(optics, *sizes, options.max_depth_m)
-        self._T_depth_color = np.eye(4)
+        self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
-            self._T_depth_color = np.linalg.inv(optics.T_color_depth)
+            self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
         self._info = self._describe(root, notes)
 
     @property
@@ -70,7 +70,7 @@ class FolderSource:
                 T_source_given = pose_matrix(v for row in read_numbers(file.pose) for v in row)
             except SourceError:
                 return None
-        return None if T_source_given is None else T_source_given @ self._T_depth_color
+        return None if T_source_given is None else T_source_given @ self._T_posed_color
 
     def _probe(self, root: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
         """Image sizes of the first frame that decodes, among the first and some spread over the source."""
@@ -134,11 +134,10 @@ def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:
     out = []
     for path in paths:
         try:
-            out.append(
-                (path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, path.stat().st_size)
-            )
+            size = path.stat().st_size
         except OSError:
-            out.append((path.name, -1))
+            size = -1
+        out.append((path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, size))
     return out
 
 

@@ -72,16 +72,14 @@ class SourceOptions:
             object.__setattr__(self, "T_color_depth", tuple(tuple(float(v) for v in row) for row in rows))
         if self.registered and (self.depth_intrinsics or self.T_color_depth):
             raise OptionError(
-                "depth that is registered has no camera of its own: leave out its intrinsics and transform"
+                "registered depth has no camera of its own: leave out --depth-intrinsics and --depth-to-color"
             )
 
 
 def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intrinsics:
     """Four finite numbers with positive focal lengths, px. Raises `OptionError`."""
     if len(values) != 4 or not all(math.isfinite(v) for v in values) or values[0] <= 0 or values[1] <= 0:
-        raise OptionError(
-            f"{name} {_show(values)}: four numbers fx,fy,cx,cy in pixels are needed, like 525,525,320,240"
-        )
+        raise OptionError(f"{name} {_show(values)}: four numbers fx,fy,cx,cy in px are needed, like 525,525,320,240")
     return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ def merge_optics(layout: Layout, options: SourceOptions) -> tuple[Optics, tuple[
         optics = replace(optics, depth_intrinsics=None, T_color_depth=None)
         if layout.registered_intrinsics is not None:
             optics = replace(optics, intrinsics=layout.registered_intrinsics, distortion=())
-    given = {
+    given: dict[str, Any] = {
         "intrinsics": options.intrinsics,
         "distortion": options.distortion,
         "depth_intrinsics": options.depth_intrinsics,
@@ -75,6 +76,8 @@ def build_rig(
     optics: Optics, color_size: tuple[int, int], depth_size: tuple[int, int] | None, max_depth_m: float | None
 ) -> Rig:
     """Check the cameras against the first images and tabulate. Raises `SourceError` and `OptionError`."""
+    if optics.distortion and optics.intrinsics is None:
+        raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
     lens = _camera(optics.intrinsics, color_size, "intrinsics", optics.distortion)
     camera = lens.pinhole() if lens else None
     undistortion = Undistortion(lens) if lens and lens.distortion else None
@@ -98,9 +101,7 @@ def _registration(
             )
         return None
     if camera is None:
-        raise SourceError(
-            "depth has a camera of its own but the colour camera is unknown; give --intrinsics fx,fy,cx,cy"
-        )
+        raise SourceError("depth has a camera of its own but the colour camera has none; give --intrinsics fx,fy,cx,cy")
     depth_camera = _camera(optics.depth_intrinsics, depth_size, "depth intrinsics", ())
     assert depth_camera is not None and optics.T_color_depth is not None
     same = replace(camera, distortion=()) == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
@@ -115,9 +116,7 @@ def _camera(
     height, width = size
     fx, fy, cx, cy = intrinsics
     if not (0 <= cx < width and 0 <= cy < height):
-        raise OptionError(
-            f"{name}: centre ({cx:g}, {cy:g}) lies outside the {_size(size)} image; are they of this size?"
-        )
+        raise OptionError(f"{name}: centre ({cx:g}, {cy:g}) lies outside the image of {_size(size)}; scale them to it")
     return Camera(width, height, fx, fy, cx, cy, distortion)
 
 
