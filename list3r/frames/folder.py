@@ -92,6 +92,8 @@ class FolderSource:
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
         missing = list(layout.missing)
+        if not self._has_depth:
+            missing.append("there is no depth: --reconstruction with a model for colour images")
         if rig.camera is None:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
         has_poses = any(f.pose is not None or f.T_source_camera is not None for f in layout.files)

@@ -6,21 +6,24 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from list3r.frames import seven_scenes
-from list3r.frames.base import FrameSource
+from list3r.frames import images, replica, seven_scenes, tum
+from list3r.frames.base import Camera, FrameSource, SourceInfo
 from list3r.frames.folder import FolderSource
-from list3r.frames.layout import Layout
+from list3r.frames.layout import IMAGE_ENDINGS, Layout
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import SourceError
 
 FOLDERS: dict[str, Callable[[Path, SourceOptions], Layout | None]] = {
     "7scenes": seven_scenes.find,
+    "tum": tum.find,
+    "replica": replica.find,
+    "images": images.find,
 }
 """Readers of folders, the most particular first: the layout of a folder, or None for one of another kind."""
 
 _WANTED = (
-    "a video file, or a folder in 7-Scenes (frame-000000.color.png), TUM RGB-D (rgb.txt) or Replica layout "
-    "(results/frame000000.jpg), or of images"
+    "give a video file, or a folder in 7-Scenes (frame-000000.color.png), TUM RGB-D (rgb.txt) or Replica "
+    "(results/frame000000.jpg) layout, or of images"
 )
 
 
@@ -33,23 +36,50 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
     root = Path(path).expanduser()
     try:
         if not root.exists():
-            raise SourceError(f"{root} does not exist; give {_WANTED}")
-        if root.is_dir():
-            return _open_folder(root, options)
+            raise SourceError(f"{root} does not exist; {_WANTED}")
+        return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
         raise SourceError(f"{error.filename or root} may not be read; check its permissions") from None
-    raise SourceError(f"{root} is not a folder of frames; give {_WANTED}")
+
+
+def require_camera(info: SourceInfo) -> Camera:
+    """The source's camera. Raises `SourceError` when its intrinsics are unknown."""
+    if info.camera is None:
+        raise SourceError(f"{info.path}: the camera's intrinsics are unknown; give --intrinsics fx,fy,cx,cy in px")
+    return info.camera
+
+
+def check_bad_share(bad: int, total: int) -> None:
+    """Raises `SourceError` when more than half of the frames could not be decoded."""
+    if bad * 2 > total:
+        raise SourceError(f"{bad} of {total} frames cannot be decoded; is the copy of the source complete?")
 
 
 def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     if not os.access(root, os.R_OK | os.X_OK):
         raise SourceError(f"{root} may not be read; check its permissions")
     if not any(root.iterdir()):
-        raise SourceError(f"{root} is empty; give {_WANTED}")
+        raise SourceError(f"{root} is an empty folder; {_WANTED}")
+    if options.kind == "video":
+        raise SourceError(f"{root} is a folder, not a video; name the video file in it or leave out the kind")
     for kind, find in FOLDERS.items():
         if options.kind in ("auto", kind):
             layout = find(root, options)
             if layout is not None and layout.files:
                 return FolderSource(root, layout, options)
-    said = "no layout that is known" if options.kind == "auto" else f"not the {options.kind} layout"
-    raise SourceError(f"{root} has {said}; give {_WANTED}")
+    said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
+    raise SourceError(f"{root} has {said}; {_WANTED}")
+
+
+def _open_file(path: Path, options: SourceOptions) -> FrameSource:
+    if not os.access(path, os.R_OK):
+        raise SourceError(f"{path} may not be read; check its permissions")
+    if options.kind not in ("auto", "video"):
+        raise SourceError(f"{path} is a file, but the {options.kind} layout is a folder; name the folder")
+    if path.suffix.lower() in IMAGE_ENDINGS:
+        raise SourceError(f"{path} is one image; name the folder of images or a video")
+    if not path.is_file() or path.stat().st_size == 0:
+        raise SourceError(f"{path} is empty or no ordinary file; {_WANTED}")
+    from list3r.frames.video import VideoSource
+
+    return VideoSource(path, options)

@@ -1,0 +1,157 @@
+"""The TUM RGB-D layout: `rgb.txt`, `depth.txt`, `groundtruth.txt`, brought together by time.
+
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012. Depth lies on the colour pixels, 5000
+units a metre. Cameras as published on the benchmark's page "file formats".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from list3r.frames.layout import FrameFile, Layout, Optics, read_calibration, read_numbers, read_text
+from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
+from list3r.memory.errors import SourceError
+
+MAX_PAIR_GAP_S = 0.02
+"""Colour and depth this far apart still make a frame (the benchmark's own tools)."""
+MAX_POSE_BRACKET_S = 0.1
+"""Poses are interpolated over gaps up to this; over longer ones a hand does not move evenly."""
+
+_ROS_DEFAULT: Intrinsics = (525.0, 525.0, 319.5, 239.5)
+_PUBLISHED: dict[str, tuple[Intrinsics, tuple[float, ...]]] = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+_FREIBURG = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", re.IGNORECASE)
+
+
+def find(root: Path, options: SourceOptions) -> Layout | None:
+    """The layout, or None when the folder has another. Raises `SourceError` for lists that cannot be read."""
+    if not (root / "rgb.txt").is_file():
+        return None
+    color_times, color_names = _read_list(root / "rgb.txt")
+    notes: list[str] = []
+    if (root / "depth.txt").is_file():
+        depth_times, depth_names = _read_list(root / "depth.txt")
+        pairs = associate(color_times, depth_times, MAX_PAIR_GAP_S)
+        if not len(pairs):
+            raise SourceError(f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; mend depth.txt")
+        if len(pairs) < len(color_times):
+            alone = len(color_times) - len(pairs)
+            notes.append(f"{alone} of {len(color_times)} colour images have no depth image in time and are left out")
+        depths = [root / depth_names[d] for _, d in pairs]
+        picked = pairs[:, 0]
+    else:
+        picked, depths = np.arange(len(color_times)), [None] * len(color_times)
+    times = color_times[picked]
+    poses = _poses(root / "groundtruth.txt", times)
+    files = tuple(
+        FrameFile(root / color_names[c], depth, None, pose, float(time))
+        for c, depth, pose, time in zip(picked, depths, poses, times, strict=True)
+    )
+    intrinsics, distortion, camera_note = _camera(root, options)
+    optics = Optics(intrinsics, distortion, depth_scale=5000.0)
+    return Layout("tum", files, optics, "color", intrinsics, (*camera_note, *notes))
+
+
+def associate(a_s: NDArray[np.float64], b_s: NDArray[np.float64], max_gap_s: float) -> NDArray[np.int64]:
+    """Pairs (into a, into b) that are each other's nearest in time within `max_gap_s`, in the order of a.
+
+    Both are ascending seconds, shapes (N,) and (M,). Shape (P, 2).
+    """
+    if not len(a_s) or not len(b_s):
+        return np.zeros((0, 2), dtype=np.int64)
+    to_b, to_a = _nearest(a_s, b_s), _nearest(b_s, a_s)
+    mutual = (to_a[to_b] == np.arange(len(a_s))) & (np.abs(b_s[to_b] - a_s) <= max_gap_s)
+    return np.stack([np.flatnonzero(mutual), to_b[mutual]], axis=1)
+
+
+def poses_at(
+    times_s: NDArray[np.float64], stamps_s: NDArray[np.float64], poses_xyzw: NDArray[np.float64]
+) -> list[NDArray[np.float64] | None]:
+    """Poses at the given times, None where none is near enough.
+
+    Between two stamps at most `MAX_POSE_BRACKET_S` apart the translation is interpolated linearly and the rotation
+    along the shortest arc; otherwise the nearest stamp within `MAX_PAIR_GAP_S` counts. `stamps_s` (N,) ascend,
+    `poses_xyzw` (N, 7) are translations in metres and quaternions.
+    """
+    matrices = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+    matrices[:, :3, :3] = Rotation.from_quat(poses_xyzw[:, 3:]).as_matrix()
+    matrices[:, :3, 3] = poses_xyzw[:, :3]
+    out: list[NDArray[np.float64] | None] = []
+    for time in times_s:
+        after = int(np.searchsorted(stamps_s, time))
+        before = after - 1
+        if 0 < after < len(stamps_s) and stamps_s[after] - stamps_s[before] <= MAX_POSE_BRACKET_S:
+            out.append(_between(float(time), stamps_s[before : after + 1], matrices[before : after + 1]))
+            continue
+        near = min((k for k in (before, after) if 0 <= k < len(stamps_s)), key=lambda k: abs(stamps_s[k] - time))
+        out.append(matrices[near] if abs(stamps_s[near] - time) <= MAX_PAIR_GAP_S else None)
+    return out
+
+
+def _between(time: float, stamps: NDArray[np.float64], matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    w = (time - stamps[0]) / (stamps[1] - stamps[0])
+    out = np.eye(4)
+    out[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(matrices[:, :3, :3]))(w).as_matrix()
+    out[:3, 3] = (1 - w) * matrices[0, :3, 3] + w * matrices[1, :3, 3]
+    return out
+
+
+def _nearest(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.int64]:
+    right = np.clip(np.searchsorted(b, a), 1, max(1, len(b) - 1))
+    right = np.minimum(right, len(b) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(a - b[left]) <= np.abs(b[right] - a), left, right)
+
+
+def _read_list(path: Path) -> tuple[NDArray[np.float64], list[str]]:
+    """Times and file names of a list `timestamp filename`, ascending in time."""
+    rows: list[tuple[float, str]] = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        words = text.split(maxsplit=1)
+        try:
+            rows.append((float(words[0]), words[1].strip()))
+        except (ValueError, IndexError):
+            raise SourceError(f"{path}: line {number} is not 'timestamp filename'; mend or remove it") from None
+    if not rows:
+        raise SourceError(f"{path} names no image; is the copy complete?")
+    rows.sort()
+    return np.array([time for time, _ in rows]), [name for _, name in rows]
+
+
+def _poses(path: Path, times_s: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
+    if not path.is_file():
+        return [None] * len(times_s)
+    rows = [row for row in read_numbers(path) if len(row) >= 8 and all(math.isfinite(v) for v in row[:8])]
+    table = np.array([row[:8] for row in rows if sum(v * v for v in row[4:8]) > 0.5]).reshape(-1, 8)
+    if not len(table):
+        return [None] * len(times_s)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return poses_at(times_s, table[:, 0], table[:, 1:])
+
+
+def _camera(root: Path, options: SourceOptions) -> tuple[Intrinsics, tuple[float, ...], tuple[str, ...]]:
+    """Colour camera: from a file, from the folder's name, or the ROS default that the benchmark recommends."""
+    if options.intrinsics is not None:
+        return options.intrinsics, (), ()
+    written = read_calibration(root)
+    if written is not None:
+        return *written, ("intrinsics of calibration.txt",)
+    named = _FREIBURG.search(root.resolve().name)
+    if named:
+        intrinsics, distortion = _PUBLISHED[named[1]]
+        note = f"intrinsics as published for freiburg{named[1]}, which the folder's name says"
+        return intrinsics, check_distortion(distortion) if distortion else (), (note,)
+    assumed = "525,525,319.5,239.5"
+    return _ROS_DEFAULT, (), (f"the camera is not named: the ROS default {assumed} is assumed; --intrinsics is better",)
