@@ -29,6 +29,10 @@ class Proposals:
     plane: NDArray[np.float64]
     """Plane (n, d) with n . p + d = 0 in camera coordinates of the anchor, n towards the camera, for candidates that
     are one flat surface; NaN for the others. Shape (N, 4)."""
+    identity: NDArray[np.int64] | None = None
+    """The thing each candidate is a view of, where the discoverer knows it across anchors. Shape (N,)."""
+    structure: NDArray[np.bool_] | None = None
+    """Candidates that bound the room (floor, wall, ceiling), where the discoverer knows. Shape (N,)."""
 
 
 class Discoverer(Protocol):

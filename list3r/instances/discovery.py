@@ -1,0 +1,96 @@
+"""The discoverer that needs no weights: geometry of the whole chunk, looked at from each anchor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Frame
+from list3r.instances.base import Proposals
+from list3r.instances.cloud import Cloud, build_cloud
+from list3r.instances.features import object_feature
+from list3r.instances.segments import Segmentation, segment_cloud
+from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
+from list3r.instances.views import ChunkViews, View, chunk_views
+from list3r.reconstruction.base import Reconstruction
+
+
+class GeometricDiscoverer:
+    """Proposes the things of the chunk's fused cloud as masks on an anchor.
+
+    The cloud of a chunk is cut once, at the first anchor; the other anchors look at the same cut.
+    """
+
+    feature_space = FEATURE_SPACE
+
+    def __init__(self, settings: InstanceSettings | None = None) -> None:
+        self.settings = settings or InstanceSettings()
+        self._views: ChunkViews | None = None
+        self._cut: tuple[Cloud, Segmentation, NDArray[np.float32]] | None = None
+
+    def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
+        """Propose masks on the frame at `position`, best first."""
+        views = chunk_views(frames, reconstruction, self.settings)
+        if views is not self._views or self._cut is None:
+            self._views, self._cut = views, self._segment(views)
+        cloud, cut, features = self._cut
+        labels = self._label_view(views, position, cloud, cut)
+        shape = (reconstruction.camera.height, reconstruction.camera.width)
+        return _proposals(views.view(position), labels, cut, features, stride=views.stride, shape=shape)
+
+    def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
+        settings = self.settings.segment
+        cloud = build_cloud([views.view(p) for p in views.anchors], settings.voxel_m * views.unit)
+        poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
+        cut = segment_cloud(cloud, poses, views.unit, settings)
+        features = np.zeros((len(cut.segments), 64), np.float32)
+        rgb = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8)
+        for number in range(len(cut.segments)):
+            mine = cut.labels == number + 1
+            features[number] = object_feature(cloud.points[mine], rgb[mine], cut.up, views.unit)
+        return cloud, cut, features
+
+    def _label_view(self, views: ChunkViews, position: int, cloud: Cloud, cut: Segmentation) -> NDArray[np.int32]:
+        """Segment of each pixel of the view at `position`, 0 for none. Shape (h, w)."""
+        if position in views.anchors:
+            index = cloud.index[views.anchors.index(position)]
+        else:
+            index = _nearest_voxels(views.view(position), cloud)
+        return np.where(index >= 0, cut.labels[index], 0).astype(np.int32)
+
+
+def _nearest_voxels(view: View, cloud: Cloud) -> NDArray[np.int32]:
+    """Voxel of the cloud nearest to each confirmed pixel of a view that is not part of it, -1 where none is near."""
+    from scipy.spatial import cKDTree
+
+    index = np.full(view.depth.shape, -1, np.int32)
+    distance, nearest = cKDTree(cloud.points).query(view.points[view.confirmed], distance_upper_bound=3.0 * cloud.voxel)
+    index[view.confirmed] = np.where(np.isfinite(distance), nearest, -1)
+    return index
+
+
+def _proposals(
+    view: View,
+    labels: NDArray[np.int32],
+    cut: Segmentation,
+    features: NDArray[np.float32],
+    *,
+    stride: int,
+    shape: tuple[int, int],
+) -> Proposals:
+    count = np.bincount(labels.ravel(), minlength=len(cut.segments) + 1)[1:]
+    score = np.array([segment.score for segment in cut.segments], np.float32)
+    present = np.flatnonzero(count > 0)
+    order = present[np.argsort(-score[present], kind="stable")]
+    renumber = np.zeros(len(cut.segments) + 1, np.int32)
+    renumber[order + 1] = np.arange(1, len(order) + 1)
+    full = np.repeat(np.repeat(renumber[labels], stride, axis=0), stride, axis=1)[: shape[0], : shape[1]]
+    planes = np.full((len(order), 4), np.nan)
+    for row, number in enumerate(order):
+        equation = cut.segments[number].plane
+        if equation is not None:
+            planes[row] = equation @ view.T_chunk_cam
+    structure = np.array([cut.segments[number].structure for number in order], bool)
+    return Proposals(view.position, full, score[order], features[order], planes, order.astype(np.int64), structure)

@@ -1,0 +1,61 @@
+"""The local instance library of a chunk (paper 3.1): anchors, discovery, prompt selection, tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from list3r.frames.base import Frame
+from list3r.instances.base import Discoverer, Proposals, Tracker
+from list3r.instances.discovery import GeometricDiscoverer
+from list3r.instances.settings import InstanceSettings
+from list3r.instances.tracking import ReprojectionTracker
+from list3r.instances.views import chunk_views, forget_views
+from list3r.memory.records import LocalLibrary
+from list3r.reconstruction.base import Reconstruction
+
+__all__ = ["InstanceSettings", "build_library", "select_prompts"]
+
+
+def build_library(
+    frames: Sequence[Frame],
+    reconstruction: Reconstruction,
+    settings: InstanceSettings | None = None,
+    discoverer: Discoverer | None = None,
+    tracker: Tracker | None = None,
+) -> LocalLibrary:
+    """Find the things of a chunk and follow them through it.
+
+    `frames` are the chunk's frames in the order of the reconstruction. Without a discoverer and a tracker the ones
+    that need no weights are used.
+    """
+    settings = settings or InstanceSettings()
+    discoverer = discoverer or GeometricDiscoverer(settings)
+    tracker = tracker or ReprojectionTracker(settings)
+    try:
+        anchors = chunk_views(frames, reconstruction, settings).anchors
+        proposals = [discoverer(frames, reconstruction, position) for position in anchors]
+        prompts = [select_prompts(p, settings) for p in proposals]
+        return tracker(frames, reconstruction, prompts, discoverer.feature_space)
+    finally:
+        forget_views()
+
+
+def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposals:
+    """The candidates worth following: sure enough and large enough in the anchor."""
+    area = np.bincount(proposals.labels.ravel(), minlength=len(proposals.score) + 1)[1:]
+    least = settings.track.min_area_px * proposals.labels.size / (640 * 480)
+    keep = np.flatnonzero((proposals.score >= settings.min_score) & (area >= least))
+    renumber = np.zeros(len(proposals.score) + 1, np.int32)
+    renumber[keep + 1] = np.arange(1, len(keep) + 1)
+    return replace(
+        proposals,
+        labels=renumber[proposals.labels],
+        score=proposals.score[keep],
+        features=proposals.features[keep],
+        plane=proposals.plane[keep],
+        identity=None if proposals.identity is None else proposals.identity[keep],
+        structure=None if proposals.structure is None else proposals.structure[keep],
+    )

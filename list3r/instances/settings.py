@@ -1,0 +1,88 @@
+"""What the local instance library can be told. Lengths are metres; a chunk without scale is measured by its depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from list3r.memory.errors import OptionError
+
+FEATURE_SPACE = "geometric-color@1/64"
+"""Colour and metric shape, see `features`."""
+
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """Standard deviation of one depth reading: base + quadratic * z^2 (structured light and stereo)."""
+
+    base_m: float = 0.0015
+    quadratic_per_m: float = 0.0019
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """How neighbouring frames are fused into an anchor's view."""
+
+    width_px: int = 320
+    """Images are worked on at about this width."""
+    reach: int = 10
+    """Frames on either side that are fused into an anchor."""
+    step: int = 2
+    """Every how many of them."""
+    noise: NoiseSettings = field(default_factory=NoiseSettings)
+
+
+@dataclass(frozen=True)
+class SegmentSettings:
+    """How the fused chunk is cut into things."""
+
+    voxel_m: float = 0.01
+    """Grain of the chunk's cloud."""
+    plane_area_m2: float = 0.08
+    """Smallest flat surface looked for."""
+    big_plane_area_m2: float = 0.7
+    """A flat surface at least this large is an instance of its own."""
+    support_area_m2: float = 0.12
+    """Smallest level surface that parts the things above it from those below."""
+    thing_size_m: float = 0.035
+    """Smallest diameter of a thing that stands out of a surface."""
+    flat_area_m2: float = 0.008
+    """Smallest sheet that is told from the surface under it by colour alone (a postcard is 0.015)."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """How masks are followed and which tracks are kept."""
+
+    min_frames: int = 5
+    min_share: float = 0.08
+    """Of the chunk's posed frames."""
+    min_stability: float = 0.4
+    min_area_px: int = 60
+    """Smallest mask worth keeping in a frame, pixels of a 640 x 480 image; scaled with the image."""
+    cannot_link_frames: int = 3
+    """Frames in which a pair must be seen side by side."""
+    support_points: int = 3000
+
+
+@dataclass(frozen=True)
+class InstanceSettings:
+    """The local instance library of a chunk."""
+
+    anchor_step: int = 12
+    """Frames from one anchor to the next; the sharpest of each run is taken (paper: at least every 50)."""
+    min_score: float = 0.2
+    """Prompts below this confidence are not followed."""
+    view: ViewSettings = field(default_factory=ViewSettings)
+    segment: SegmentSettings = field(default_factory=SegmentSettings)
+    track: TrackSettings = field(default_factory=TrackSettings)
+
+    @property
+    def feature_space(self) -> str:
+        """Embedding space of the default discoverer's features, `model@revision/dim`."""
+        return FEATURE_SPACE
+
+    def __post_init__(self) -> None:
+        if self.anchor_step < 1:
+            raise OptionError(f"anchor step {self.anchor_step} must be at least 1 frame")
+        if self.segment.voxel_m <= 0:
+            raise OptionError(f"voxel size {self.segment.voxel_m} m must be positive")

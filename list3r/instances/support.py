@@ -1,0 +1,71 @@
+"""The surface points of instances, gathered from the anchors' fused views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.base import Proposals
+from list3r.instances.cloud import pack
+from list3r.instances.views import ChunkViews
+from list3r.memory.records import Support
+
+
+def collect_supports(
+    views: ChunkViews,
+    proposals: Sequence[Proposals],
+    images: Sequence[NDArray[np.int32]],
+    count: int,
+    max_points: int,
+) -> list[Support]:
+    """Support of each of `count` instances from label images (instance + 1) of the anchors, thinned by voxels."""
+    points, rgb, confidence, owner = [], [], [], []
+    for candidates, image in zip(proposals, images, strict=True):
+        view = views.view(candidates.position)
+        mask = (image > 0) & view.confirmed
+        single = views.reconstruction.confidence[candidates.position][:: views.stride, :: views.stride]
+        points.append(view.points[mask])
+        rgb.append(view.rgb[mask])
+        confidence.append(single[mask].astype(np.float32))
+        owner.append(image[mask] - 1)
+    if not points:
+        return []
+    xyz, colors, sure, owners = (np.concatenate(part) for part in (points, rgb, confidence, owner))
+    order = np.argsort(owners, kind="stable")
+    bounds = np.searchsorted(owners[order], np.arange(count + 1))
+    out = []
+    for number in range(count):
+        mine = order[bounds[number] : bounds[number + 1]]
+        out.append(_thin(xyz[mine], colors[mine], sure[mine], views.unit, max_points))
+    return out
+
+
+def _thin(
+    points: NDArray[np.float32],
+    rgb: NDArray[np.uint8],
+    confidence: NDArray[np.float32],
+    unit: float,
+    max_points: int,
+) -> Support:
+    """One mean point in each voxel: 5 mm for small things, larger so that at most `max_points` are left."""
+    if not len(points):
+        return Support(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8))
+    voxel = 0.005 * unit
+    while True:
+        _, inverse, number = np.unique(
+            pack(np.floor(points / voxel).astype(np.int64)), return_inverse=True, return_counts=True
+        )
+        if len(number) <= max_points:
+            break
+        voxel *= max(1.15, np.sqrt(len(number) / max_points))
+    mean = [np.bincount(inverse, points[:, k], minlength=len(number)) / number for k in range(3)]
+    color = [np.bincount(inverse, rgb[:, k], minlength=len(number)) / number for k in range(3)]
+    sure = np.bincount(inverse, confidence, minlength=len(number)) / number
+    sure = sure * (1.0 - 0.5**number)
+    return Support(
+        np.stack(mean, axis=1).astype(np.float32),
+        np.clip(sure, 0.0, 1.0).astype(np.float32),
+        np.clip(np.rint(np.stack(color, axis=1)), 0, 255).astype(np.uint8),
+    )
