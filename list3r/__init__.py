@@ -1,3 +1,39 @@
-"""Object memory for long videos."""
+"""Object memory for long videos: a library of 3D instances in one file that can be asked, updated and exported.
+
+    >>> import list3r
+    >>> memory = list3r.build("walk/", "house.l3r")          # or list3r.open("house.l3r")
+    >>> for match in memory.nearest(point=(0.0, 0.0, 1.0), k=3):
+    ...     print(match.instance.id, match.instance.description, match.distance_m)
+    >>> memory.relations(subject=12, predicate="on")
+
+Nothing heavy is imported before it is needed.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from list3r.memory.errors import List3rError
+    from list3r.scene_memory import SceneMemory, build, open
 
 __version__ = "0.1.0"
+__all__ = ["List3rError", "SceneMemory", "__version__", "build", "open"]
+
+_HOMES = {
+    "List3rError": "list3r.memory.errors",
+    "SceneMemory": "list3r.scene_memory",
+    "build": "list3r.scene_memory",
+    "open": "list3r.scene_memory",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'list3r' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

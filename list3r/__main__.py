@@ -1,0 +1,5 @@
+"""`python -m list3r` is the command line."""
+
+from list3r.cli import main
+
+main()

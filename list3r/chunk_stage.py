@@ -1,0 +1,166 @@
+"""What is done to one chunk by itself: reconstruct it, find and follow its objects (paper, sections 3.1 and A.1).
+
+A function of the chunk alone, so that chunks can be worked on side by side in any process.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource
+from list3r.frames.chunks import ChunkSettings, ChunkSpan
+from list3r.frames.source import SourceOptions, open_source
+from list3r.instances.library import InstanceSettings, build_library
+from list3r.instances.overlays import draw_debug
+from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.records import ChunkResult, Keyframe, LocalLibrary, OverlapSamples
+from list3r.reconstruction.base import Reconstruction, Reconstructor
+from list3r.reconstruction.keyframe_record import make_keyframes, overlap_samples
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """What shapes a memory. Two builds of one source with equal settings give equal memories."""
+
+    reconstruction: str = "rgbd"
+    """The reconstruction model."""
+    poses: str = "estimate"
+    """given or estimate."""
+    chunks: ChunkSettings = field(default_factory=ChunkSettings)
+    instances: InstanceSettings = field(default_factory=InstanceSettings)
+    keep_pictures: bool = True
+    """Keep a JPEG of each keyframe in the memory."""
+
+
+@dataclass(frozen=True)
+class ChunkTask:
+    """One chunk to work on."""
+
+    path: str
+    options: SourceOptions
+    span: ChunkSpan
+    settings: BuildSettings
+    debug_dir: str | None = None
+    """Folder for overlays, or None."""
+
+
+def make_reconstructor(settings: BuildSettings) -> Reconstructor:
+    """The reconstruction model that the settings name. Raises `OptionError` for a name that is not known."""
+    if settings.reconstruction != "rgbd":
+        raise OptionError(f"--reconstruction {settings.reconstruction} is not known; this version has: rgbd")
+    from list3r.reconstruction.rgbd import RgbdReconstructor
+
+    return RgbdReconstructor(poses=settings.poses)
+
+
+def process_chunk(task: ChunkTask) -> ChunkResult:
+    """Frames of one chunk to poses, keyframes and a local instance library."""
+    clock = _Clock()
+    source = _source(task.path, task.options)
+    camera = source.info.camera
+    assert camera is not None
+    read = list(source.read(task.span.start, task.span.stop))
+    frames = [f for f in read if isinstance(f, Frame)]
+    bad = tuple((f.index, f.reason) for f in read if isinstance(f, BadFrame))
+    clock.mark("read")
+    try:
+        if not frames:
+            raise TrackingError("no frame of the chunk could be decoded")
+        reconstruction = make_reconstructor(task.settings)(frames, camera)
+    except TrackingError:
+        return _without_geometry(task, frames, camera, bad, clock.seconds)
+    clock.mark("reconstruction")
+    library = build_library(frames, reconstruction, task.settings.instances)
+    clock.mark("instances")
+    keyframes = make_keyframes(frames, reconstruction, keep_jpeg=task.settings.keep_pictures)
+    samples = overlap_samples(reconstruction, task.settings.chunks.overlap)
+    clock.mark("keyframes")
+    if task.debug_dir is not None:
+        draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
+    return _result(task, frames, reconstruction, library, samples, bad, clock.seconds, keyframes)
+
+
+def _result(
+    task: ChunkTask,
+    frames: Sequence[Frame],
+    reconstruction: Reconstruction,
+    library: LocalLibrary,
+    samples: OverlapSamples,
+    bad: tuple[tuple[int, str], ...],
+    seconds: dict[str, float],
+    keyframes: tuple[Keyframe, ...],
+) -> ChunkResult:
+    camera = reconstruction.camera
+    return ChunkResult(
+        index=task.span.index,
+        frame_indices=reconstruction.frame_indices,
+        times_s=np.array([f.time_s for f in frames]),
+        posed=reconstruction.posed,
+        T_chunk_cam=reconstruction.T_chunk_cam,
+        T_source_cam=_given_poses(frames),
+        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        image_size=(camera.height, camera.width),
+        scale_kind=reconstruction.scale_kind,
+        keyframes=keyframes,
+        overlap=samples,
+        library=library,
+        bad_frames=bad,
+        seconds=seconds,
+    )
+
+
+def _without_geometry(
+    task: ChunkTask,
+    frames: Sequence[Frame],
+    camera: Camera,
+    bad: tuple[tuple[int, str], ...],
+    seconds: dict[str, float],
+) -> ChunkResult:
+    """A chunk through which the camera could not be followed: its frames are kept as lost."""
+    count = len(frames)
+    nothing = OverlapSamples(
+        np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    )
+    empty = Reconstruction(
+        frame_indices=np.array([f.index for f in frames], np.int64),
+        posed=np.zeros(count, bool),
+        T_chunk_cam=np.tile(np.eye(4), (count, 1, 1)),
+        camera=camera,
+        depth=np.zeros((count, camera.height, camera.width), np.float32),
+        confidence=np.zeros((count, camera.height, camera.width), np.float16),
+        scale_kind="metric",
+        keyframes=np.zeros(0, np.int64),
+    )
+    library = LocalLibrary((), np.zeros((0, 2), np.int32), task.settings.instances.feature_space)
+    return _result(task, frames, empty, library, nothing, bad, seconds, ())
+
+
+def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
+    if all(f.T_source_cam is None for f in frames):
+        return None
+    missing = np.full((4, 4), np.nan)
+    return np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
+
+
+@lru_cache(maxsize=2)
+def _source(path: str, options: SourceOptions) -> FrameSource:
+    return open_source(path, options)
+
+
+class _Clock:
+    """CPU seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.process_time()
+
+    def mark(self, stage: str) -> None:
+        now = time.process_time()
+        self.seconds[stage] = round(now - self._last, 3)
+        self._last = now

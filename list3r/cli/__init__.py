@@ -1,0 +1,5 @@
+"""The command line."""
+
+from list3r.cli.app import main
+
+__all__ = ["main"]

@@ -1,0 +1,85 @@
+"""The program `list3r`: its commands, and the one place where errors become one line and an exit status.
+
+Status 0: done. 1: the program failed, was interrupted, or a check found damage. 2: the input is wrong, and how to mend
+it is said.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+
+from list3r.cli import build_commands, evaluation_commands, file_commands, memory_commands, query_commands
+from list3r.memory.errors import List3rError
+
+app = typer.Typer(
+    name="list3r",
+    help="Object memory for long videos: build it, ask it, export it.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for module in (build_commands, memory_commands, query_commands, file_commands, evaluation_commands):
+    module.register(app)
+
+_USAGE_ERROR = typer.BadParameter.__mro__[1]
+_COMMAND_ERROR = typer.BadParameter.__mro__[2]
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+    if version:
+        from list3r import __version__
+
+        print(f"list3r {__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command; its exit status."""
+    command = typer.main.get_command(app)
+    try:
+        status = command.main(arguments, prog_name="list3r", standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except _USAGE_ERROR as error:
+        return _usage_error(error)
+    except _COMMAND_ERROR as error:
+        return _fail(error.format_message())  # type: ignore[attr-defined]
+    except List3rError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 1
+    except typer.Abort:
+        print("\ninterrupted", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        where = f" {error.filename}:" if error.filename else ""
+        return _fail(f"{where} {error.strerror or error}".strip())
+
+
+def _usage_error(error: BaseException) -> int:
+    context = getattr(error, "ctx", None)
+    message = error.format_message()  # type: ignore[attr-defined]
+    if not message:
+        print(context.get_help())
+        return 2
+    path = context.command_path if context is not None else "list3r"
+    return _fail(f"{message.rstrip('.')}; see `{path} --help`")
+
+
+def _fail(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return 2

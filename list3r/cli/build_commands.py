@@ -1,0 +1,195 @@
+"""inspect, build, demo: from a source to a memory."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli import source_options as src
+from list3r.cli.common import JsonOption, note, print_json
+
+if TYPE_CHECKING:
+    from list3r.pipeline import BuildReport
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.command("inspect")(inspect)
+    app.command("build")(build)
+    app.command("demo")(demo)
+
+
+def inspect(
+    source: src.SourceArgument,
+    kind: src.Kind = "auto",
+    every: src.Every = 1,
+    frames: src.Frames = None,
+    intrinsics: src.Intrinsics = None,
+    distortion: src.Distortion = None,
+    depth_intrinsics: src.DepthIntrinsics = None,
+    depth_to_color: src.DepthToColor = None,
+    registered: src.Registered = False,
+    depth_scale: src.DepthScale = None,
+    fps: src.Fps = None,
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Estimate the colour camera and the depth-to-colour transform.")
+    ] = False,
+    overlay: Annotated[
+        Path | None, typer.Option("--overlay", metavar="FILE", help="Write a picture of depth edges over colour.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Say what a source holds: kind, frames, size, depth, intrinsics, poses, and what is missing.
+
+    Example: list3r inspect walk.mp4 --json
+    """
+    from list3r.frames.inspection import describe, draw_registration, lines
+    from list3r.frames.source import open_source
+
+    options = src.source_options(**_source_words(locals()))
+    opened = open_source(source, options)
+    report = describe(opened.info)
+    if calibrate:
+        from list3r.frames.calibrate import calibrate as estimate
+
+        report["calibration"] = estimate(source, options).as_dict()
+    if overlay is not None:
+        draw_registration(opened, overlay)
+        report["overlay"] = str(overlay)
+    if json:
+        print_json(report)
+    else:
+        print("\n".join(lines(report)))
+
+
+def build(
+    source: src.SourceArgument,
+    memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
+    reconstruction: Annotated[str, typer.Option("--reconstruction", help="rgbd or auto.")] = "auto",
+    poses: Annotated[
+        str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
+    ] = "auto",
+    kind: src.Kind = "auto",
+    every: src.Every = 1,
+    frames: src.Frames = None,
+    intrinsics: src.Intrinsics = None,
+    distortion: src.Distortion = None,
+    depth_intrinsics: src.DepthIntrinsics = None,
+    depth_to_color: src.DepthToColor = None,
+    registered: src.Registered = False,
+    depth_scale: src.DepthScale = None,
+    fps: src.Fps = None,
+    chunk: Annotated[int, typer.Option("--chunk", help="Frames in a chunk.")] = 100,
+    overlap: Annotated[int, typer.Option("--overlap", help="Frames that neighbouring chunks share.")] = 30,
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
+    workers: Annotated[
+        int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a build that was interrupted.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing memory.")] = False,
+    debug: Annotated[
+        Path | None, typer.Option("--debug", metavar="DIR", help="Write overlays of masks and tracks there.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Build a memory from a video or a folder of frames.
+
+    Example: list3r build walk/ -m house.l3r
+    """
+    from list3r.chunk_stage import BuildSettings
+    from list3r.frames.chunks import ChunkSettings
+    from list3r.frames.source import open_source
+
+    options = src.source_options(**_source_words(locals()))
+    settings = BuildSettings(
+        reconstruction=reconstruction,
+        poses=poses,
+        chunks=ChunkSettings(length=chunk, overlap=overlap),
+        keep_pictures=pictures,
+    )
+    if not json:
+        info = open_source(source, options).info
+        for line in info.notes:
+            note(f"note: {line}")
+    run = {"options": options, "settings": settings, "workers": workers, "resume": resume, "force": force}
+    report = run_build(source, memory, quiet=json, debug_dir=debug, **run)
+    if json:
+        print_json({"memory": str(memory), **report.as_dict()})
+    else:
+        print("\n".join(report_lines(memory, report)))
+
+
+def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any) -> BuildReport:
+    """Build with a progress bar; Ctrl-C says how to go on."""
+    from tqdm import tqdm
+
+    from list3r.pipeline import build as build_memory
+
+    tqdm.monitor_interval = 0
+    with tqdm(unit="frame", desc="building", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        try:
+            return build_memory(source, memory, progress=progress, **arguments)
+        except KeyboardInterrupt:
+            bar.close()
+            if memory.exists():
+                note(f"\ninterrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
+            else:
+                note("\ninterrupted before the first chunk was finished; nothing was written")
+            raise typer.Exit(1) from None
+
+
+def report_lines(memory: Path, report: BuildReport) -> list[str]:
+    """What a build did, for people."""
+    size = memory.stat().st_size / 1e6
+    lines = [
+        f"{memory}  {size:.1f} MB",
+        f"frames     {report.posed} of {report.frames} posed, {report.lost} lost, {report.bad} unreadable",
+        f"chunks     {report.chunks} in {report.components} part{'s' * (report.components > 1)}, {report.loops} loops",
+        f"instances  {report.instances} things, {report.structure} pieces of structure, {report.relations} relations",
+        f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
+    ]
+    return lines + [f"note: {line}" for line in report.notes]
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the walk, the memory and the exports.")
+    ] = Path("list3r-demo"),
+    seed: Annotated[int, typer.Option("--seed", help="Another seed furnishes other rooms.")] = 1,
+    frames: Annotated[int, typer.Option("--frames", help="Length of the walk.")] = 300,
+    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Processes.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Simulate a walk through two furnished rooms, build its memory, ask it, export it. Nothing is downloaded.
+
+    Example: list3r demo --out /tmp/demo
+    """
+    from list3r.cli.demo import run_demo
+
+    report = run_demo(out, seed=seed, frames=frames, workers=workers, quiet=json)
+    if json:
+        print_json(report)
+
+
+def _source_words(words: dict[str, Any]) -> dict[str, Any]:
+    names = (
+        "kind",
+        "every",
+        "frames",
+        "intrinsics",
+        "distortion",
+        "depth_intrinsics",
+        "depth_to_color",
+        "registered",
+        "depth_scale",
+        "fps",
+    )
+    return {name: words[name] for name in names}

@@ -1,0 +1,73 @@
+"""What the commands share: how options are read and how results are shown."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from list3r.scene_memory import SceneMemory
+
+MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memory file.", show_default=False)]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
+
+
+def parse_point(text: str, option: str) -> tuple[float, float, float]:
+    """Three numbers with commas. Raises `OptionError` naming the option."""
+    from list3r.memory.errors import OptionError
+
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise OptionError(f"{option} {text!r}: three numbers with commas are needed, such as 0.5,1.2,0.8") from None
+    if not all(math.isfinite(v) for v in (x, y, z)):
+        raise OptionError(f"{option} {text!r}: the numbers must be finite")
+    return x, y, z
+
+
+def open_memory(path: Path) -> SceneMemory:
+    """The memory behind a path, for reading."""
+    from list3r.scene_memory import open as open_scene
+
+    return open_scene(path)
+
+
+def print_json(value: object) -> None:
+    """JSON on standard output; NaN becomes null."""
+    print(json.dumps(_plain(value), indent=2, allow_nan=False))
+
+
+def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
+    """Left-aligned columns under a header."""
+    cells = [list(header), *[[_cell(v) for v in row] for row in rows]]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
+    for row in cells:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def note(message: str) -> None:
+    """A line for people, on standard error."""
+    print(message, file=sys.stderr)
+
+
+def _cell(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays to lists, NumPy numbers to Python's, NaN to null, floats to six decimals."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value

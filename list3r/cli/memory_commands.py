@@ -1,0 +1,182 @@
+"""info, list, show: what a memory holds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+
+if TYPE_CHECKING:
+    from list3r.memory.records import Instance
+    from list3r.scene_memory import SceneMemory
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.command("info")(info)
+    app.command("list")(list_instances)
+    app.command("show")(show)
+
+
+def info(
+    memory: MemoryArgument,
+    loops: Annotated[
+        bool, typer.Option("--loops", help="List every measured relation of chunks and its verdict.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Say what a memory is: sessions, frames, scale, gravity, instances, loops.
+
+    Example: list3r info house.l3r --loops
+    """
+    with open_memory(memory) as scene:
+        report = memory_report(scene)
+        edges = [_edge(e) for e in scene.store.edges() if e.kind == "loop" or loops]
+    if json:
+        print_json({**report, "edges": edges} if loops else report)
+        return
+    for key, value in report.items():
+        if key != "sessions":
+            print(f"{key.replace('_', ' '):20} {value}")
+    for session in report["sessions"]:
+        print(
+            f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}"
+        )
+    if loops:
+        rows = [
+            [e["u"], e["v"], e["kind"], e["frames"], e["inliers"], e["residual_m"], e["weight"], e["reason"]]
+            for e in edges
+        ]
+        print_table(rows, ["u", "v", "kind", "frames", "inliers", "residual", "weight", "verdict"])
+
+
+def memory_report(scene: SceneMemory) -> dict[str, Any]:
+    """The facts of a memory."""
+    store = scene.store
+    frames, chunks, edges = store.frames(), store.chunks(), store.edges()
+    states = {state: sum(f.state == state for f in frames) for state in ("posed", "lost", "bad")}
+    return {
+        "path": str(scene.path),
+        "size_mb": round(scene.path.stat().st_size / 1e6, 2),
+        "created_by": store.get_value("created_by"),
+        "scale": store.get_value("scale_kind"),
+        "scale_source": store.get_value("scale_source"),
+        "units": scene.units,
+        "gravity": scene.gravity,
+        "frames": len(frames),
+        **states,
+        "chunks": len(chunks),
+        "parts": len({c.component for c in chunks}),
+        "loops_accepted": sum(e.kind == "loop" and e.accepted for e in edges),
+        "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
+        "things": len(store.instances(structure=False)),
+        "structure": len(store.instances(structure=True)),
+        "relations": len(store.relations()),
+        "aliases": len(store.aliases()),
+        "embedding_spaces": store.embedding_spaces(),
+        "sessions": [
+            {"id": s.session_id, "source": s.source, "frames": s.frame_count, "state": s.state}
+            for s in store.sessions()
+        ],
+    }
+
+
+def _edge(edge: Any) -> dict[str, Any]:
+    return {
+        "u": edge.u,
+        "v": edge.v,
+        "kind": edge.kind,
+        "frames": "" if edge.frames is None else "{}-{}".format(*edge.frames),
+        "inliers": edge.inliers,
+        "residual_m": edge.residual_m,
+        "weight": edge.weight,
+        "accepted": edge.accepted,
+        "reason": edge.reason,
+        "scores": edge.scores,
+    }
+
+
+def list_instances(
+    memory: MemoryArgument,
+    structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
+    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")] = 0.0,
+    json: JsonOption = False,
+) -> None:
+    """List the instances with their place and size.
+
+    Example: list3r list house.l3r --min-confidence 0.5
+    """
+    with open_memory(memory) as scene:
+        found = scene.instances(structure=None if structure else False)
+        units = scene.units
+    kept = [i for i in found if i.confidence >= min_confidence]
+    if json:
+        print_json([instance_dict(i) for i in kept])
+        return
+    rows = [
+        [
+            i.id,
+            i.label or i.description,
+            _triple(i.center),
+            _triple(i.box.size),
+            i.confidence,
+            i.observations,
+            i.structure or "",
+        ]
+        for i in kept
+    ]
+    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "structure"])
+
+
+def _triple(values: Any) -> str:
+    return " ".join(f"{v:6.2f}" for v in values)
+
+
+def show(
+    memory: MemoryArgument,
+    instance_id: Annotated[
+        int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
+    ],
+    json: JsonOption = False,
+) -> None:
+    """Show one instance: where, how big, when seen, its relations.
+
+    Example: list3r show house.l3r 12
+    """
+    with open_memory(memory) as scene:
+        instance = scene.instance(instance_id)
+        relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
+        names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
+        aliases = [old for old, _ in scene.store.aliases().items() if scene.store.resolve(old) == instance.id]
+        parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations(instance.id)]
+        units = scene.units
+    if json:
+        related = [vars(r) for r in relations]
+        print_json({**instance_dict(instance), "relations": related, "aliases": aliases, "observed_as": parts})
+        return
+    print(f"{instance.id}  {instance.label or instance.description}")
+    for key, value in (
+        ("center", f"{_triple(instance.center)} {units}"),
+        ("size", f"{_triple(instance.box.size)} {units}"),
+        (
+            "confidence",
+            f"{instance.confidence:.2f}, seen in {instance.observations} frames of {len(parts)} chunk instances",
+        ),
+        ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
+        ("aliases", ", ".join(map(str, aliases)) or "none"),
+    ):
+        print(f"  {key:11} {value}")
+    for r in relations:
+        print(
+            f"  {names.get(r.subject, '?')} ({r.subject}) {r.predicate} {names.get(r.object, '?')} ({r.object})"
+            f"  confidence {r.confidence:.2f}, margin {r.margin:.3f} {units}"
+        )
+
+
+def instance_dict(instance: Instance) -> dict[str, Any]:
+    """An instance in the words of the scene JSON."""
+    from list3r.exporters.scene_json import instance_entry
+
+    return instance_entry(instance)

@@ -1,0 +1,73 @@
+"""The options that say what is known of a source; the same words on every command that reads one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from list3r.frames.options import SourceOptions
+
+SourceArgument = Annotated[
+    str, typer.Argument(metavar="SOURCE", help="A video file, or a folder of frames.", show_default=False)
+]
+Kind = Annotated[str, typer.Option("--kind", help="auto, 7scenes, tum, replica, images or video.")]
+Every = Annotated[int, typer.Option("--every", metavar="N", help="Take every N-th frame.")]
+Frames = Annotated[
+    str | None,
+    typer.Option("--frames", metavar="START:STOP", help="Take frames START to STOP only, before --every."),
+]
+Intrinsics = Annotated[str | None, typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="Colour camera, px.")]
+Distortion = Annotated[
+    str | None, typer.Option("--distortion", metavar="K1,K2,P1,P2,K3", help="Lens of the colour camera (OpenCV).")
+]
+DepthIntrinsics = Annotated[
+    str | None,
+    typer.Option("--depth-intrinsics", metavar="FX,FY,CX,CY", help="Depth camera, px, if depth is not registered."),
+]
+DepthToColor = Annotated[
+    str | None,
+    typer.Option(
+        "--depth-to-color",
+        metavar="TRANSFORM",
+        help="Depth camera to colour camera: tx,ty,tz,qx,qy,qz,qw in metres, or a 4x4 matrix row by row, or a file.",
+    ),
+]
+Registered = Annotated[bool, typer.Option("--registered", help="Depth already lies on the colour image's pixels.")]
+DepthScale = Annotated[
+    float | None, typer.Option("--depth-scale", metavar="UNITS", help="Stored depth units per metre.")
+]
+Fps = Annotated[float | None, typer.Option("--fps", help="Frames a second of a source without a clock.")]
+
+
+def source_options(
+    *,
+    kind: str,
+    every: int,
+    frames: str | None,
+    intrinsics: str | None,
+    distortion: str | None,
+    depth_intrinsics: str | None,
+    depth_to_color: str | None,
+    registered: bool,
+    depth_scale: float | None,
+    fps: float | None,
+) -> SourceOptions:
+    """The words of the command line as options. Raises `OptionError` naming the option."""
+    from list3r.frames import options as words
+
+    start, stop = words.parse_range(frames) if frames else (None, None)
+    return words.SourceOptions(
+        kind=kind,
+        every=every,
+        start=start,
+        stop=stop,
+        intrinsics=words.parse_intrinsics(intrinsics, "--intrinsics") if intrinsics else None,
+        distortion=words.parse_distortion(distortion) if distortion else None,
+        depth_intrinsics=words.parse_intrinsics(depth_intrinsics, "--depth-intrinsics") if depth_intrinsics else None,
+        T_color_depth=words.parse_transform(depth_to_color, "--depth-to-color") if depth_to_color else None,
+        registered=registered,
+        depth_scale=depth_scale,
+        fps=fps,
+    )

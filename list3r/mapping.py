@@ -1,0 +1,77 @@
+"""What is done when a chunk arrives: join it to the others, place all chunks, consolidate the library.
+
+One transaction a chunk. All state lies in the store, so that a build that goes on after a crash takes the same path
+as one that was never interrupted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from list3r.association.alignment import align_overlap
+from list3r.association.pose_graph import optimize
+from list3r.association.revisits import find_loops
+from list3r.memory.consolidation import consolidate
+from list3r.memory.errors import DegenerateError
+from list3r.memory.geometry import Sim3
+from list3r.memory.gravity import estimate_gravity, world_from_graph
+from list3r.memory.records import ChunkResult, Edge
+from list3r.memory.store import Store
+
+
+def add_chunk(store: Store, session_id: int, result: ChunkResult) -> int:
+    """Add one chunk to the memory, all of it or nothing; its id."""
+    with store.transaction():
+        chunk_id = store.add_chunk(session_id, result)
+        given = store.get_value("poses") == "given"
+        store.add_edges(_edge_of_given_poses(store, session_id) if given else _adjacent_edge(store, session_id, result))
+        if not given:
+            store.add_edges(find_loops(store, chunk_id))
+        place_chunks(store)
+        consolidate(store, chunk_id)
+    return chunk_id
+
+
+def _adjacent_edge(store: Store, session_id: int, result: ChunkResult) -> list[Edge]:
+    """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it."""
+    chunks = store.chunks(session_id)
+    if len(chunks) < 2:
+        return []
+    u, v = chunks[-2], chunks[-1]
+    metric = u.scale_kind == v.scale_kind == "metric"
+    try:
+        return [align_overlap(store.overlap_samples(u.chunk_id), result.overlap, u.chunk_id, v.chunk_id, metric=metric)]
+    except DegenerateError:
+        return []
+
+
+def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
+    """With given poses all chunks have the source's own world as their frame."""
+    chunks = store.chunks(session_id)
+    if len(chunks) < 2:
+        return []
+    u, v = chunks[-2].chunk_id, chunks[-1].chunk_id
+    return [Edge(u, v, "adjacent", Sim3.identity(), 1.0, 1.0, 0, 0.0, True, "both lie in the source's own world")]
+
+
+def place_chunks(store: Store) -> None:
+    """Optimise the graph, find which way is up, and write where every chunk lies."""
+    chunks = store.chunks()
+    edges = store.edges()
+    metric = all(c.scale_kind == "metric" for c in chunks)
+    initial = _graph_poses(store)
+    graph = optimize([c.chunk_id for c in chunks], edges, initial, metric=metric)
+    store.add_edges(graph.edges)
+    store.place_chunks(graph.S_graph_chunk, graph.components)
+    store.set_value("T_world_graph", np.eye(4).tolist())
+    gravity = estimate_gravity(store)
+    T_world_graph = world_from_graph(gravity)
+    store.set_value("T_world_graph", T_world_graph.as_matrix().tolist())
+    store.set_value("gravity", gravity.status)
+    store.place_chunks({k: T_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components)
+
+
+def _graph_poses(store: Store) -> dict[int, Sim3]:
+    """Where the chunks lay before, in the graph's frame."""
+    T_graph_world = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist())).inverse()
+    return {c.chunk_id: T_graph_world @ c.S_world_chunk for c in store.chunks()}

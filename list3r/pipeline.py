@@ -1,0 +1,289 @@
+"""From a video to a memory: the page that reads like the paper's method, and the only writer of memories.
+
+frames -> chunks -> reconstruction + local instance library        (any process, side by side; `chunk_stage`)
+       -> edges -> graph -> up -> global instance library -> store (in order, one transaction each; `mapping`)
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from list3r import __version__
+from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
+from list3r.frames.base import SourceInfo
+from list3r.frames.chunks import ChunkSpan, plan_chunks
+from list3r.frames.source import SourceOptions, check_bad_share, open_source
+from list3r.mapping import add_chunk
+from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
+from list3r.memory.records import Session
+from list3r.memory.store import Store
+from list3r.workers import OrderedPool, default_workers
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all) after every chunk."""
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """What a build did."""
+
+    frames: int
+    posed: int
+    lost: int
+    bad: int
+    chunks: int
+    components: int
+    loops: int
+    instances: int
+    structure: int
+    relations: int
+    seconds: float
+    """Wall time of this run."""
+    frames_per_second: float
+    """Frames of this run (a resumed build counts only what it did itself) by wall time."""
+    resumed_chunks: int
+    """Chunks that an earlier run had finished."""
+    stage_seconds: dict[str, float]
+    """CPU seconds by stage, over all runs."""
+    notes: tuple[str, ...]
+    """What the user should know, one sentence each."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return asdict(self)
+
+
+def build(
+    source: str | Path,
+    memory: str | Path,
+    *,
+    options: SourceOptions | None = None,
+    settings: BuildSettings | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    force: bool = False,
+    debug_dir: str | Path | None = None,
+    progress: Progress | None = None,
+) -> BuildReport:
+    """Build the memory of one video; see `list3r.build` for the arguments.
+
+    Raises `SourceError`, `MemoryFileError`, `OptionError`, `TrackingError`; then nothing half-written is left, except a
+    memory with the chunks that were finished, which `resume` goes on with.
+    """
+    started = time.monotonic()
+    options = options or SourceOptions()
+    info = open_source(source, options).info
+    settings = resolve_settings(settings or BuildSettings(poses="auto"), info)
+    check_buildable(info, settings)
+    if workers is not None and workers < 1:
+        raise OptionError(f"--workers {workers}: at least 1 process is needed")
+    spans = plan_chunks(info.frame_count, settings.chunks)
+    if debug_dir is not None:
+        _make_folder(Path(debug_dir))
+    count = min(workers or default_workers(), len(spans))
+    pool = OrderedPool(process_chunk, count)
+    try:
+        with _open_target(Path(memory), resume=resume, force=force) as target:
+            session = _session(target.store, info, settings)
+            done = {c.index for c in target.store.chunks(session)}
+            tasks = [
+                ChunkTask(str(source), options, span, settings, None if debug_dir is None else str(debug_dir))
+                for span in spans
+                if span.index not in done
+            ]
+            _add_all(target, session, tasks, pool, info, progress)
+            return _finish(target.store, session, info, spans, done, started)
+    finally:
+        pool.stop()
+
+
+def _add_all(
+    target: _Target,
+    session: int,
+    tasks: list[ChunkTask],
+    pool: OrderedPool,
+    info: SourceInfo,
+    progress: Progress | None,
+) -> None:
+    bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
+    for task, result in zip(tasks, pool.map(tasks), strict=True):
+        bad.update(index for index, _ in result.bad_frames)
+        check_bad_share(len(bad), info.frame_count)
+        add_chunk(target.store, session, result)
+        target.keep()
+        if progress is not None:
+            progress(task.span.stop, info.frame_count)
+
+
+def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:
+    """Settings with `auto` replaced by what the source offers."""
+    poses, reconstruction = settings.poses, settings.reconstruction
+    if poses == "auto":
+        poses = "given" if info.has_poses else "estimate"
+    if reconstruction == "auto":
+        reconstruction = "rgbd"
+    return replace(settings, poses=poses, reconstruction=reconstruction)
+
+
+def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
+    """Raise an error that names the fix when the source cannot be built with the settings."""
+    if settings.poses not in ("given", "estimate"):
+        raise OptionError(f"--poses {settings.poses} is not known; choose estimate, given or auto")
+    if settings.reconstruction != "rgbd":
+        raise OptionError(f"--reconstruction {settings.reconstruction} is not known; this version has: rgbd, auto")
+    if not info.has_depth:
+        raise OptionError(
+            f"{info.path} has no depth, and this version reconstructs from RGB-D only; "
+            "give a folder in the 7-Scenes, TUM or Replica layout"
+        )
+    if info.camera is None:
+        raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
+    if settings.poses == "given" and not info.has_poses:
+        raise OptionError(f"{info.path} has no poses; use --poses estimate")
+
+
+class _Target:
+    """The memory being written. When nothing of worth came into it, what was there before is put back."""
+
+    def __init__(self, store: Store, *, fresh: bool, replaced: Path | None = None) -> None:
+        self.store = store
+        self._fresh = fresh
+        self._replaced = replaced
+
+    def keep(self) -> None:
+        """From now on the new memory stays, whatever happens."""
+        self._fresh = False
+        if self._replaced is not None:
+            self._replaced.unlink(missing_ok=True)
+            self._replaced = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.store.close()
+        if kind is not None and self._fresh:
+            self.store.path.unlink(missing_ok=True)
+            if self._replaced is not None:
+                self._replaced.rename(self.store.path)
+
+
+def _open_target(path: Path, *, resume: bool, force: bool) -> _Target:
+    if path.is_dir():
+        raise MemoryFileError(f"{path} is a folder; name a file for the memory, such as {path / 'memory.l3r'}")
+    if path.exists() and path.stat().st_size == 0:
+        path.unlink()
+    if not path.exists():
+        return _Target(Store.create(path), fresh=True)
+    if resume and not force:
+        return _Target(Store.open(path, writable=True), fresh=False)
+    if not force:
+        raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
+    Store.open(path, writable=True).close()
+    replaced = path.with_name(f"{path.name}.replaced")
+    path.rename(replaced)
+    return _Target(Store.create(path), fresh=True, replaced=replaced)
+
+
+def _session(store: Store, info: SourceInfo, settings: BuildSettings) -> int:
+    """The session to write to: a new one, or the one that a build before left unfinished."""
+    wanted = json.loads(json.dumps(asdict(settings)))
+    sessions = store.sessions()
+    if sessions:
+        _check_same(sessions[0], info, wanted, store)
+        return sessions[0].session_id
+    with store.transaction():
+        store.set_value("created_by", f"list3r {__version__}")
+        store.set_value("scale_kind", info.scale_kind)
+        store.set_value("scale_source", "sensor depth" if info.has_depth else "none")
+        store.set_value("gravity", "unknown")
+        store.set_value("poses", settings.poses)
+        return store.add_session(str(Path(info.path).resolve()), info.fingerprint, wanted, info.frame_count)
+
+
+def _check_same(session: Session, info: SourceInfo, wanted: dict[str, object], store: Store) -> None:
+    if session.fingerprint != info.fingerprint:
+        raise OptionError(
+            f"{store.path} was begun from {session.source} with other frames or camera options; "
+            "give the same source and options to --resume, or --force to begin anew"
+        )
+    different = sorted(k for k in wanted if session.settings.get(k) != wanted[k])
+    if different:
+        raise OptionError(
+            f"{store.path} was begun with other settings ({', '.join(different)}); "
+            "give the same ones to --resume, or --force to begin anew"
+        )
+
+
+def _finish(
+    store: Store, session: int, info: SourceInfo, spans: list[ChunkSpan], done: set[int], started: float
+) -> BuildReport:
+    frames = store.frames(session)
+    posed = sum(f.state == "posed" for f in frames)
+    if posed == 0:
+        raise TrackingError(
+            f"the camera could not be followed in any of the {len(frames)} frames of {info.path}; "
+            "check the depth scale and intrinsics with `list3r inspect`"
+        )
+    with store.transaction():
+        store.complete_session(session)
+    seconds = time.monotonic() - started
+    fresh = sum(s.stop - s.start for s in spans if s.index not in done)
+    overlap = sum(1 for s in spans if s.index not in done and s.index > 0) * _overlap(spans)
+    components = len({c.component for c in store.chunks()})
+    lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
+    return BuildReport(
+        frames=len(frames),
+        posed=posed,
+        lost=lost,
+        bad=bad,
+        chunks=len(spans),
+        components=components,
+        loops=sum(e.kind == "loop" and e.accepted for e in store.edges()),
+        instances=len(store.instances(structure=False)),
+        structure=len(store.instances(structure=True)),
+        relations=len(store.relations()),
+        seconds=round(seconds, 2),
+        frames_per_second=round(max(0, fresh - overlap) / seconds, 2),
+        resumed_chunks=len(done),
+        stage_seconds={k: round(v, 2) for k, v in store.stage_seconds().items()},
+        notes=_notes(store, lost, bad, components),
+    )
+
+
+def _overlap(spans: list[ChunkSpan]) -> int:
+    return spans[0].stop - spans[1].start if len(spans) > 1 else 0
+
+
+def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...]:
+    notes = []
+    if bad:
+        notes.append(f"{bad} frames could not be decoded and were skipped: {_listed(store)}")
+    if lost:
+        notes.append(f"the camera could not be followed in {lost} frames; they have no pose")
+    if components > 1:
+        notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
+    if store.get_value("gravity") == "unknown":
+        notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
+    return tuple(notes)
+
+
+def _listed(store: Store, most: int = 5) -> str:
+    rows = store.bad_frames()
+    shown = ", ".join(f"{index} ({reason})" for _, index, reason in rows[:most])
+    return shown + (f" and {len(rows) - most} more" if len(rows) > most else "")
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"the folder {path} cannot be made: {error.strerror}") from error

@@ -1,0 +1,81 @@
+"""A small pool of processes that keeps order and never runs far ahead of whoever takes the results."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from list3r.memory.errors import List3rError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+DEFAULT_LIMIT = 4
+"""Processes started unless more are asked for; each holds one chunk of frames (about 0.4 GB at 640x480)."""
+
+
+def default_workers() -> int:
+    """As many processes as there are cores to run on, at most `DEFAULT_LIMIT`."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    return max(1, min(cores, DEFAULT_LIMIT))
+
+
+class OrderedPool:
+    """Runs one function over tasks in processes; results come in the order of the tasks.
+
+    The processes start with the pool, before the caller opens files, so that they hold none of the caller's locks.
+    """
+
+    def __init__(self, work: Callable[[Task], Result], workers: int) -> None:
+        self._work = work
+        self._workers = workers
+        self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _prepare, (os.getpid(),))
+        self._executor.submit(os.getpid).result()
+
+    def map(self, tasks: Sequence[Task]) -> Iterator[Result]:
+        """Results in order; at most `workers + 1` tasks are under way or waiting to be taken."""
+        waiting: deque[Future[Result]] = deque()
+        upcoming = iter(tasks)
+        try:
+            for task in upcoming:
+                waiting.append(self._executor.submit(self._work, task))
+                if len(waiting) > self._workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        except BrokenProcessPool as error:
+            raise List3rError(
+                "a worker process was ended from outside, most likely for want of memory; "
+                "go on with --resume and fewer --workers"
+            ) from error
+
+    def stop(self) -> None:
+        """End the processes at once."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.kill()
+
+
+def _prepare(parent: int) -> None:
+    """In each process: leave Ctrl-C to the parent, use one thread, end when the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_follow, args=(parent,), daemon=True).start()
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+
+
+def _follow(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.3)
+    os._exit(1)
