@@ -1,0 +1,78 @@
+"""The memory as the exporters read it: one component, one frame of reference at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import ChunkRow, FrameRow, Instance, Support
+from list3r.memory.store import Store
+
+
+@dataclass(frozen=True)
+class Component:
+    """What shares one frame of reference. Two components were never placed against each other: do not overlay them."""
+
+    id: int
+    """The smallest chunk id of it."""
+    main: bool
+    """True for the component with the most posed frames."""
+    chunks: tuple[ChunkRow, ...]
+    poses: tuple[tuple[FrameRow, Sim3], ...]
+    """Posed frames in the order of sessions and frames, with their S_world_cam."""
+    instances: tuple[Instance, ...]
+    """By id."""
+
+    @property
+    def name(self) -> str:
+        """Empty for the main component, else `component_7`."""
+        return "" if self.main else f"component_{self.id}"
+
+
+def read_components(store: Store) -> list[Component]:
+    """The components of a memory, the main one first; an empty memory has one empty component."""
+    chunks = store.chunks()
+    component_of = {c.chunk_id: c.component for c in chunks}
+    poses = store.camera_poses()
+    instances = store.instances()
+    counts = dict.fromkeys([*component_of.values(), *(i.component for i in instances)], 0)
+    for frame, _ in poses:
+        counts[component_of[frame.chunk_id]] += 1
+    order = sorted(counts, key=lambda k: (-counts[k], k)) or [0]
+    return [
+        Component(
+            id=k,
+            main=k == order[0],
+            chunks=tuple(c for c in chunks if c.component == k),
+            poses=tuple(p for p in poses if component_of[p[0].chunk_id] == k),
+            instances=tuple(i for i in instances if i.component == k),
+        )
+        for k in order
+    ]
+
+
+def thinned_support(store: Store, instance: Instance, limit: int | None) -> Support:
+    """Surface points in the world, at most `limit` of them, finite; the same ones every time."""
+    support = store.support(instance.id)
+    keep = np.flatnonzero(np.isfinite(support.points).all(axis=1))
+    if limit is not None and len(keep) > limit:
+        keep = np.sort(np.random.default_rng(instance.id).choice(keep, limit, replace=False))
+    if len(keep) == len(support.points):
+        return support
+    return Support(support.points[keep], support.confidence[keep], support.rgb[keep])
+
+
+def has_box(instance: Instance) -> bool:
+    """Whether the instance has finite geometry."""
+    box = instance.box
+    return bool(np.isfinite([*box.center, *box.size, *box.rotation.ravel()]).all())
+
+
+def frames_per_second(frames: list[FrameRow]) -> float | None:
+    """Median rate of one session in frames of the source per second, None where the clock says nothing."""
+    known = [f for f in frames if f.state != "bad"]
+    steps = np.diff([f.time_s for f in known]), np.diff([f.frame_index for f in known])
+    rates = steps[1][steps[0] > 0] / steps[0][steps[0] > 0]
+    return float(np.median(rates)) if len(rates) else None

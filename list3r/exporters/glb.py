@@ -1,0 +1,114 @@
+"""Boxes and points as binary glTF, for any 3D viewer."""
+
+# mypy: disable-error-code="no-untyped-call"
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from list3r.exporters.components import Component, has_box, read_components, thinned_support
+from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.palette import Color, instance_color, linear_from_srgb, structure_color
+from list3r.memory.records import Instance
+from list3r.memory.store import Store
+
+T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""glTF has y up: its x, y, z are the world's x, z, -y."""
+
+_EDGES = ((0, 1), (0, 2), (0, 4), (3, 1), (3, 2), (3, 7), (5, 1), (5, 4), (5, 7), (6, 2), (6, 4), (6, 7))
+"""Pairs of `OrientedBox.corners` that differ along one axis."""
+
+
+@dataclass(frozen=True)
+class GlbSettings:
+    """What goes into the file."""
+
+    points_per_instance: int = 5000
+    """At most so many points of a thing."""
+    points_per_structure: int = 20000
+    """At most so many points of a floor, a wall and the like."""
+
+
+def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = None) -> tuple[Path, ...]:
+    """Node `instance_12` with its children `instance_12_points` and, for things, `instance_12_box` (lines).
+
+    The node `world` above them turns z up into the y up of glTF. Facts of an instance are the `extras` of its geometry.
+    Each component is a file of its own, the main one at `path`. Returns the files written.
+    """
+    path, settings = Path(path), settings or GlbSettings()
+    written = []
+    with contextlib.ExitStack() as stack:
+        for component in read_components(store):
+            target = part_path(path, component.name)
+            temporary = stack.enter_context(replacing(target))
+            temporary.write_bytes(_glb(store, component, settings))
+            written.append(target)
+    return tuple(written)
+
+
+def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
+    scene = trimesh.Scene(base_frame="scene")
+    scene.graph.update("world", "scene", matrix=T_GLTF_WORLD)
+    scene.metadata.update(_scene_facts(store, component))
+    for instance in component.instances:
+        limit = settings.points_per_structure if instance.structure else settings.points_per_instance
+        name = f"instance_{instance.id}"
+        scene.graph.update(name, "world")
+        support = thinned_support(store, instance, limit)
+        if len(support.points):
+            linear = np.round(255 * linear_from_srgb(support.rgb)).astype(np.uint8)
+            alpha = np.full((len(linear), 1), 255, np.uint8)
+            cloud = trimesh.PointCloud(support.points, colors=np.hstack([linear, alpha]))
+            _add(scene, cloud, f"{name}_points", name, instance)
+        if has_box(instance) and not instance.structure:
+            _add(scene, _wire_box(instance), f"{name}_box", name, instance)
+    if not scene.geometry:
+        _add_nothing(scene)
+    return bytes(scene.export(file_type="glb", unitize_normals=False))
+
+
+def _add(scene: trimesh.Scene, geometry: Any, name: str, parent: str, instance: Instance) -> None:
+    geometry.metadata.update(_facts(instance))
+    scene.add_geometry(geometry, node_name=name, geom_name=name, parent_node_name=parent)
+
+
+def _add_nothing(scene: trimesh.Scene) -> None:
+    """glTF of trimesh needs one geometry: an empty memory gives one invisible point at the origin."""
+    scene.add_geometry(
+        trimesh.PointCloud(np.zeros((1, 3)), colors=np.zeros((1, 4), np.uint8)), node_name="empty", geom_name="empty"
+    )
+
+
+def _wire_box(instance: Instance) -> trimesh.path.Path3D:
+    entities = [trimesh.path.entities.Line(np.array(edge)) for edge in _EDGES]
+    color: Color = (structure_color if instance.structure else instance_color)(instance.id)
+    rgba: NDArray[np.uint8] = np.append(np.round(255 * linear_from_srgb(color)), 255).astype(np.uint8)
+    return trimesh.path.Path3D(
+        entities=entities, vertices=instance.box.corners(), colors=np.tile(rgba, (len(entities), 1)), process=False
+    )
+
+
+def _facts(instance: Instance) -> dict[str, Any]:
+    return {
+        "id": instance.id,
+        "label": instance.label or "",
+        "description": instance.description,
+        "confidence": round(float(instance.confidence), 4),
+        "state": instance.state,
+        "structure": instance.structure or "",
+    }
+
+
+def _scene_facts(store: Store, component: Component) -> dict[str, Any]:
+    return {
+        "list3r_units": units(store),
+        "list3r_metric": store.get_value("scale_kind", "relative"),
+        "list3r_gravity": store.get_value("gravity", "unknown"),
+        "list3r_component": component.id,
+    }

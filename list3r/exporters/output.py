@@ -1,0 +1,67 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from list3r.memory.errors import ExportError
+from list3r.memory.store import Store
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary name beside `path` to write to; it takes the place of `path` when the block ends well.
+
+    Raises `ExportError` before the block when the folder is absent or not writable or when something stands at `path`
+    that an export must not replace (a folder, a device, a memory file), and for every failure of the disk inside it.
+    """
+    path = Path(path)
+    check_target(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        temporary.write_bytes(b"")
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise ExportError(f"{path} cannot be written: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def check_target(path: Path) -> None:
+    """Raises `ExportError` when `path` cannot or must not be written."""
+    try:
+        if not path.parent.is_dir():
+            raise ExportError(f"the folder {path.parent} does not exist; create it first")
+        if path.is_dir():
+            raise ExportError(f"{path} is a folder; name a file in it")
+        if path.exists() and not path.is_file():
+            raise ExportError(f"{path} is not a regular file; name another one")
+        if path.is_file() and _is_database(path):
+            raise ExportError(f"{path} is a memory file or another SQLite database; name another file for the export")
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise ExportError(f"the folder {path.parent} is not writable; choose another one or change its permissions")
+    except OSError as error:
+        raise ExportError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _is_database(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(16) == b"SQLite format 3\x00"
+    except PermissionError:
+        return False
+
+
+def part_path(path: Path, name: str) -> Path:
+    """Where a further part of an export goes: `scene.component_7.ply` beside `scene.ply`; `path` for no name."""
+    return path.with_name(f"{path.stem}.{name}{path.suffix}") if name else path
+
+
+def units(store: Store) -> str:
+    """Unit of length: "m" for a metric or anchored memory, "unit" for a relative one, whose scale is arbitrary."""
+    return "m" if store.get_value("scale_kind", "relative") in ("metric", "anchored") else "unit"

@@ -1,0 +1,173 @@
+"""The scene graph as JSON: the fixed fields of `scene.schema.json`, readable without any of our code."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from list3r.exporters.components import Component, frames_per_second, has_box, read_components
+from list3r.exporters.output import replacing, units
+from list3r.memory.geometry import quat_wxyz_from_rotation
+from list3r.memory.records import Instance, Relation
+from list3r.memory.store import Store
+
+FORMAT = "list3r-scene-graph"
+VERSION = 1
+_METRIC_DECIMALS = 4
+"""Lengths of a metric memory are written to 0.1 mm."""
+
+
+def scene_schema() -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) that every scene keeps."""
+    text = resources.files("list3r.exporters").joinpath("scene.schema.json").read_text(encoding="utf-8")
+    return dict(json.loads(text))
+
+
+def write_scene_json(store: Store, path: str | Path) -> tuple[Path, ...]:
+    """Write `scene_dict` to a file, one instance or relation a line. Returns the file written."""
+    scene = scene_dict(store)
+    with replacing(path) as temporary:
+        temporary.write_text(_lay_out(scene), encoding="utf-8")
+    return (Path(path),)
+
+
+def scene_dict(store: Store) -> dict[str, Any]:
+    """The scene graph of a memory as plain JSON values, without NaN.
+
+    `frame.up` is [0, 0, 1] where gravity is known or estimated and null where it is unknown; `frame.units` is "m" for
+    a metric or anchored memory and "unit" for a relative one; geometry that an instance lacks is null. Coordinates of
+    instances of different `component` are not comparable.
+    """
+    components = read_components(store)
+    gravity = store.get_value("gravity", "unknown")
+    decimals = _length_decimals(store, components)
+    instances = sorted((i for c in components for i in c.instances), key=lambda i: i.id)
+    known = {i.id for i in instances}
+    relations = [r for r in store.relations() if r.subject in known and r.object in known]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "frame": {
+            "up": None if gravity == "unknown" else [0, 0, 1],
+            "units": units(store),
+            "metric": store.get_value("scale_kind", "relative"),
+            "metric_source": store.get_value("scale_source"),
+            "gravity": gravity,
+        },
+        "sessions": _sessions(store),
+        "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
+        "instances": [_instance(i, decimals) for i in instances],
+        "relations": [_relation(r, decimals) for r in relations],
+        "aliases": [{"id": k, "instance": v} for k, v in store.aliases().items()],
+    }
+
+
+def _length_decimals(store: Store, components: list[Component]) -> int:
+    """Decimals of lengths: 0.1 mm where metric, 1e-5 of the scene's extent where the unit is arbitrary."""
+    centers = [i.center for c in components for i in c.instances if np.isfinite(i.center).all()]
+    if units(store) == "m" or not centers:
+        return _METRIC_DECIMALS
+    extent = float(np.max(np.ptp(centers, axis=0))) or 1.0
+    return int(np.clip(5 - np.floor(np.log10(extent)), _METRIC_DECIMALS, 15))
+
+
+def _number(value: float, decimals: int) -> float | None:
+    return round(float(value), decimals) + 0.0 if np.isfinite(value) else None
+
+
+def _vector(values: ArrayLike, decimals: int) -> list[float] | None:
+    """Rounded numbers, without negative zero; None where one is not finite."""
+    flat = np.asarray(values, dtype=np.float64).ravel()
+    return [float(v) + 0.0 for v in np.round(flat, decimals)] if np.isfinite(flat).all() else None
+
+
+def _instance(instance: Instance, decimals: int) -> dict[str, Any]:
+    box, view = instance.box, instance.best_view
+    low, high = _vector(instance.aabb[0], decimals), _vector(instance.aabb[1], decimals)
+    return {
+        "id": instance.id,
+        "label": instance.label,
+        "description": instance.description,
+        "center": _vector(instance.center, decimals),
+        "aabb": {"min": low, "max": high} if low and high else None,
+        "box": {
+            "center": _vector(box.center, decimals),
+            "size": _vector(box.size, decimals),
+            "quat_wxyz": _vector(quat_wxyz_from_rotation(box.rotation), 6),
+        }
+        if has_box(instance)
+        else None,
+        "confidence": _number(instance.confidence, 4),
+        "observations": instance.observations,
+        "first_seen": _number(instance.first_seen_s, 6),
+        "last_seen": _number(instance.last_seen_s, 6),
+        "state": instance.state,
+        "structure": instance.structure is not None,
+        "structure_kind": instance.structure,
+        "color": {"name": instance.color_name, "rgb": [int(v) for v in instance.color_rgb]},
+        "component": instance.component,
+        "best_view": None
+        if view is None
+        else {"session": view.session_id, "frame": view.frame_index, "box_xyxy": _vector(view.box_xyxy, 1)},
+    }
+
+
+def _relation(relation: Relation, decimals: int) -> dict[str, Any]:
+    return {
+        "subject": relation.subject,
+        "predicate": relation.predicate,
+        "object": relation.object,
+        "confidence": _number(relation.confidence, 4),
+        "margin": _number(relation.margin, decimals),
+    }
+
+
+def _component(component: Component, count: int) -> dict[str, Any]:
+    note = "the frame of reference of the memory" if component.main else "not placed against the main component"
+    return {
+        "id": component.id,
+        "main": component.main,
+        "chunks": [c.chunk_id for c in component.chunks],
+        "posed_frames": len(component.poses),
+        "note": note if count > 1 else "all of the memory shares one frame of reference",
+    }
+
+
+def _sessions(store: Store) -> list[dict[str, Any]]:
+    found = []
+    for session in store.sessions():
+        frames = store.frames(session.session_id)
+        states = [f.state for f in frames]
+        cameras = dict.fromkeys((*c.intrinsics, *c.image_size) for c in store.chunks(session.session_id))
+        rate = frames_per_second(frames)
+        found.append(
+            {
+                "id": session.session_id,
+                "source": session.source,
+                "state": session.state,
+                "frames": {k: states.count(k) for k in ("posed", "lost", "bad")},
+                "fps": None if rate is None else _number(rate, 3),
+                "cameras": [
+                    {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": int(width), "height": int(height)}
+                    for fx, fy, cx, cy, height, width in cameras
+                ],
+            }
+        )
+    return found
+
+
+def _lay_out(scene: dict[str, Any]) -> str:
+    """JSON with one item of each list a line: short enough to read, stable enough to compare."""
+    parts = []
+    for key, value in scene.items():
+        if isinstance(value, list) and value:
+            items = ",\n".join(f"  {json.dumps(v, allow_nan=False, ensure_ascii=False)}" for v in value)
+            parts.append(f' "{key}": [\n{items}\n ]')
+        else:
+            parts.append(f' "{key}": {json.dumps(value, allow_nan=False, ensure_ascii=False)}')
+    return "{\n" + ",\n".join(parts) + "\n}\n"
