@@ -1,0 +1,96 @@
+"""Errors of a reconstructed cloud: accuracy, completeness, Chamfer distance, normal consistency, F-score."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from list3r.memory.errors import OptionError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CloudErrors:
+    """How a cloud differs from the truth, both in one frame of reference and in metres."""
+
+    accuracy_cm: float
+    """Mean distance from the estimate's points to the truth."""
+    accuracy_median_cm: float
+    completeness_cm: float
+    """Mean distance from the truth's points to the estimate."""
+    completeness_median_cm: float
+    chamfer_cm: float
+    """Mean of accuracy and completeness."""
+    normal_consistency: float | None
+    """Mean |cosine| between normals of nearest points, both ways, in [0, 1]; None without normals."""
+    threshold_cm: float
+    precision: float
+    """Share of the estimate's points within the threshold of the truth."""
+    recall: float
+    """Share of the truth's points within the threshold of the estimate."""
+    f_score: float
+    """Harmonic mean of the two (Knapitsch et al., "Tanks and temples", 2017)."""
+
+    def as_dict(self) -> dict[str, float | None]:
+        """Plain numbers for JSON."""
+        return asdict(self)
+
+
+def evaluate_cloud(
+    truth: ArrayLike,
+    estimate: ArrayLike,
+    truth_normals: ArrayLike | None = None,
+    estimate_normals: ArrayLike | None = None,
+    threshold_m: float = 0.05,
+    truncate_m: float | None = None,
+) -> CloudErrors:
+    """Compare two clouds (N, 3) and (M, 3) of one frame of reference, metres; normals, if any, of unit length.
+
+    `truncate_m` caps single distances, where parts of the truth were never in view; None leaves them. Raises
+    `OptionError` for an empty cloud and for points that are not finite.
+    """
+    a, b = _points(truth, "truth"), _points(estimate, "estimate")
+    to_truth, row_truth = _nearest(a, b)
+    to_estimate, row_estimate = _nearest(b, a)
+    precision, recall = float(np.mean(to_truth <= threshold_m)), float(np.mean(to_estimate <= threshold_m))
+    if truncate_m is not None:
+        to_truth, to_estimate = np.minimum(to_truth, truncate_m), np.minimum(to_estimate, truncate_m)
+    consistency = None
+    if truth_normals is not None and estimate_normals is not None:
+        n, m = np.asarray(truth_normals, dtype=np.float64), np.asarray(estimate_normals, dtype=np.float64)
+        if n.shape != a.shape or m.shape != b.shape:
+            raise OptionError(f"normals of shape {n.shape} and {m.shape} for points of shape {a.shape} and {b.shape}")
+        there = np.abs(np.einsum("nk,nk->n", n[row_truth], m)).mean()
+        back = np.abs(np.einsum("nk,nk->n", n, m[row_estimate])).mean()
+        consistency = float((there + back) / 2)
+    return CloudErrors(
+        accuracy_cm=100 * float(to_truth.mean()),
+        accuracy_median_cm=100 * float(np.median(to_truth)),
+        completeness_cm=100 * float(to_estimate.mean()),
+        completeness_median_cm=100 * float(np.median(to_estimate)),
+        chamfer_cm=50 * float(to_truth.mean() + to_estimate.mean()),
+        normal_consistency=consistency,
+        threshold_cm=100 * threshold_m,
+        precision=precision,
+        recall=recall,
+        f_score=2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
+    )
+
+
+def _nearest(targets: Array, points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Distance to the nearest target of each point, and its row."""
+    distance, row = cKDTree(targets).query(points)
+    return np.asarray(distance, dtype=np.float64), np.asarray(row, dtype=np.int64)
+
+
+def _points(points: ArrayLike, name: str) -> Array:
+    p = np.asarray(points, dtype=np.float64)
+    if p.ndim != 2 or p.shape[1] != 3 or len(p) == 0:
+        raise OptionError(f"the {name} cloud has shape {p.shape}; want (N, 3) with at least one point")
+    if not np.isfinite(p).all():
+        raise OptionError(f"the {name} cloud has points that are not finite; leave them out first")
+    return p

@@ -1,0 +1,123 @@
+"""A scene JSON held against the truth of its world: instances and relations in one go."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from list3r.evaluation.boxes import transform_box, upright
+from list3r.evaluation.instances import InstanceErrors, evaluate_instances
+from list3r.evaluation.relations import RelationErrors, evaluate_relations
+from list3r.evaluation.trajectory import Trajectory, align, associate
+from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz
+
+
+def read_scene(path: str | Path) -> dict[str, Any]:
+    """Read a scene JSON or a `truth.json`. Raises `SourceError` for a file that is neither."""
+    try:
+        scene = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise SourceError(f"{path} is not JSON ({error}); want a scene graph of `list3r export --to json`") from error
+    if not isinstance(scene, dict) or not isinstance(scene.get("instances"), list):
+        raise SourceError(f"{path} has no list of instances; want a scene graph of `list3r export --to json`")
+    return scene
+
+
+def scene_boxes(scene: Mapping[str, Any], S_truth_scene: Sim3 | None = None) -> dict[int, OrientedBox]:
+    """Upright boxes by id, of all that is no structure and not gone, moved into the frame of the truth."""
+    move = S_truth_scene or Sim3.identity()
+    out = {}
+    for entry in scene["instances"]:
+        if entry.get("structure") or entry.get("state", "present") == "removed":
+            continue
+        out[int(entry["id"])] = upright(transform_box(move, _box(entry)), tilt_deg=10.0)
+    return out
+
+
+def scene_relations(scene: Mapping[str, Any]) -> list[tuple[int, str, int]]:
+    """Triples (subject, predicate, object) of a scene or truth."""
+    return [(int(r["subject"]), str(r["predicate"]), int(r["object"])) for r in scene.get("relations", [])]
+
+
+def alignment_of(truth: Trajectory, estimate: Trajectory, *, with_scale: bool, tolerance_s: float = 0.01) -> Sim3:
+    """S_truth_scene from the camera's path in both frames of reference. Raises as `align` does."""
+    rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
+    if len(rows) < 3:
+        raise OptionError(f"{len(rows)} poses within {tolerance_s} s of each other; both need one clock")
+    return align(truth.at(rows_truth), estimate.at(rows), with_scale=with_scale)
+
+
+def evaluate_scene_instances(
+    scene: Mapping[str, Any],
+    truth: Mapping[str, Any],
+    S_truth_scene: Sim3 | None = None,
+    iou_threshold: float = 0.25,
+    min_px: int = 0,
+) -> InstanceErrors:
+    """Match the objects of a scene with the true ones that once covered `min_px` pixels of a frame, structure aside.
+
+    The rows of `matches` number the ids of either side in ascending order, see `scene_boxes`.
+    """
+    true = _seen_boxes(truth, min_px)
+    boxes = scene_boxes(scene, S_truth_scene)
+    return evaluate_instances([true[k] for k in sorted(true)], [boxes[k] for k in sorted(boxes)], iou_threshold)
+
+
+def evaluate_scene(
+    scene: Mapping[str, Any], truth: Mapping[str, Any], S_truth_scene: Sim3 | None = None, min_px: int = 150
+) -> dict[str, Any]:
+    """Everything at once, as plain numbers: instances at IoU 0.25 and 0.5, relations over those matched at 0.25.
+
+    `S_truth_scene` takes the scene's world to that of the truth (see `alignment_of`); None when they are the same.
+    `matched_ids` lists (true id, scene id, IoU), `missed` the true things without a match.
+    """
+    loose = evaluate_scene_instances(scene, truth, S_truth_scene, 0.25, min_px)
+    strict = evaluate_scene_instances(scene, truth, S_truth_scene, 0.50, min_px)
+    true_ids, scene_ids = sorted(_seen_boxes(truth, min_px)), sorted(scene_boxes(scene, S_truth_scene))
+    matched = [(true_ids[t], scene_ids[e], round(iou, 4)) for t, e, iou in loose.matches]
+    found = {t for t, _, _ in matched}
+    labels = {int(e["id"]): e.get("label") for e in truth["instances"]}
+    return {
+        "instances_0.25": _without_rows(loose),
+        "instances_0.50": _without_rows(strict),
+        "relations": relations_of_matches(scene, truth, matched).as_dict(),
+        "matched_ids": matched,
+        "missed": [{"id": k, "label": labels[k]} for k in true_ids if k not in found],
+    }
+
+
+def relations_of_matches(
+    scene: Mapping[str, Any], truth: Mapping[str, Any], matched: list[tuple[int, int, float]]
+) -> RelationErrors:
+    """Relations over pairs (true id, scene id, IoU)."""
+    truth_of = {scene_id: true_id for true_id, scene_id, _ in matched}
+    return evaluate_relations(scene_relations(truth), scene_relations(scene), truth_of)
+
+
+def _seen_boxes(truth: Mapping[str, Any], min_px: int) -> dict[int, OrientedBox]:
+    boxes = scene_boxes(truth)
+    area = {int(e["id"]): e.get("largest_px", min_px) for e in truth["instances"]}
+    return {k: box for k, box in boxes.items() if area[k] >= min_px}
+
+
+def _without_rows(errors: InstanceErrors) -> dict[str, Any]:
+    return {k: v for k, v in errors.as_dict().items() if k != "matches"}
+
+
+def _box(entry: Mapping[str, Any]) -> OrientedBox:
+    try:
+        box = entry["box"]
+        center, size = np.array(box["center"], dtype=np.float64), np.array(box["size"], dtype=np.float64)
+        rotation = rotation_from_quat_wxyz(np.array(box["quat_wxyz"], dtype=np.float64))
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"instance {entry.get('id')} has no box with center, size and quat_wxyz") from error
+    if center.shape != (3,) or size.shape != (3,) or rotation.shape != (3, 3):
+        raise SourceError(f"instance {entry.get('id')} has a box of wrong length; want 3 + 3 + 4 numbers")
+    return OrientedBox(center, size, rotation)

@@ -1,0 +1,168 @@
+"""Ray casting of a world: colour, depth and ids of what each pixel shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.simulation.shading import ContactShadows, TextureAtlas, illumination, surface
+from list3r.simulation.things import BOX, CYLINDER, stack_solids
+from list3r.simulation.world import World
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_NEAR_M = 0.05
+_EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)])
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """What a perfect camera sees."""
+
+    color: Floats
+    """RGB in [0, 255]. Shape (H, W, 3)."""
+    depth: Floats
+    """Along the camera's z, metres, 0 where nothing is hit. Shape (H, W)."""
+    ids: NDArray[np.int32]
+    """Id of the thing, 0 for nothing. Shape (H, W)."""
+    incidence: Floats
+    """Cosine between the ray and the surface's normal, in [0, 1]. Shape (H, W)."""
+
+
+class Renderer:
+    """Draws a world with one camera. Solids are culled by the rectangle of their corners and drawn near to far."""
+
+    def __init__(self, world: World, camera: Camera) -> None:
+        self._world = world
+        self._camera = camera
+        self._solids = stack_solids(world.things)
+        self._corners = self._solids.corners()
+        self._atlas = TextureAtlas(self._solids)
+        self._shadows = ContactShadows(world, self._solids)
+        self._x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
+        self._y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
+
+    def render(self, T_world_cam: Array) -> RenderedFrame:
+        """The picture from a pose. Shape (4, 4)."""
+        depth, solid = self._cast(T_world_cam)
+        rotation, eye = T_world_cam[:3, :3].astype(np.float32), T_world_cam[:3, 3].astype(np.float32)
+        shape = depth.shape
+        hit = np.flatnonzero(solid.ravel() >= 0)
+        seen, z = solid.ravel()[hit], depth.ravel()[hit]
+        rays = np.stack(np.broadcast_arrays(self._x[None, :], self._y[:, None], np.float32(1.0)), -1).reshape(-1, 3)
+        rays = rays[hit] @ rotation.T
+        points = eye + z[:, None] * rays
+        toward = -rays / np.linalg.norm(rays, axis=1)[:, None]
+        normals, u, v = surface(self._solids, seen, points, toward)
+        cosine = np.einsum("nk,nk->n", normals, toward)
+        footprint = z / self._camera.fx / np.sqrt(np.maximum(cosine, 0.05))
+        albedo = self._atlas.sample(self._solids.material[seen], u, v, footprint)
+        light = illumination(self._world, points, normals) * self._shadows.factor(points, normals[:, 2] > 0.9)
+        color, ids = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.int32)
+        incidence = np.zeros(shape, np.float32)
+        color.reshape(-1, 3)[hit] = np.minimum(albedo * light[:, None], 255)
+        ids.ravel()[hit], incidence.ravel()[hit] = self._solids.thing[seen], cosine
+        return RenderedFrame(color, np.where(solid >= 0, depth, 0).astype(np.float32), ids, incidence)
+
+    def _cast(self, T_world_cam: Array) -> tuple[Floats, NDArray[np.int64]]:
+        """Depth (inf where nothing is hit) and number of the nearest solid (-1 for none) of every pixel."""
+        camera = self._camera
+        depth = np.full((camera.height, camera.width), np.inf, np.float32)
+        solid = np.full((camera.height, camera.width), -1, np.int64)
+        nearest, rects = self._rectangles(T_world_cam)
+        for n in np.argsort(nearest, kind="stable"):
+            left, top, right, bottom = rects[n]
+            if right <= left or bottom <= top:
+                continue
+            window = (slice(top, bottom), slice(left, right))
+            before = depth[window]
+            if before.max() <= nearest[n]:
+                continue
+            found = self._intersect(int(n), T_world_cam, self._x[left:right], self._y[top:bottom])
+            closer = found < before
+            depth[window] = np.where(closer, found, before)
+            solid[window][closer] = n
+        return depth, solid
+
+    def _rectangles(self, T_world_cam: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Least depth (N,) and pixel rectangle [left, right) x [top, bottom) (N, 4) of every solid."""
+        camera = self._camera
+        local = (self._corners - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+        a, b = local[:, _EDGES[:, 0]], local[:, _EDGES[:, 1]]
+        za, zb = a[..., 2], b[..., 2]
+        share = np.clip((_NEAR_M - za) / np.where(np.abs(zb - za) < 1e-12, 1e-12, zb - za), 0, 1)
+        cut = a + share[..., None] * (b - a)
+        points = np.concatenate([local, cut], axis=1)
+        ahead = points[..., 2] >= _NEAR_M * (1 - 1e-6)
+        z = np.where(ahead, points[..., 2], 1.0)
+        px, py = camera.fx * points[..., 0] / z + camera.cx, camera.fy * points[..., 1] / z + camera.cy
+        left, top = np.where(ahead, px, np.inf).min(axis=1), np.where(ahead, py, np.inf).min(axis=1)
+        right, bottom = np.where(ahead, px, -np.inf).max(axis=1), np.where(ahead, py, -np.inf).max(axis=1)
+        rects = np.stack([np.ceil(left), np.ceil(top), np.floor(right) + 1, np.floor(bottom) + 1], axis=1)
+        size = np.array([camera.width, camera.height, camera.width, camera.height])
+        return np.maximum(local[..., 2].min(axis=1), 0.0), np.clip(rects, 0, size).astype(np.int64)
+
+    def _intersect(self, n: int, T_world_cam: Array, x: Floats, y: Floats) -> Floats:
+        """Depth at which the rays of a window meet solid `n`, inf where they miss. Shape (len(y), len(x))."""
+        solids = self._solids
+        c, s = np.cos(solids.yaw[n]), np.sin(solids.yaw[n])
+        to_local = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        rotation = (to_local @ T_world_cam[:3, :3]).astype(np.float32)
+        origin = (to_local @ (T_world_cam[:3, 3] - solids.center[n])).astype(np.float32)
+        rays = [r[0] * x[None, :] + (r[1] * y + r[2])[:, None] for r in rotation]
+        half = solids.half[n].astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if solids.kind[n] == BOX:
+                return _hit_box(origin, rays, half)
+            if solids.kind[n] == CYLINDER:
+                return _hit_cylinder(origin, rays, half, bool(solids.open_top[n]))
+            return _hit_sphere(origin, rays, float(half[0]), bool(solids.open_top[n]))
+
+
+def _hit_box(origin: Floats, rays: list[Floats], half: Floats) -> Floats:
+    """Slab test (Kay and Kajiya, 1986)."""
+    enter = np.full(rays[0].shape, _NEAR_M, np.float32)
+    leave = np.full(rays[0].shape, np.inf, np.float32)
+    for o, d, h in zip(origin, rays, half, strict=True):
+        inverse = 1.0 / d
+        a, b = (-h - o) * inverse, (h - o) * inverse
+        np.maximum(enter, np.minimum(a, b), out=enter)
+        np.minimum(leave, np.maximum(a, b), out=leave)
+    return np.where(enter <= leave, enter, np.inf).astype(np.float32)
+
+
+def _hit_cylinder(origin: Floats, rays: list[Floats], half: Floats, open_top: bool) -> Floats:
+    """Wall from outside or, where the top is open, from inside; then the caps."""
+    (dx, dy, dz), (ox, oy, oz), radius, h = rays, origin, half[0], half[2]
+    a, b = dx * dx + dy * dy, ox * dx + oy * dy
+    root = np.sqrt(b * b - a * (ox * ox + oy * oy - radius * radius))
+    best = np.full(dx.shape, np.inf, np.float32)
+    for sign in (-1.0, 1.0) if open_top else (-1.0,):
+        t = (-b + sign * root) / a
+        good = (np.abs(oz + t * dz) <= h) & (t > _NEAR_M)
+        best = np.where(good & (t < best), t, best)
+    for level in (-h,) if open_top else (-h, h):
+        t = (level - oz) / dz
+        good = ((ox + t * dx) ** 2 + (oy + t * dy) ** 2 <= radius * radius) & (t > _NEAR_M)
+        best = np.where(good & (t < best), t, best)
+    return np.asarray(best, dtype=np.float32)
+
+
+def _hit_sphere(origin: Floats, rays: list[Floats], radius: float, open_top: bool) -> Floats:
+    """Nearest root, or the nearest on the lower half."""
+    dx, dy, dz = rays
+    a = dx * dx + dy * dy + dz * dz
+    b = origin[0] * dx + origin[1] * dy + origin[2] * dz
+    root = np.sqrt(b * b - a * (float(origin @ origin) - radius * radius))
+    best = np.full(dx.shape, np.inf, np.float32)
+    for sign in (-1.0, 1.0) if open_top else (-1.0,):
+        t = (-b + sign * root) / a
+        good = t > _NEAR_M
+        if open_top:
+            good &= origin[2] + t * dz <= 0
+        best = np.where(good & (t < best), t, best)
+    return np.asarray(best, dtype=np.float32)

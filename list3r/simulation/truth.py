@@ -1,0 +1,84 @@
+"""What is true of a world, in words that a scene graph can be held against."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
+from list3r.simulation.things import Thing
+from list3r.simulation.world import World
+
+NEXT_TO_GAP_M = 0.25
+"""Things on one support are next to each other up to this gap between their footprints, metres."""
+
+
+def world_truth(world: World, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
+    """The content of `truth.json`: frame, instances with boxes, relations.
+
+    `seen` maps the id of a thing to counts of the walk: frames in which it shows, and its largest area in pixels.
+    """
+    return {
+        "format": "list3r-simulated-truth",
+        "version": 1,
+        "seed": world.seed,
+        "frame": {"up": [0, 0, 1], "units": "m", "metric": "metric", "gravity": "known"},
+        "instances": [_instance(t, (seen or {}).get(t.id, {})) for t in world.things],
+        "relations": [{"subject": s, "predicate": p, "object": o} for s, p, o in true_relations(world)],
+    }
+
+
+def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
+    box = thing.box()
+    return {
+        "id": thing.id,
+        "label": thing.label,
+        "structure": thing.structure is not None,
+        "box": {
+            "center": _rounded(box.center),
+            "size": _rounded(box.size),
+            "quat_wxyz": _rounded(quat_wxyz_from_rotation(box.rotation)),
+        },
+        "support": thing.support,
+        "container": thing.container,
+        "attached": thing.attached,
+        "frames_seen": seen.get("frames", 0),
+        "largest_px": seen.get("largest_px", 0),
+    }
+
+
+def true_relations(world: World) -> list[tuple[int, str, int]]:
+    """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `next_to` by gap, both ways."""
+    triples: list[tuple[int, str, int]] = []
+    for thing in world.things:
+        if thing.container is not None:
+            triples.append((thing.id, "in", thing.container))
+        elif thing.support is not None:
+            triples.append((thing.id, "on", thing.support))
+        if thing.attached is not None:
+            triples.append((thing.id, "attached_to", thing.attached))
+    standing = [t for t in world.things if t.support is not None and t.label != "rug"]
+    for a in standing:
+        for b in standing:
+            if a.id != b.id and a.support == b.support and footprint_gap(a.box(), b.box()) <= NEXT_TO_GAP_M:
+                triples.append((a.id, "next_to", b.id))
+    return triples
+
+
+def footprint_gap(a: OrientedBox, b: OrientedBox) -> float:
+    """Distance between the footprints of two upright boxes, metres, 0 where they overlap.
+
+    The longest separation along the sides' normals of either box, which is exact unless corner faces corner.
+    """
+    corners = [box.corners()[::2, :2] for box in (a, b)]
+    gaps = [0.0]
+    for axis in [box.rotation[:2, k] for box in (a, b) for k in (0, 1)]:
+        p, q = corners[0] @ axis, corners[1] @ axis
+        gaps.append(float(max(q.min() - p.max(), p.min() - q.max())))
+    return max(gaps)
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(v), 6) + 0.0 for v in values]
