@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
@@ -103,16 +102,19 @@ def write_walk(
     spans = [(k, min(k + _BATCH, len(time_s))) for k in range(0, len(time_s), _BATCH)]
     seen: dict[int, dict[str, int]] = {}
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (settings, root)) if workers > 1 else None
-    with pool or nullcontext():
+    try:
         written = pool.map(_write_in_process, spans) if pool else map(_Writer(settings, root).write_span, spans)
         for areas in written:
             _count(seen, areas)
             if progress is not None:
                 progress(len(areas))
-    _write_lists(root, time_s, settings.camera())
+    finally:
+        if pool:
+            pool.shutdown(cancel_futures=True)
     write_tum(root / "groundtruth.txt", Trajectory(time_s, poses))
     truth = world_truth(settings.world(), seen)
     (root / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    _write_lists(root, time_s, settings.camera())
     return root
 
 

@@ -253,7 +253,7 @@ def furnish_bedroom(p: Placer, room: Room, walls: dict[str, int], floor: int) ->
     )
     glow = Material("plain", (236, 206, 150), (252, 236, 200), 0.3)
     p.add(room, "lamp", f.lamp(0.42, dark, glow), wide - 0.17, 3.5, z=0.5, on=night.id)
-    p.add(room, "mug", p.small("mug")[0], wide - 0.33, 3.28, rng.uniform(0, 360), z=0.5, on=night.id)
+    p.add(room, "box", p.small("box")[0], wide - 0.31, 3.30, rng.uniform(0, 360), z=0.5, on=night.id)
     high = f.cabinet((1.0, 0.52, 1.1), p.wood(), p.wood(0.7))
     wardrobe = p.add(room, "cabinet", high, 0.75, room.depth - 0.27, 180, on=floor)
     p.scatter(room, wardrobe, ("box", "vase"), 1.0, 0.52)
