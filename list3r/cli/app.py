@@ -71,10 +71,10 @@ def run(arguments: list[str]) -> int:
 
 
 def _usage_error(error: BaseException) -> int:
-    context = getattr(error, "ctx", None)
+    context = error.ctx  # type: ignore[attr-defined]
     message = error.format_message()  # type: ignore[attr-defined]
-    if not message:
-        print(context.get_help())
+    if not message or message.startswith("Usage:"):
+        print(message or context.get_help(), file=sys.stderr)
         return 2
     path = context.command_path if context is not None else "list3r"
     return _fail(f"{message.rstrip('.')}; see `{path} --help`")

@@ -1,0 +1,180 @@
+"""Bad input through the real program: exit status 2, one or two lines that name the fix, nothing left behind."""
+
+from __future__ import annotations
+
+import re
+import resource
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from list3r.memory.store import Store
+from tests.conftest import write_small_room
+
+
+def run(*arguments: str | Path, before: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
+    """The program as a user starts it."""
+    command = [sys.executable, "-m", "list3r", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, preexec_fn=before)
+
+
+def check_refused(result: subprocess.CompletedProcess[str], pattern: str) -> None:
+    """Status 2, nothing on standard output, at most two lines of error that match."""
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("note:")]
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    assert 1 <= len(lines) <= 2, result.stderr
+    assert lines[0].startswith("error: ")
+    assert re.search(pattern, result.stderr), result.stderr
+
+
+def write_frames(folder: Path, count: int = 4, *, depth_size: tuple[int, int] = (64, 48), poses: bool = True) -> Path:
+    """A tiny TUM folder with a flat wall."""
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    color = Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    depth = Image.fromarray(np.full((depth_size[1], depth_size[0]), 10000, np.uint16))
+    for k in range(count):
+        color.save(folder / f"rgb/{k}.png")
+        depth.save(folder / f"depth/{k}.png")
+    for name in ("rgb", "depth"):
+        (folder / f"{name}.txt").write_text("".join(f"{k * 0.1:.1f} {name}/{k}.png\n" for k in range(count)))
+    if poses:
+        (folder / "groundtruth.txt").write_text("".join(f"{k * 0.1:.1f} 0 0 0 0 0 0 1\n" for k in range(count)))
+    (folder / "calibration.txt").write_text("60 60 31.5 23.5\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with good and bad sources and memories."""
+    root = tmp_path_factory.mktemp("bad")
+    write_frames(root / "good")
+    write_frames(root / "unposed", poses=False)
+    write_frames(root / "small-depth", depth_size=(32, 20))
+    corrupt = write_frames(root / "corrupt", count=6)
+    for k in range(5):
+        (corrupt / f"rgb/{k}.png").write_bytes(b"not a picture")
+    listed = write_frames(root / "unlisted")
+    (listed / "depth.txt").unlink()
+    (root / "empty").mkdir()
+    pictures = root / "pictures"
+    pictures.mkdir()
+    shutil.copy(root / "good/rgb/0.png", pictures / "0.png")
+    shutil.copy(root / "good/rgb/0.png", pictures / "1.png")
+    (root / "zeros").mkdir()
+    (root / "zeros/0.png").touch()
+    (root / "text.mp4").write_text("this is no video")
+    (root / "zero.mp4").touch()
+    (root / "note.txt").write_text("hello")
+    with Store.create(root / "room.l3r") as store, store.transaction():
+        write_small_room(store)
+    shutil.copy(root / "room.l3r", root / "newer.l3r")
+    with sqlite3.connect(root / "newer.l3r") as database:
+        database.execute("PRAGMA user_version = 99")
+    database.close()
+    with sqlite3.connect(root / "other.db") as database:
+        database.execute("CREATE TABLE t (x)")
+    database.close()
+    whole = (root / "room.l3r").read_bytes()
+    (root / "torn.l3r").write_bytes(whole[: len(whole) // 3])
+    return root
+
+
+CASES = {
+    "absent source": ("build {p}/nothing -m {p}/new.l3r", "nothing.*(exist|found)"),
+    "empty folder": ("build {p}/empty -m {p}/new.l3r", "empty"),
+    "inspect an empty folder": ("inspect {p}/empty", "empty"),
+    "not a video": ("build {p}/text.mp4 -m {p}/new.l3r", "text.mp4"),
+    "zero bytes": ("build {p}/zero.mp4 -m {p}/new.l3r", "zero.mp4"),
+    "pictures of zero bytes": ("build {p}/zeros -m {p}/new.l3r --intrinsics 60,60,32,24", "zeros"),
+    "not a source at all": ("inspect {p}/note.txt", "note.txt"),
+    "depth of another size": ("build {p}/small-depth -m {p}/new.l3r", "32x20.*--depth-intrinsics|--depth-intrinsics"),
+    "no depth": ("build {p}/pictures -m {p}/new.l3r --intrinsics 60,60,32,24", "no depth"),
+    "depth list missing": ("build {p}/unlisted -m {p}/new.l3r", "depth"),
+    "mostly corrupt": ("build {p}/corrupt -m {p}/new.l3r", "5 of 6"),
+    "no poses to be given": ("build {p}/unposed -m {p}/new.l3r --poses given", "no poses.*estimate"),
+    "memory is a folder": ("build {p}/good -m {p}/empty", "is a folder"),
+    "memory in no folder": ("build {p}/good -m {p}/no/where/new.l3r", "does not exist"),
+    "memory exists": ("build {p}/good -m {p}/room.l3r", "--resume.*--force"),
+    "resume of another source": ("build {p}/good -m {p}/room.l3r --resume", "begun from walk"),
+    "force onto a stranger's file": ("build {p}/good -m {p}/note.txt --force", "not a memory"),
+    "force onto another database": ("build {p}/good -m {p}/other.db --force", "not a LIST3R memory"),
+    "intrinsics of three": ("build {p}/good -m {p}/new.l3r --intrinsics 60,60,32", "--intrinsics.*four numbers"),
+    "intrinsics in words": ("build {p}/good -m {p}/new.l3r --intrinsics a,b,c,d", "--intrinsics.*not a number"),
+    "negative focal length": ("build {p}/good -m {p}/new.l3r --intrinsics=-60,60,32,24", "intrinsics"),
+    "a transform that is none": ("build {p}/good -m {p}/new.l3r --depth-to-color 1,2", "--depth-to-color"),
+    "depth scale zero": ("build {p}/good -m {p}/new.l3r --depth-scale 0", "depth scale"),
+    "every zero": ("build {p}/good -m {p}/new.l3r --every 0", "every 0"),
+    "frames backwards": ("build {p}/good -m {p}/new.l3r --frames 9:3", "9"),
+    "frames beyond the end": ("build {p}/good -m {p}/new.l3r --frames 90:99", "90"),
+    "overlap as long as the chunk": ("build {p}/good -m {p}/new.l3r --chunk 20 --overlap 20", "overlap 20"),
+    "no workers": ("build {p}/good -m {p}/new.l3r --workers 0", "--workers 0"),
+    "unknown poses": ("build {p}/good -m {p}/new.l3r --poses guess", "--poses guess"),
+    "unknown model": ("build {p}/good -m {p}/new.l3r --reconstruction magic", "--reconstruction magic"),
+    "unknown kind": ("build {p}/good -m {p}/new.l3r --kind magic", "magic"),
+    "debug folder under a file": ("build {p}/good -m {p}/new.l3r --debug {p}/note.txt/x", "note.txt"),
+    "unknown option": ("build {p}/good -m {p}/new.l3r --magic", "--magic"),
+    "unknown command": ("magic", "magic"),
+    "no memory": ("info {p}/nothing.l3r", "does not exist"),
+    "not a memory": ("info {p}/note.txt", "not a memory"),
+    "another database": ("list {p}/other.db", "not a LIST3R memory"),
+    "newer schema": ("list {p}/newer.l3r", "schema version 99"),
+    "torn file": ("list {p}/torn.l3r", "torn.l3r"),
+    "unknown id": ("show {p}/room.l3r 77", "no instance 77"),
+    "id that is no number": ("show {p}/room.l3r mug", "mug"),
+    "nearest to an unknown id": ("query nearest {p}/room.l3r --id 77", "no instance 77"),
+    "nearest to nothing": ("query nearest {p}/room.l3r", "--point|--id"),
+    "nearest to half a point": ("query nearest {p}/room.l3r --point 1,2", "--point.*three numbers"),
+    "nearest to no number": ("query nearest {p}/room.l3r --point nan,0,0", "finite"),
+    "no neighbours wanted": ("query nearest {p}/room.l3r --point 0,0,0 -k 0", "k"),
+    "within no region": ("query within {p}/room.l3r", "--box.*--radius"),
+    "within a negative sphere": ("query within {p}/room.l3r --point 0,0,0 --radius=-1", "radius"),
+    "within an inverted box": ("query within {p}/room.l3r --box 1,1,1,0,0,0", "box|lower|corner"),
+    "unknown predicate": ("query relations {p}/room.l3r --predicate likes", "likes"),
+    "similar to an unknown id": ("query similar {p}/room.l3r --id 77", "no instance 77"),
+    "unknown format": ("export {p}/room.l3r --to stl --out {p}/new.stl", "stl"),
+    "export into no folder": ("export {p}/room.l3r --to json --out {p}/no/new.json", "no"),
+    "export onto a folder": ("export {p}/room.l3r --to json --out {p}/empty", "empty"),
+    "export onto the memory": ("export {p}/room.l3r --to json --out {p}/room.l3r", "room.l3r"),
+    "trajectory that is none": ("eval trajectory {p}/note.txt {p}/room.l3r", "note.txt"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_refused_in_one_line_and_leaves_nothing(case: str, place: Path) -> None:
+    command, pattern = CASES[case]
+    before = {p: p.stat().st_mtime_ns for p in place.iterdir() if p.is_file()}
+    check_refused(run(*(word.format(p=place) for word in command.split())), pattern)
+    after = {p: p.stat().st_mtime_ns for p in place.iterdir() if p.is_file()}
+    assert after == before
+
+
+def test_a_full_disk_is_named_and_nothing_half_written_is_left(place: Path, tmp_path: Path) -> None:
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    result = run("build", place / "good", "-m", tmp_path / "new.l3r", "--workers", "1", before=small_files)
+    check_refused(result, "disk|space|written")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_memory_that_cannot_be_read_is_named(place: Path, tmp_path: Path) -> None:
+    loop = tmp_path / "loop.l3r"
+    loop.symlink_to(loop)
+    check_refused(run("info", loop), "loop.l3r")
+
+
+@pytest.mark.parametrize("arguments", [(), ("query",), ("eval",)])
+def test_without_a_command_the_help_is_shown(arguments: tuple[str, ...]) -> None:
+    result = run(*arguments)
+    assert "Usage: list3r" in result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
