@@ -15,13 +15,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from list3r.chunk_stage import BuildSettings
+    from list3r.frames.options import SourceOptions
     from list3r.memory.errors import List3rError
     from list3r.scene_memory import SceneMemory, build, open
 
 __version__ = "0.1.0"
-__all__ = ["List3rError", "SceneMemory", "__version__", "build", "open"]
+__all__ = ["BuildSettings", "List3rError", "SceneMemory", "SourceOptions", "__version__", "build", "open"]
 
 _HOMES = {
+    "BuildSettings": "list3r.chunk_stage",
+    "SourceOptions": "list3r.frames.options",
     "List3rError": "list3r.memory.errors",
     "SceneMemory": "list3r.scene_memory",
     "build": "list3r.scene_memory",
