@@ -135,7 +135,7 @@ def associate(truth_time_s: Array, time_s: Array, tolerance_s: float = 0.01) -> 
     Each time of the shorter list takes the nearest one of the longer list, if it is within the tolerance, as evo does;
     times are ascending. Returns the row numbers of both, (P,) each.
     """
-    swap = len(truth_time_s) > len(time_s)
+    swap = len(truth_time_s) >= len(time_s)
     short, long = (time_s, truth_time_s) if swap else (truth_time_s, time_s)
     right = np.clip(np.searchsorted(long, short), 1, max(len(long) - 1, 1))
     right = np.minimum(right, len(long) - 1)

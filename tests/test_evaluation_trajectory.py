@@ -1,0 +1,213 @@
+"""Trajectory errors: laws of alignment, the TUM format, and agreement with evo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from list3r.evaluation.trajectory import (
+    Trajectory,
+    associate,
+    evaluate_trajectory,
+    read_tum,
+    write_tum,
+)
+from list3r.memory.errors import DegenerateError, OptionError, SourceError
+from list3r.memory.geometry import Sim3
+
+
+def random_walk(seed: int, count: int = 80) -> Trajectory:
+    """A smooth path with turning views at 30 Hz."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = np.cumsum(rng.normal(0, 0.02, (count, 3)), axis=0)
+    poses[:, :3, :3] = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.03, (count, 3)), axis=0)).as_matrix()
+    return Trajectory(np.arange(count) / 30.0 + 1.3e9, poses)
+
+
+def disturbed(truth: Trajectory, seed: int, sigma: float = 0.01) -> Trajectory:
+    """The truth with noise of position and view."""
+    rng = np.random.default_rng([seed, 1])
+    poses = truth.T_world_cam.copy()
+    poses[:, :3, 3] += rng.normal(0, sigma, (len(poses), 3))
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0, sigma, (len(poses), 3))).as_matrix()
+    return Trajectory(truth.time_s, poses)
+
+
+def moved(trajectory: Trajectory, transform: Sim3) -> Trajectory:
+    """The same path in another frame of reference and scale."""
+    poses = trajectory.T_world_cam.copy()
+    poses[:, :3, 3] = transform.apply(trajectory.positions())
+    poses[:, :3, :3] = transform.rotation @ poses[:, :3, :3]
+    return Trajectory(trajectory.time_s, poses)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.2, 5.0))
+def test_a_similar_copy_is_perfect_after_sim3_and_tells_its_scale(seed: int, scale: float) -> None:
+    truth = random_walk(seed)
+    tangent = np.random.default_rng(seed).normal(0, 0.8, 7)
+    tangent[6] = np.log(scale)
+    errors = evaluate_trajectory(truth, moved(truth, Sim3.exp(tangent)))
+    assert errors.ate_sim3_m.rmse < 1e-9
+    assert errors.scale * scale == pytest.approx(1.0, rel=1e-9)
+    assert errors.rpe_rotation_deg.max < 1e-5
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000))
+def test_errors_do_not_depend_on_the_frame_of_the_estimate(seed: int) -> None:
+    truth = random_walk(seed)
+    estimate = disturbed(truth, seed)
+    tangent = np.append(np.random.default_rng(seed).normal(0, 1, 6), 0.0)
+    one, two = evaluate_trajectory(truth, estimate), evaluate_trajectory(truth, moved(estimate, Sim3.exp(tangent)))
+    assert two.ate_se3_m.rmse == pytest.approx(one.ate_se3_m.rmse, rel=1e-7)
+    assert two.rpe_translation_m.rmse == pytest.approx(one.rpe_translation_m.rmse, rel=1e-7)
+    assert one.ate_sim3_m.rmse <= one.ate_se3_m.rmse + 1e-12
+
+
+def test_a_constant_drift_is_the_rpe() -> None:
+    truth = random_walk(3)
+    step = np.eye(4)
+    step[:3, :3] = Rotation.from_rotvec([0, 0, np.deg2rad(0.5)]).as_matrix()
+    relative = np.linalg.inv(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    poses = [truth.T_world_cam[0]]
+    for move in relative:
+        poses.append(poses[-1] @ move @ step)
+    errors = evaluate_trajectory(truth, Trajectory(truth.time_s, np.array(poses)))
+    assert errors.rpe_rotation_deg.min == pytest.approx(0.5, abs=1e-5)
+    assert errors.rpe_rotation_deg.max == pytest.approx(0.5, abs=1e-5)
+    assert errors.rpe_translation_m.max < 1e-7
+
+
+def test_tum_files_come_back(tmp_path: Path) -> None:
+    trajectory = random_walk(5)
+    write_tum(tmp_path / "a.txt", trajectory)
+    back = read_tum(tmp_path / "a.txt")
+    assert np.allclose(back.time_s, trajectory.time_s, atol=1e-6)
+    assert np.allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no poses"),
+        ("# only a comment\n", "no poses"),
+        ("0 1 2 3 0 0 0\n", "7 numbers"),
+        ("0 1 2 3 0 0 0 nan\n", "finite"),
+        ("0 1 2 3 0 0 0 0\n", "quaternion"),
+        ("0 1 2 x 0 0 0 1\n", "line 1"),
+    ],
+)
+def test_a_file_that_is_no_trajectory_is_named(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "bad.txt"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=words):
+        read_tum(path)
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="nowhere"):
+        read_tum(tmp_path / "nowhere.txt")
+
+
+def test_association_is_by_time_and_within_tolerance() -> None:
+    truth = np.arange(0, 10, 0.01)
+    times = np.array([0.004, 1.0, 5.5049, 11.0])
+    rows_truth, rows = associate(truth, times, 0.01)
+    assert rows.tolist() == [0, 1, 2]
+    assert np.abs(truth[rows_truth] - times[rows]).max() < 0.0051
+    there, back = associate(truth, times), associate(times, truth)
+    assert np.array_equal(there[0], back[1])
+    assert np.array_equal(there[1], back[0])
+
+
+def test_too_few_common_moments_and_lines_are_errors() -> None:
+    truth = random_walk(0)
+    late = Trajectory(truth.time_s + 500, truth.T_world_cam)
+    with pytest.raises(OptionError, match="0 poses within"):
+        evaluate_trajectory(truth, late)
+    line = truth.T_world_cam.copy()
+    line[:, :3, 3] = np.arange(len(line))[:, None] * np.array([0.01, 0.02, 0.0])
+    with pytest.raises(DegenerateError, match="line"):
+        evaluate_trajectory(truth, Trajectory(truth.time_s, line))
+    with pytest.raises(OptionError, match="delta"):
+        evaluate_trajectory(truth, truth, delta_frames=0)
+
+
+# ----------------------------------------------------------------------------------------------- against evo
+
+
+def evo_figures(truth: Path, estimate: Path, delta: int) -> dict[str, float]:
+    """The same figures by evo."""
+    from evo.core import metrics, sync
+    from evo.core.units import Unit
+    from evo.tools import file_interface
+
+    a, b = file_interface.read_tum_trajectory_file(truth), file_interface.read_tum_trajectory_file(estimate)
+    a, b = sync.associate_trajectories(a, b, max_diff=0.01)
+    out = {"pairs": float(b.num_poses)}
+    for name, relation in (
+        ("rpe_translation", metrics.PoseRelation.translation_part),
+        ("rpe_rotation", metrics.PoseRelation.rotation_angle_deg),
+    ):
+        rpe = metrics.RPE(relation, delta, Unit.frames, all_pairs=True)
+        rpe.process_data((a, b))
+        out[name] = rpe.get_statistic(metrics.StatisticsType.rmse)
+    for name, free in (("ate_se3", False), ("ate_sim3", True)):
+        copy = file_interface.read_tum_trajectory_file(estimate)
+        ref, copy = sync.associate_trajectories(file_interface.read_tum_trajectory_file(truth), copy, max_diff=0.01)
+        _, _, scale = copy.align(ref, correct_scale=free)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data((ref, copy))
+        out[name] = ape.get_statistic(metrics.StatisticsType.rmse)
+        if free:
+            out["scale"] = float(scale)
+    return out
+
+
+def assert_like_evo(truth: Path, estimate: Path, delta: int) -> None:
+    pytest.importorskip("evo")
+    theirs = evo_figures(truth, estimate, delta)
+    ours = evaluate_trajectory(read_tum(truth), read_tum(estimate), delta_frames=delta)
+    figures = {
+        "pairs": float(ours.pairs),
+        "ate_se3": ours.ate_se3_m.rmse,
+        "ate_sim3": ours.ate_sim3_m.rmse,
+        "scale": ours.scale,
+        "rpe_translation": ours.rpe_translation_m.rmse,
+        "rpe_rotation": ours.rpe_rotation_deg.rmse,
+    }
+    assert figures == pytest.approx(theirs, rel=1e-6, abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("delta", [1, 7])
+def test_random_trajectories_agree_with_evo(tmp_path: Path, seed: int, delta: int) -> None:
+    truth = random_walk(seed, 150)
+    estimate = moved(disturbed(truth, seed), Sim3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.8, 1.1, 0.4])))
+    keep = np.flatnonzero(np.random.default_rng(seed).uniform(size=150) < 0.7)
+    write_tum(tmp_path / "truth.txt", truth)
+    write_tum(tmp_path / "estimate.txt", estimate.at(keep))
+    assert_like_evo(tmp_path / "truth.txt", tmp_path / "estimate.txt", delta)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("truth", "estimate"),
+    [
+        ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam.txt"),
+        ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam_drift.txt"),
+        ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-ORB_kf_mono.txt"),
+        ("fr2_desk_groundtruth.txt", "fr2_desk_ORB.txt"),
+        ("fr2_desk_groundtruth.txt", "fr2_desk_ORB_kf_mono.txt"),
+    ],
+)
+def test_real_trajectories_agree_with_evo(shared_data: Path, truth: str, estimate: str) -> None:
+    folder = shared_data / "trajectories"
+    assert_like_evo(folder / truth, folder / estimate, delta=1)
