@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, FrameRow, Instance, Support
@@ -62,6 +63,19 @@ def thinned_support(store: Store, instance: Instance, limit: int | None) -> Supp
     if len(keep) == len(support.points):
         return support
     return Support(support.points[keep], support.confidence[keep], support.rgb[keep])
+
+
+def point_spacing(points: NDArray[np.float32]) -> float:
+    """Width that lets neighbouring points of a surface touch: from the area that they cover on a coarse grid.
+
+    The occupied cells of a grid with about sixteen points a cell estimate the area; `points` has shape (N, 3), N >= 1.
+    """
+    extent = np.sort(np.ptp(points, axis=0).astype(np.float64))[::-1]
+    if not extent[0] > 0:
+        return 0.01
+    cell = max(np.sqrt(extent[0] * max(extent[1], extent[0] / 50) * 16 / len(points)), extent[0] / 500)
+    occupied = np.unique(np.floor((points - points.min(axis=0)) / cell).astype(np.int64), axis=0)
+    return float(np.sqrt(len(occupied) * cell**2 / len(points)))
 
 
 def has_box(instance: Instance) -> bool:

@@ -43,7 +43,7 @@ def export(store: Store, format_name: str, path: str | Path) -> tuple[Path, ...]
     """Write a memory to `path` in a format; the files written, `path` first.
 
     A memory of several components gives further files beside `path` in formats that hold one frame of reference.
-    Raises `OptionError` for an unknown format or a file name that does not fit it, `ExportError` when the file cannot be
+    Raises `OptionError` for an unknown format or a file name that does not fit it, `ExportError` when it cannot be
     written.
     """
     path = Path(path)

@@ -61,7 +61,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
         },
         "sessions": _sessions(store),
         "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
-        "instances": [_instance(i, decimals) for i in instances],
+        "instances": [instance_entry(i, decimals) for i in instances],
         "relations": [_relation(r, decimals) for r in relations],
         "aliases": [{"id": k, "instance": v} for k, v in store.aliases().items()],
     }
@@ -86,7 +86,8 @@ def _vector(values: ArrayLike, decimals: int) -> list[float] | None:
     return [float(v) + 0.0 for v in np.round(flat, decimals)] if np.isfinite(flat).all() else None
 
 
-def _instance(instance: Instance, decimals: int) -> dict[str, Any]:
+def instance_entry(instance: Instance, decimals: int = _METRIC_DECIMALS) -> dict[str, Any]:
+    """One entry of `instances`; lengths rounded to so many decimals."""
     box, view = instance.box, instance.best_view
     low, high = _vector(instance.aabb[0], decimals), _vector(instance.aabb[1], decimals)
     return {

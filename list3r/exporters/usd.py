@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
-from list3r.exporters.components import Component, has_box, read_components, thinned_support
+from list3r.exporters.components import Component, has_box, point_spacing, read_components, thinned_support
 from list3r.exporters.output import replacing, units
 from list3r.exporters.palette import instance_color, linear_from_srgb
 from list3r.exporters.usd_camera import add_cameras, set_time_range
@@ -152,19 +152,6 @@ def _add_points(stage: Usd.Stage, path: Sdf.Path, points_object: NDArray[np.floa
     prim.CreateExtentAttr([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())])
     colors = np.ascontiguousarray(linear_from_srgb(rgb), dtype=np.float32)
     prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
-
-
-def point_spacing(points: NDArray[np.float32]) -> float:
-    """Width that lets neighbouring points of a surface touch: from the area that they cover on a coarse grid.
-
-    The occupied cells of a grid with about sixteen points a cell estimate the area; `points` has shape (N, 3), N >= 1.
-    """
-    extent = np.sort(np.ptp(points, axis=0).astype(np.float64))[::-1]
-    if not extent[0] > 0:
-        return 0.01
-    cell = max(np.sqrt(extent[0] * max(extent[1], extent[0] / 50) * 16 / len(points)), extent[0] / 500)
-    occupied = np.unique(np.floor((points - points.min(axis=0)) / cell).astype(np.int64), axis=0)
-    return float(np.sqrt(len(occupied) * cell**2 / len(points)))
 
 
 def _set_label(prim: Usd.Prim, instance: Instance) -> None:

@@ -1,0 +1,398 @@
+"""A plan view as a picture: walls, things with their ids, the camera's path, a scale bar and a legend."""
+
+from __future__ import annotations
+
+import contextlib
+import unicodedata
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial import ConvexHull, QhullError
+
+from list3r.exporters.components import Component, has_box, read_components, thinned_support
+from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.palette import Color, instance_color
+from list3r.exporters.plan_frame import PlanFrame, choose_rotation, is_wall, quarter_turn
+from list3r.exporters.plan_labels import Anchor, place_tags
+from list3r.exporters.plan_map import pale_picture
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance, Support
+from list3r.memory.store import Store
+
+_INK: Color = (38, 42, 52)
+_GREY: Color = (120, 124, 134)
+_START: Color = (22, 140, 100)
+_END: Color = (196, 48, 72)
+_OVERSAMPLING = 2
+"""Drawn so many times larger and averaged down: Pillow does not smooth its lines."""
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """How the picture is laid out; lengths in px of the finished picture."""
+
+    width_px: int = 1600
+    legend_px: int = 470
+    margin_px: int = 32
+    header_px: int = 78
+    footer_px: int = 64
+    row_px: int = 23
+    max_legend_px: int = 960
+    """The map grows up to this height for the legend's sake; things that are not listed are drawn all the same."""
+    min_map_px: int = 560
+    max_map_px: int = 1400
+    points_per_instance: int = 8000
+    """At most so many points of each thing are drawn."""
+    points_per_structure: int = 40000
+    """At most so many points of a floor, a wall and the like."""
+
+    def __post_init__(self) -> None:
+        if self.width_px < self.legend_px + 400:
+            raise OptionError(f"the picture is {self.width_px} px wide; at least {self.legend_px + 400} px are needed")
+
+
+def write_plan(store: Store, path: str | Path, settings: PlanSettings | None = None) -> tuple[Path, ...]:
+    """Write the plan view of every component as PNG, the main one to `path`. Returns the files written."""
+    path, settings = Path(path), settings or PlanSettings()
+    written = []
+    with contextlib.ExitStack() as stack:
+        for component in read_components(store):
+            target = part_path(path, component.name)
+            temporary = stack.enter_context(replacing(target))
+            plan_image(store, component, settings).save(temporary, format="PNG")
+            written.append(target)
+    return tuple(written)
+
+
+def plan_image(store: Store, component: Component, settings: PlanSettings | None = None) -> Image.Image:
+    """The plan view of one component."""
+    settings = settings or PlanSettings()
+    limits = (settings.points_per_instance, settings.points_per_structure)
+    supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
+    things = [i for i in component.instances if not i.structure and has_box(i)]
+    frame = _frame(store, component, supports, settings, len(things))
+    sheet = _Sheet(frame, settings)
+    sheet.picture(component, supports)
+    sheet.boxes(things)
+    sheet.camera_path(component)
+    sheet.tags(things)
+    sheet.scale_bar(units(store))
+    sheet.axes()
+    sheet.header(_title(store, component), _subtitle(store, component))
+    sheet.legend(things, units(store))
+    return sheet.finish()
+
+
+def _title(store: Store, component: Component) -> str:
+    extra = "" if component.main else f" (component {component.id}, not placed against the main one)"
+    return store.path.name + extra
+
+
+def _subtitle(store: Store, component: Component) -> str:
+    structure = [i.structure for i in component.instances if i.structure]
+    kinds = ", ".join(
+        f"{structure.count(k)} {k}{'s' * (structure.count(k) > 1)}"
+        for k in ("floor", "wall", "ceiling", "plane")
+        if k in structure
+    )
+    words = [
+        f"{len(component.instances) - len(structure)} things",
+        f"structure: {kinds}" if kinds else "no structure",
+        f"{len(component.poses):,} posed frames",
+        f"scale {store.get_value('scale_kind', 'relative')}",
+    ]
+    return "  ·  ".join(words)
+
+
+def _frame(
+    store: Store, component: Component, supports: dict[int, Support], settings: PlanSettings, rows: int
+) -> PlanFrame:
+    """Walls along the page, everything inside, as large as the page allows."""
+    rotation, note = choose_rotation(component, store.get_value("gravity", "unknown"))
+    low, high = _extent(component, supports, rotation)
+    if high[1] - low[1] > high[0] - low[0]:
+        rotation = quarter_turn(rotation)
+        low, high = _extent(component, supports, rotation)
+    span = np.maximum(high - low, 1e-6) * 1.06
+    width = settings.width_px - settings.legend_px - 3 * settings.margin_px
+    height = int(np.clip(width * span[1] / span[0], settings.min_map_px, settings.max_map_px))
+    height = max(height, min(rows * settings.row_px + 70, settings.max_legend_px))
+    size = (width * _OVERSAMPLING, height * _OVERSAMPLING)
+    return PlanFrame(rotation, (low + high) / 2, float(min(size / span)), size, note)
+
+
+def _extent(
+    component: Component, supports: dict[int, Support], rotation: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper corner, plan coordinates, of boxes of things, the camera, and structure but for its fringe."""
+    page = rotation[:2].T
+    parts = [i.box.corners() @ page for i in component.instances if not i.structure and has_box(i)]
+    parts += [S_world_cam.translation[None] @ page for _, S_world_cam in component.poses]
+    for i in component.instances:
+        if i.structure and len(supports[i.id].points):
+            parts.append(np.quantile(supports[i.id].points @ page, [0.01, 0.99], axis=0))
+    flat = np.concatenate(parts) if parts else np.array([[-1.0, -1.0], [1.0, 1.0]])
+    return flat.min(axis=0), flat.max(axis=0)
+
+
+class _Sheet:
+    """The page while it is drawn, at `_OVERSAMPLING` times its size."""
+
+    def __init__(self, frame: PlanFrame, settings: PlanSettings) -> None:
+        self.frame, self.settings = frame, settings
+        k = _OVERSAMPLING
+        self.left, self.top = settings.margin_px * k, settings.header_px * k
+        self.map_size = frame.size_px
+        height = self.top + self.map_size[1] + settings.footer_px * k
+        self.image = Image.new("RGB", (settings.width_px * k, height), (255, 255, 255))
+        self.draw = ImageDraw.Draw(self.image, "RGBA")
+        self.tag_font, self.text_font = _font(13), _font(14)
+
+    def finish(self) -> Image.Image:
+        """The page at its size."""
+        return self.image.reduce(_OVERSAMPLING)
+
+    def px(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where world points are on the page, px. Shape (N, 3) -> (N, 2)."""
+        return np.asarray(self.frame.to_px(points_world) + np.array([self.left, self.top]))
+
+    # ------------------------------------------------------------------ the map
+
+    def picture(self, component: Component, supports: dict[int, Support]) -> None:
+        """What was seen from above, in pale colours."""
+        up = self.frame.R_plan_world[2]
+        seen = [i for i in component.instances if len(supports[i.id].points) and i.structure != "ceiling"]
+        walls = [supports[i.id] for i in seen if is_wall(i, up)]
+        floors = [supports[i.id] for i in seen if i.structure and not is_wall(i, up)]
+        things = [supports[i.id] for i in seen if not i.structure]
+        pixels = pale_picture(self.frame, things, floors, walls)
+        self.image.paste(Image.fromarray(np.round(pixels).astype(np.uint8)), (self.left, self.top))
+        bare = [i for i in component.instances if is_wall(i, up) and not len(supports[i.id].points)]
+        for instance in bare:
+            self.draw.polygon(self._footprint(instance), fill=(62, 68, 82, 200))
+        right, bottom = self.left + self.map_size[0] - 1, self.top + self.map_size[1] - 1
+        self.draw.rectangle((self.left, self.top, right, bottom), outline=(205, 207, 212), width=_OVERSAMPLING)
+
+    def _footprint(self, instance: Instance) -> list[tuple[float, float]]:
+        corners = self.px(instance.box.corners())
+        try:
+            corners = corners[ConvexHull(corners).vertices]
+        except (QhullError, ValueError):
+            corners = np.array([corners.min(axis=0), corners.max(axis=0) + 1.0])
+        return [(float(x), float(y)) for x, y in corners]
+
+    def boxes(self, things: list[Instance]) -> None:
+        """Oriented boxes, the small ones over the large ones."""
+        for instance in sorted(things, key=lambda i: (-_area(self._footprint(i)), i.id)):
+            color, outline = instance_color(instance.id), self._footprint(instance)
+            self.draw.polygon(outline, fill=(*color, 46))
+            self.draw.line([*outline, outline[0], outline[1]], fill=(*color, 255), width=2 * _OVERSAMPLING)
+
+    def camera_path(self, component: Component) -> None:
+        """Where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""
+        sessions = sorted({frame.session_id for frame, _ in component.poses})
+        for session in sessions:
+            poses = [p for p in component.poses if p[0].session_id == session]
+            frames = np.array([frame.frame_index for frame, _ in poses])
+            xy = self.px(np.stack([S_world_cam.translation for _, S_world_cam in poses]))
+            gaps = np.diff(frames) > 1.5 * np.median(np.diff(frames)) if len(frames) > 1 else np.zeros(0, bool)
+            for k in range(len(xy) - 1):
+                if not gaps[k]:
+                    self._stroke(xy[k], xy[k + 1], _between(k / max(len(xy) - 1, 1)), 2)
+            for k in range(0, len(xy), max(1, len(xy) // 30)):
+                forward = self.frame.R_plan_world[:2] @ poses[k][1].rotation[:, 2]
+                tip = xy[k] + forward * [1.0, -1.0] * 13 * _OVERSAMPLING
+                self._stroke(xy[k], tip, _between(k / max(len(xy) - 1, 1)), 1.5)
+            self._mark(xy[0], _START, "start", round_mark=True)
+            self._mark(xy[-1], _END, "end", round_mark=False)
+
+    def _stroke(self, a: NDArray[np.float64], b: NDArray[np.float64], color: Color, width: float) -> None:
+        ends = [(float(a[0]), float(a[1])), (float(b[0]), float(b[1]))]
+        self.draw.line(ends, fill=(*color, 210), width=round(width * _OVERSAMPLING))
+
+    def _mark(self, xy: NDArray[np.float64], color: Color, word: str, *, round_mark: bool) -> None:
+        x, y = (float(v) for v in xy)
+        r = 6 * _OVERSAMPLING
+        shape = self.draw.ellipse if round_mark else self.draw.rectangle
+        shape((x - r, y - r, x + r, y + r), fill=color, outline=(255, 255, 255), width=2 * _OVERSAMPLING)
+        self._text((x + r * 1.6, y), word, self.text_font, color, anchor="lm", halo=True)
+
+    # ------------------------------------------------------------------ words
+
+    def _text(
+        self,
+        xy: tuple[float, float],
+        text: str,
+        font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
+        color: Color,
+        anchor: str = "la",
+        *,
+        halo: bool = False,
+    ) -> None:
+        stroke = 2 * _OVERSAMPLING if halo else 0
+        self.draw.text(
+            xy, _plain(text), fill=color, font=font, anchor=anchor, stroke_width=stroke, stroke_fill=(255, 255, 255)
+        )
+
+    def tags(self, things: list[Instance]) -> None:
+        """The id of each thing on or beside it, a line to it where it is away, its name where there is room."""
+        k = _OVERSAMPLING
+        anchors, names = [], []
+        for instance in things:
+            corners = np.array(self._footprint(instance))
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            (x, y), half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
+            width, name = self._chip_width(instance.id), _short_name(instance)
+            room = width + self.draw.textlength(name, font=self.text_font) + 8 * k
+            names.append(name if room < 1.8 * half[0] and half[1] > 20 * k else "")
+            anchors.append(Anchor((x, y), (half[0], half[1]), (room if names[-1] else width, 18.0 * k)))
+        page = (self.left + 4.0, self.top + 4.0, self.left + self.map_size[0] - 4.0, self.top + self.map_size[1] - 4.0)
+        places = place_tags(anchors, page, [self._scale_bar_place()])
+        for anchor, place in zip(anchors, places, strict=True):
+            self._leader(anchor, place)
+        for instance, anchor, name, (x, y) in zip(things, anchors, names, places, strict=True):
+            width = self._chip_width(instance.id)
+            left = x - anchor.tag[0] / 2
+            self._chip((left + width / 2, y), (width, anchor.tag[1]), instance.id)
+            self._text((left + width + 5 * k, y), name, self.text_font, _INK, anchor="lm", halo=True)
+
+    def _leader(self, anchor: Anchor, place: tuple[float, float]) -> None:
+        (x, y), k = anchor.xy, _OVERSAMPLING
+        if abs(place[0] - x) <= anchor.tag[0] / 2 and abs(place[1] - y) <= anchor.tag[1] / 2:
+            return
+        self.draw.line([anchor.xy, place], fill=(*_INK, 170), width=k)
+        self.draw.ellipse((x - 2 * k, y - 2 * k, x + 2 * k, y + 2 * k), fill=(*_INK, 220))
+
+    def _chip_width(self, instance_id: int) -> float:
+        return float(self.draw.textlength(str(instance_id), font=self.tag_font)) + 9.0 * _OVERSAMPLING
+
+    def _chip(self, xy: tuple[float, float], size: tuple[float, float], instance_id: int) -> None:
+        (x, y), (w, h) = xy, (size[0] / 2, size[1] / 2)
+        color = instance_color(instance_id)
+        edge = _OVERSAMPLING
+        self.draw.rounded_rectangle(
+            (x - w, y - h, x + w, y + h), radius=h * 0.5, fill=color, outline=(255, 255, 255), width=edge
+        )
+        self._text((x, y), str(instance_id), self.tag_font, _contrast(color), anchor="mm")
+
+    def _scale_bar_place(self) -> tuple[float, float, float, float]:
+        k, bottom = _OVERSAMPLING, self.top + self.map_size[1]
+        return self.left + 10.0 * k, bottom - 52.0 * k, self.left + 240.0 * k, bottom - 8.0 * k
+
+    def scale_bar(self, unit: str) -> None:
+        """A bar of a round length at the lower left of the map."""
+        k = _OVERSAMPLING
+        length = _round_length(200 * k / self.frame.pixels_per_unit)
+        place = self._scale_bar_place()
+        x0, y0 = place[0] + 10 * k, place[3] - 12 * k
+        x1 = x0 + length * self.frame.pixels_per_unit
+        self.draw.rectangle(place, fill=(255, 255, 255, 225))
+        self.draw.line([(x0, y0 - 6 * k), (x0, y0), (x1, y0), (x1, y0 - 6 * k)], fill=_INK, width=2 * k)
+        words = f"{length:g} m" if unit == "m" else f"{length:g} x the memory's unit (relative scale)"
+        self._text((x0, y0 - 11 * k), words, self.text_font, _INK, anchor="ls")
+
+    def axes(self) -> None:
+        """The world's axes as they lie on the page, and what is up, under the map."""
+        k = _OVERSAMPLING
+        origin = np.array([self.left + 24.0 * k, self.top + self.map_size[1] + 32.0 * k])
+        for axis, (name, color) in enumerate((("x", (200, 60, 60)), ("y", (40, 140, 60)), ("z", (50, 90, 200)))):
+            arrow = self.frame.R_plan_world[:2, axis] * [1.0, -1.0] * 17 * k
+            if np.linalg.norm(arrow) < 5 * k:
+                continue
+            tip = origin + arrow
+            self._stroke(origin, tip, color, 2)
+            side = np.array([-arrow[1], arrow[0]]) * 0.16
+            head = [tip + arrow * 0.18, tip - arrow * 0.16 + side, tip - arrow * 0.16 - side]
+            self.draw.polygon([(float(p[0]), float(p[1])) for p in head], fill=color)
+            at = tip + arrow * 0.45
+            self._text((float(at[0]), float(at[1])), name, _font(12), color, anchor="mm")
+        self._text(
+            (self.left + 66.0 * k, self.top + self.map_size[1] + 32.0 * k), self.frame.note, self.text_font, _GREY, "lm"
+        )
+
+    def header(self, title: str, subtitle: str) -> None:
+        """Name of the memory and what is in it."""
+        k = _OVERSAMPLING
+        self._text((self.left, 14 * k), title, _font(24), _INK)
+        self._text((self.left, 47 * k), subtitle, _font(15), _GREY)
+
+    def legend(self, things: list[Instance], unit: str) -> None:
+        """A table of ids, descriptions and sizes; where it is too long, those that were seen most."""
+        k, settings = _OVERSAMPLING, self.settings
+        x = self.left + self.map_size[0] + settings.margin_px * k
+        right, y = x + settings.legend_px * k, self.top + 4 * k
+        fits = (self.map_size[1] - 50 * k) // (settings.row_px * k)
+        chosen = sorted(sorted(things, key=lambda i: (-i.observations, i.id))[:fits], key=lambda i: i.id)
+        sizes = [_size_text(i) for i in chosen]
+        column = max([self.draw.textlength(s, font=self.text_font) for s in sizes], default=0.0) + 12 * k
+        self._text((x + 46 * k, y), "description", self.text_font, _GREY)
+        self._text((right, y), f"size, {unit}", self.text_font, _GREY, anchor="ra")
+        self.draw.line([(x, y + 21 * k), (right, y + 21 * k)], fill=(205, 207, 212), width=k)
+        for row, (instance, size) in enumerate(zip(chosen, sizes, strict=True)):
+            middle = y + 24 * k + (row + 0.5) * settings.row_px * k
+            width = max(30.0 * k, self._chip_width(instance.id))
+            self._chip((x + 18 * k, middle), (width, 18.0 * k), instance.id)
+            words = _shorten(
+                self.draw, instance.label or instance.description, self.text_font, right - column - x - 46 * k
+            )
+            self._text((x + 46 * k, middle), words, self.text_font, _INK, anchor="lm")
+            self._text((right, middle), size, self.text_font, _GREY, anchor="rm")
+        if len(things) > len(chosen):
+            y_more = y + 24 * k + len(chosen) * settings.row_px * k
+            self._text((x + 46 * k, y_more + 4 * k), f"and {len(things) - len(chosen)} more", self.text_font, _GREY)
+
+
+def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size_px * _OVERSAMPLING)
+
+
+def _plain(text: str) -> str:
+    """Text in the letters that Pillow's own font has."""
+    kept = "".join(c for c in text if c in "·…" or c.isascii())
+    if kept == text:
+        return text
+    return "".join(
+        c if c in "·…" else unicodedata.normalize("NFKD", c).encode("ascii", "ignore").decode() or "?" for c in text
+    )
+
+
+def _shorten(
+    draw: ImageDraw.ImageDraw, text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float
+) -> str:
+    text = _plain(text)
+    if draw.textlength(text, font=font) <= width:
+        return text
+    while text and draw.textlength(text + "…", font=font) > width:
+        text = text[:-1]
+    return text.rstrip() + "…"
+
+
+def _short_name(instance: Instance) -> str:
+    return _plain(instance.label or instance.description.split(",")[0])
+
+
+def _size_text(instance: Instance) -> str:
+    return " x ".join(f"{v:.2f}" if v < 10 else f"{v:.1f}" for v in instance.box.size)
+
+
+def _area(outline: list[tuple[float, float]]) -> float:
+    x, y = np.array(outline).T
+    return float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2)
+
+
+def _between(share: float) -> Color:
+    r, g, b = (round(a + (z - a) * share) for a, z in zip(_START, _END, strict=True))
+    return r, g, b
+
+
+def _contrast(color: Color) -> Color:
+    return (255, 255, 255) if 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] < 165 else _INK
+
+
+def _round_length(limit: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not over the limit."""
+    power = 10.0 ** np.floor(np.log10(limit))
+    return float(power * max(m for m in (1, 2, 5) if m * power <= limit))

@@ -1,0 +1,84 @@
+"""Where the tags of a plan view go so that every one can be read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Rect = tuple[float, float, float, float]
+"""x0, y0, x1, y1, px."""
+
+_ANGLES = np.deg2rad(np.arange(0.0, 360.0, 15.0) - 90.0)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A thing that wants a tag."""
+
+    xy: tuple[float, float]
+    """Its middle, px."""
+    half: tuple[float, float]
+    """Half width and height of its footprint, px."""
+    tag: tuple[float, float]
+    """Width and height of its tag, px."""
+
+    @property
+    def small(self) -> bool:
+        """Whether a tag on top would hide the thing."""
+        return self.half[0] < self.tag[0] or self.half[1] < self.tag[1] * 1.2
+
+
+def place_tags(anchors: Sequence[Anchor], page: Rect, taken: Sequence[Rect] = ()) -> list[tuple[float, float]]:
+    """Middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
+
+    Tags avoid each other, the rectangles `taken` and the small things. Where nothing is free within the search
+    radius the place of least overlap is taken.
+    """
+    obstacles = [_around(a.xy, a.half) for a in anchors if a.small]
+    owners = [n for n, a in enumerate(anchors) if a.small]
+    boxes = [*taken, *obstacles]
+    owner = np.array([-1] * len(taken) + owners, dtype=int)
+    places: list[tuple[float, float]] = [(0.0, 0.0)] * len(anchors)
+    order = sorted(range(len(anchors)), key=lambda n: (not anchors[n].small, anchors[n].half[0] * anchors[n].half[1]))
+    for n in order:
+        anchor = anchors[n]
+        others = np.array(boxes, dtype=float).reshape(-1, 4)[owner != n]
+        places[n] = _nearest_free(anchor, others, page)
+        boxes.append(_around(places[n], (anchor.tag[0] / 2 + 2, anchor.tag[1] / 2 + 2)))
+        owner = np.append(owner, -1)
+    return places
+
+
+def _around(xy: tuple[float, float], half: tuple[float, float]) -> Rect:
+    return xy[0] - half[0], xy[1] - half[1], xy[0] + half[0], xy[1] + half[1]
+
+
+def _nearest_free(anchor: Anchor, boxes: NDArray[np.float64], page: Rect) -> tuple[float, float]:
+    half = np.array(anchor.tag) / 2
+    low, high = np.array(page[:2]) + half, np.array(page[2:]) - half
+    best, least = anchor.xy, np.inf
+    for ring in _rings(anchor):
+        places = np.clip(ring, low, np.maximum(low, high))
+        left = np.maximum(places[:, None] - half, boxes[None, :, :2])
+        right = np.minimum(places[:, None] + half, boxes[None, :, 2:])
+        overlap = np.maximum(right - left, 0.0).prod(axis=2).sum(axis=1)
+        k = int(np.argmin(overlap))
+        if overlap[k] < least:
+            best, least = (float(places[k, 0]), float(places[k, 1])), float(overlap[k])
+        if least <= 0:
+            break
+    return best
+
+
+def _rings(anchor: Anchor) -> Iterator[NDArray[np.float64]]:
+    """Places round an anchor, the best first: on it if it is large, then rings of growing radius. Shape (R, 2) each."""
+    middle, across = np.array(anchor.xy), np.array(anchor.tag)
+    start = np.array(anchor.half) + across / 2 + 3 if anchor.small else np.zeros(2)
+    if not anchor.small:
+        yield middle[None]
+    for step in range(0 if anchor.small else 1, 40):
+        radius = start + step * across[1] * 0.6
+        yield middle + np.stack([np.cos(_ANGLES) * radius[0], np.sin(_ANGLES) * radius[1]], axis=1)
