@@ -1,0 +1,245 @@
+"""Follow the camera through a chunk: every frame is registered to the model that the frames before it made.
+
+A frame is accepted only when enough of the model is seen, agrees in depth and brightness, and the motion is possible.
+A frame that fails is sought again by local features; where that fails too a new segment begins, and `join` puts
+segments together afterwards by verified geometry only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+from list3r.reconstruction.features import Features, FeatureSettings, detect, match, relative_pose
+from list3r.reconstruction.registration import Registration, RegistrationSettings, Samples, register
+from list3r.reconstruction.surfels import FusionSettings, SurfelModel
+from list3r.reconstruction.view import SensorNoise, View, make_view, shrink_camera
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """How the camera is followed."""
+
+    working_width: int = 160
+    """Width of the images that are registered, px."""
+    samples: int = 6000
+    """Model points used for one frame."""
+    least_known: float = 0.08
+    """Least share of pixels with depth and normal for a frame to be of use."""
+    least_overlap: float = 0.2
+    """Least share of the model points in view that fall on known depth, relative to the frame's known share."""
+    least_inliers: float = 0.55
+    """Least share of those that agree."""
+    most_residual: float = 4.0
+    """Largest robust deviation of the depth residuals, in units of the sensor's noise."""
+    least_correlation: float = 0.4
+    """Least correlation of brightness with the model's."""
+    most_speed_m_per_s: float = 3.0
+    most_turn_deg_per_s: float = 360.0
+    gap_s: float = 0.15
+    """Frames further apart than this are sought by features first."""
+    keyframe_turn_deg: float = 12.0
+    keyframe_shift: float = 0.12
+    """Translation between keyframes as a share of the median depth."""
+    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+
+@dataclass
+class Segment:
+    """Consecutive frames that were followed without a break, in the coordinates of the first."""
+
+    model: SurfelModel
+    T_segment_cam: dict[int, Pose] = field(default_factory=dict)
+    """By position in the chunk."""
+    keyframes: list[int] = field(default_factory=list)
+    """Positions."""
+
+
+class Tracker:
+    """Follows one chunk. `segments` holds the outcome, in order of time."""
+
+    def __init__(self, frames: Sequence[Frame], camera: Camera, settings: OdometrySettings) -> None:
+        self.frames, self.camera, self.settings = frames, camera, settings
+        self.small = shrink_camera(camera, settings.working_width)
+        self.segments: list[Segment] = []
+        self._features: dict[int, Features] = {}
+        self._views: dict[int, View] = {}
+
+    def run(self) -> list[Segment]:
+        """Follow all frames, then join the segments that can be joined; the largest comes first."""
+        for position in range(len(self.frames)):
+            self._step(position)
+        return self._join()
+
+    def view(self, position: int) -> View:
+        """The frame at working resolution."""
+        if position not in self._views:
+            self._views.clear()
+            frame = self.frames[position]
+            assert frame.depth is not None
+            self._views[position] = make_view(frame.color, frame.depth, self.small, self.settings.noise)
+        return self._views[position]
+
+    def features(self, position: int) -> Features:
+        """The frame's local features, found once."""
+        if position not in self._features:
+            frame = self.frames[position]
+            assert frame.depth is not None
+            self._features[position] = detect(frame.color, frame.depth, self.camera, self.settings.features)
+        return self._features[position]
+
+    def _usable(self, position: int) -> bool:
+        return self.frames[position].depth is not None and bool(
+            self.view(position).valid.mean() >= self.settings.least_known
+        )
+
+    def _step(self, position: int) -> None:
+        if not self._usable(position):
+            return
+        found = self._follow(self.segments[-1], position) if self.segments else None
+        if found is None:
+            self.segments.append(Segment(SurfelModel(self.settings.fusion, self.settings.noise)))
+            found = np.eye(4)
+        self._accept(self.segments[-1], position, found)
+
+    def _accept(self, segment: Segment, position: int, T_segment_cam: Pose) -> None:
+        segment.model.fuse(self.view(position), T_segment_cam)
+        segment.T_segment_cam[position] = T_segment_cam
+        if not segment.keyframes or self._moved(segment, position):
+            segment.keyframes.append(position)
+
+    def _moved(self, segment: Segment, position: int) -> bool:
+        step = np.linalg.inv(segment.T_segment_cam[segment.keyframes[-1]]) @ segment.T_segment_cam[position]
+        depth = self.view(position).depth
+        far = float(np.median(depth[depth > 0]))
+        turn = _angle_deg(step)
+        return turn > self.settings.keyframe_turn_deg or bool(
+            np.linalg.norm(step[:3, 3]) > self.settings.keyframe_shift * far
+        )
+
+    def _follow(self, segment: Segment, position: int) -> Pose | None:
+        """The frame's pose in the segment, or None when nothing trustworthy is found."""
+        last = max(segment.T_segment_cam)
+        gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
+        if gap_s <= self.settings.gap_s:
+            guess = self._predict(segment, last, gap_s)
+            for T in (guess, segment.T_segment_cam[last]):
+                found = self._place(segment, position, T)
+                if found is not None and self._possible(segment, last, found.T_model_cam, gap_s):
+                    return found.T_model_cam
+        found = self._seek(segment, position)
+        if found is None and gap_s > self.settings.gap_s:
+            found = self._place(segment, position, segment.T_segment_cam[last])
+        if found is None or not self._possible(segment, last, found.T_model_cam, gap_s):
+            return None
+        return found.T_model_cam
+
+    def _predict(self, segment: Segment, last: int, gap_s: float) -> Pose:
+        """Constant velocity from the last two frames."""
+        before = [p for p in segment.T_segment_cam if p < last][-1:]
+        T_last = segment.T_segment_cam[last]
+        if not before:
+            return T_last
+        span_s = self.frames[last].time_s - self.frames[before[0]].time_s
+        if not 0 < span_s <= self.settings.gap_s:
+            return T_last
+        step = np.linalg.inv(segment.T_segment_cam[before[0]]) @ T_last
+        ratio = gap_s / span_s
+        moved = np.eye(4)
+        moved[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(step[:3, :3])[0] * ratio)[0]
+        moved[:3, 3] = step[:3, 3] * ratio
+        return T_last @ moved
+
+    def _place(self, segment: Segment, position: int, T_guess: Pose) -> Registration | None:
+        """Register the frame to the segment's model from a guess, kept only when it can be trusted."""
+        samples = segment.model.samples(T_guess, self.small, self.settings.samples)
+        found = register(samples, self.view(position), T_guess, self.settings.registration, self.settings.noise)
+        return found if found is not None and self._trusted(found, samples, position) else None
+
+    def _trusted(self, found: Registration, samples: Samples, position: int) -> bool:
+        s, view = self.settings, self.view(position)
+        share = float(view.valid.mean())
+        return (
+            found.overlap >= s.least_overlap * share
+            and len(samples.points) * found.overlap >= s.least_overlap * view.valid.sum() * 0.25
+            and found.inliers >= s.least_inliers
+            and found.residual <= s.most_residual
+            and not found.correlation < s.least_correlation
+        )
+
+    def _possible(self, segment: Segment, last: int, T: Pose, gap_s: float) -> bool:
+        step = np.linalg.inv(segment.T_segment_cam[last]) @ T
+        gap_s = max(gap_s, 1.0 / 60.0)
+        return bool(
+            np.linalg.norm(step[:3, 3]) <= self.settings.most_speed_m_per_s * gap_s
+            and _angle_deg(step) <= self.settings.most_turn_deg_per_s * gap_s
+        )
+
+    def _seek(self, segment: Segment, position: int) -> Registration | None:
+        """Find the frame by features against the segment's last frame and keyframes, then register it."""
+        last = max(segment.T_segment_cam)
+        candidates = [last, *[k for k in reversed(segment.keyframes) if k != last]]
+        best: Registration | None = None
+        for candidate in candidates[:6]:
+            T = self._feature_guess(candidate, position)
+            if T is None:
+                continue
+            found = self._place(segment, position, segment.T_segment_cam[candidate] @ T)
+            if found is not None and (best is None or found.inliers > best.inliers):
+                best = found
+        return best
+
+    def _feature_guess(self, a: int, b: int) -> Pose | None:
+        fa, fb = self.features(a), self.features(b)
+        pairs = match(fa.descriptors, fb.descriptors, self.settings.features.ratio)
+        pose = relative_pose(
+            fa.points_cam[pairs[:, 0]], fb.points_cam[pairs[:, 1]], self.settings.features, self.settings.noise
+        )
+        return None if pose is None else pose.T_a_b
+
+    def _join(self) -> list[Segment]:
+        """Attach segments to the largest one, over and over until no more can be."""
+        left = sorted(self.segments, key=lambda s: -len(s.T_segment_cam))
+        done: list[Segment] = []
+        while left:
+            base = left.pop(0)
+            attached = True
+            while attached:
+                attached = False
+                for other in list(left):
+                    T_base_other = self._connect(base, other)
+                    if T_base_other is not None:
+                        self._attach(base, other, T_base_other)
+                        left.remove(other)
+                        attached = True
+            done.append(base)
+            break
+        return done + left
+
+    def _connect(self, base: Segment, other: Segment) -> Pose | None:
+        for position in other.keyframes[:4]:
+            found = self._seek(base, position)
+            if found is not None:
+                return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
+        return None
+
+    def _attach(self, base: Segment, other: Segment, T_base_other: Pose) -> None:
+        for position, T in other.T_segment_cam.items():
+            base.T_segment_cam[position] = T_base_other @ T
+        for position in other.keyframes:
+            base.model.fuse(self.view(position), base.T_segment_cam[position])
+        base.keyframes = sorted([*base.keyframes, *other.keyframes])
+
+
+def _angle_deg(T: Pose) -> float:
+    return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))

@@ -1,0 +1,229 @@
+"""Register a view against surface points of a model: point-to-plane and brightness residuals together.
+
+Each model point is projected into the view; the surface point found there gives a point-to-plane residual along the
+model's normal, and the brightness found there a photometric one. Both are divided by their own robust scale, so that
+one weight balances them, and both are under a Huber kernel. Gauss-Newton on SE(3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.reconstruction.view import Floats, SensorNoise, View
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """How a view is registered."""
+
+    iterations: int = 12
+    gate_m: float = 0.10
+    """First limit of the point-to-plane distance; halved in each of the first two iterations."""
+    normal_agreement: float = 0.7
+    """Least cosine between the normals of a pair."""
+    photometric_weight: float = 2.0
+    """Weight of a brightness residual against a depth residual of the same number of standard deviations."""
+    least_pairs: int = 150
+    converged: float = 3e-5
+    """Largest component of the last step, metres and radians."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Surface points of a model."""
+
+    points: Floats
+    """Model coordinates, metres. Shape (N, 3)."""
+    normals: Floats
+    """Unit. Shape (N, 3)."""
+    gray: Floats | None = None
+    """Brightness, 0 to 255. Shape (N,)."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A view placed against a model."""
+
+    T_model_cam: NDArray[np.float64]
+    """Shape (4, 4)."""
+    overlap: float
+    """Share of the model points that fall on known depth of the view."""
+    inliers: float
+    """Share of those that agree within the last gate."""
+    residual: float
+    """Robust standard deviation of the point-to-plane residuals, in units of the sensor's noise."""
+    correlation: float
+    """Correlation of model and view brightness over the inliers; NaN without texture or brightness."""
+    pairs: int
+    information: NDArray[np.float64]
+    """Of the left-hand tangent (translation, rotation) in model coordinates. Shape (6, 6)."""
+
+
+def register(
+    model: Samples, view: View, T_model_cam: NDArray[np.float64], settings: RegistrationSettings, noise: SensorNoise
+) -> Registration | None:
+    """Refine `T_model_cam`; None when too few points meet."""
+    frame = _Frame(view, noise)
+    photometric = model.gray is not None and settings.photometric_weight > 0
+    T = np.array(T_model_cam, dtype=np.float64)
+    pairs = None
+    for iteration in range(settings.iterations):
+        pairs = _pair(model, frame, T, settings.gate_m * 0.5 ** min(iteration, 2), settings.normal_agreement)
+        if pairs.count < settings.least_pairs:
+            return None
+        information, gradient = _geometric(pairs)
+        if photometric:
+            more, slope = _photometric(pairs, frame, T)
+            information += settings.photometric_weight * more
+            gradient += settings.photometric_weight * slope
+        damped = information + 1e-9 * np.trace(information) * np.eye(6)
+        step = -np.linalg.solve(damped, gradient)
+        T = _exp(step) @ T
+        if iteration > 2 and np.abs(step).max() < settings.converged:
+            break
+    assert pairs is not None
+    return Registration(
+        T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
+    )
+
+
+class _Frame:
+    """The images of a view laid out for look-ups by pixel number."""
+
+    def __init__(self, view: View, noise: SensorNoise) -> None:
+        self.camera = view.camera
+        self.points = view.points.reshape(-1, 3)
+        self.normals = view.normals.reshape(-1, 3)
+        self.valid = view.valid.ravel()
+        self.inverse_sigma = 1.0 / noise.sigma(view.depth).ravel()
+        dx = cv2.Sobel(view.gray, cv2.CV_32F, 1, 0, scale=0.125)
+        dy = cv2.Sobel(view.gray, cv2.CV_32F, 0, 1, scale=0.125)
+        self.brightness = cv2.merge([view.gray, dx, dy])
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of model and view points for one iteration, M of them."""
+
+    moved: Floats
+    """View points in model coordinates. Shape (M, 3)."""
+    points: Floats
+    normals: Floats
+    gray: Floats | None
+    uv: Floats
+    """Projections of the model points, px. Shape (M, 2)."""
+    points_cam: Floats
+    """Model points in camera coordinates. Shape (M, 3)."""
+    residual: Floats
+    """Point-to-plane distances over the sensor's noise. Shape (M,)."""
+    inverse_sigma: Floats
+    scale: float
+    overlap: float
+    share: float
+
+    @property
+    def count(self) -> int:
+        return len(self.residual)
+
+
+def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, agreement: float) -> _Pairs:
+    camera = frame.camera
+    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    points_cam: Floats = np.asarray((model.points - t) @ R, np.float32)
+    inverse_z = 1.0 / np.maximum(points_cam[:, 2], np.float32(1e-3))
+    u = points_cam[:, 0] * inverse_z * np.float32(camera.fx) + np.float32(camera.cx)
+    v = points_cam[:, 1] * inverse_z * np.float32(camera.fy) + np.float32(camera.cy)
+    inside = (points_cam[:, 2] > 0.05) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    index = np.flatnonzero(inside)
+    pixel = np.rint(v[index]).astype(np.int64) * camera.width + np.rint(u[index]).astype(np.int64)
+    known = frame.valid[pixel]
+    index, pixel = index[known], pixel[known]
+    moved, normals = frame.points[pixel] @ R.T + t, model.normals[index]
+    apart = moved - model.points[index]
+    distance = np.einsum("ij,ij->i", apart, normals)
+    alike = np.einsum("ij,ij->i", frame.normals[pixel] @ R.T, normals) > agreement
+    near = (np.abs(distance) < gate_m) & (np.einsum("ij,ij->i", apart, apart) < (4 * gate_m) ** 2) & alike
+    keep = np.flatnonzero(near)
+    inverse_sigma = frame.inverse_sigma[pixel[keep]]
+    residual = distance[keep] * inverse_sigma
+    scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3 if len(keep) else 1.0
+    index = index[keep]
+    gray = None if model.gray is None else model.gray[index]
+    return _Pairs(
+        moved=moved[keep],
+        points=model.points[index],
+        normals=normals[keep],
+        gray=gray,
+        uv=np.stack([u[index], v[index]], axis=1),
+        points_cam=points_cam[index],
+        residual=residual,
+        inverse_sigma=inverse_sigma,
+        scale=scale,
+        overlap=len(pixel) / max(1, len(model.points)),
+        share=len(keep) / max(1, len(pixel)),
+    )
+
+
+def _geometric(pairs: _Pairs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
+    slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1) * pairs.inverse_sigma[:, None]
+    return _normal_equations(slope, pairs.residual, pairs.scale)
+
+
+def _photometric(
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
+    assert pairs.gray is not None
+    value, dx, dy = _sample(frame, pairs.uv)
+    error = value - pairs.gray
+    error -= np.median(error)
+    scale = 1.4826 * float(np.median(np.abs(error))) + 1.0
+    camera, p = frame.camera, pairs.points_cam
+    inverse_z = 1.0 / p[:, 2]
+    gx, gy = dx * np.float32(camera.fx) * inverse_z, dy * np.float32(camera.fy) * inverse_z
+    slope_cam = np.stack([gx, gy, -(gx * p[:, 0] + gy * p[:, 1]) * inverse_z], axis=1)
+    slope_model = slope_cam @ T[:3, :3].T.astype(np.float32)
+    slope = -np.concatenate([slope_model, _cross(pairs.points, slope_model)], axis=1)
+    return _normal_equations(slope, error, scale)
+
+
+def _normal_equations(slope: Floats, error: Floats, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Huber-weighted, with the residuals in units of their robust scale."""
+    limit = 1.345 * scale
+    weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-9)).astype(np.float32) / np.float32(scale * scale)
+    weighted = slope * weight[:, None]
+    return (weighted.T @ slope).astype(np.float64), (weighted.T @ error).astype(np.float64)
+
+
+def _correlation(pairs: _Pairs, frame: _Frame) -> float:
+    if pairs.gray is None or pairs.count < 2:
+        return float("nan")
+    value = _sample(frame, pairs.uv)[0]
+    a, b = value - value.mean(), pairs.gray - pairs.gray.mean()
+    spread = float(a.std() * b.std())
+    return float((a * b).mean()) / spread if min(a.std(), b.std()) > 2.0 else float("nan")
+
+
+def _sample(frame: _Frame, uv: Floats) -> tuple[Floats, Floats, Floats]:
+    """Brightness and its gradient at sub-pixel places."""
+    u, v = np.ascontiguousarray(uv[None, :, 0]), np.ascontiguousarray(uv[None, :, 1])
+    found = np.asarray(cv2.remap(frame.brightness, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))[0]
+    return found[:, 0], found[:, 1], found[:, 2]
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    ax, ay, az, bx, by, bz = a[:, 0], a[:, 1], a[:, 2], b[:, 0], b[:, 1], b[:, 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
+def _exp(step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A small rigid motion of (translation, rotation vector). Shape (6,) -> (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(step[3:])[0]
+    T[:3, 3] = step[:3]
+    return T

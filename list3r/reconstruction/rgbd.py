@@ -1,0 +1,128 @@
+"""Reconstruction `rgbd`: sensor depth with poses that are given or estimated.
+
+Estimated poses come from dense registration of each frame to a model of surface elements, depth and brightness
+together (`odometry`, `registration`, `surfels`); local features find frames again after a break (`features`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+from list3r.memory.errors import OptionError, TrackingError
+from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.confidence import ConfidenceSettings, depth_confidence
+from list3r.reconstruction.odometry import OdometrySettings, Tracker
+
+
+@dataclass(frozen=True)
+class RgbdSettings:
+    """How a chunk of RGB-D frames is reconstructed."""
+
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+
+
+@dataclass(frozen=True)
+class RgbdReconstructor:
+    """Poses and depth of RGB-D frames, metres.
+
+    The chunk's frame is the camera of its first posed frame where poses are estimated, and the source's own world where
+    they are given.
+    """
+
+    settings: RgbdSettings = field(default_factory=RgbdSettings)
+    poses: str = "estimate"
+    """given or estimate."""
+
+    def __post_init__(self) -> None:
+        if self.poses not in ("given", "estimate"):
+            raise OptionError(f"poses {self.poses!r}: choose given or estimate")
+
+    def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
+        """Reconstruct a chunk.
+
+        Raises `TrackingError` when the frames have no depth, when no given pose is valid, or when no two frames can
+        be related.
+        """
+        if not any(frame.depth is not None for frame in frames):
+            raise TrackingError("the frames have no depth; the rgbd reconstruction needs it")
+        if self.poses == "given":
+            T, posed, keyframes = self._given(frames, camera)
+        else:
+            T, posed, keyframes = self._estimate(frames, camera)
+        shape = (camera.height, camera.width)
+        depth = np.stack([np.zeros(shape, np.float32) if f.depth is None else f.depth for f in frames])
+        return Reconstruction(
+            frame_indices=np.array([frame.index for frame in frames], np.int64),
+            posed=posed,
+            T_chunk_cam=T,
+            camera=camera,
+            depth=depth,
+            confidence=np.stack([depth_confidence(d, camera, self.settings.confidence) for d in depth]),
+            scale_kind="metric",
+            keyframes=np.array(keyframes, np.int64),
+        )
+
+    def _estimate(
+        self, frames: Sequence[Frame], camera: Camera
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int]]:
+        segments = Tracker(frames, camera, self.settings.odometry).run()
+        if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
+            raise TrackingError(
+                f"no two of the {len(frames)} frames from {frames[0].index} to {frames[-1].index} can be related; "
+                "the camera moves too fast, or depth or texture is missing"
+            )
+        T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
+        for position, pose in segments[0].T_segment_cam.items():
+            T[position], posed[position] = pose, True
+        T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
+        return T, posed, segments[0].keyframes
+
+    def _given(
+        self, frames: Sequence[Frame], camera: Camera
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int]]:
+        T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
+        for position, frame in enumerate(frames):
+            if frame.T_source_cam is not None and is_rigid(frame.T_source_cam):
+                T[position], posed[position] = frame.T_source_cam, True
+        if not posed.any():
+            raise TrackingError(
+                f"none of the frames {frames[0].index} to {frames[-1].index} has a valid pose; use --poses estimate"
+            )
+        return T, posed, select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry)
+
+
+def is_rigid(T: NDArray[np.float64]) -> bool:
+    """Whether a 4x4 matrix is a finite rigid transform, to a tolerance that text files keep."""
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)
+
+
+def select_keyframes(
+    T_chunk_cam: NDArray[np.float64],
+    posed: NDArray[np.bool_],
+    depths: Sequence[NDArray[np.float32] | None],
+    settings: OdometrySettings,
+) -> list[int]:
+    """Positions of frames that have moved enough since the last keyframe."""
+    keyframes: list[int] = []
+    for position in map(int, np.flatnonzero(posed)):
+        depth = depths[position]
+        known = depth[::8, ::8][depth[::8, ::8] > 0] if depth is not None else np.zeros(0)
+        if not len(known):
+            continue
+        if keyframes:
+            step = np.linalg.inv(T_chunk_cam[keyframes[-1]]) @ T_chunk_cam[position]
+            turn = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
+            shift = np.linalg.norm(step[:3, 3]) / float(np.median(known))
+            if turn <= settings.keyframe_turn_deg and shift <= settings.keyframe_shift:
+                continue
+        keyframes.append(position)
+    return keyframes or [int(np.flatnonzero(posed)[0])]
