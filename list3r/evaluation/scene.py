@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,21 @@ def evaluate_scene_instances(
 ) -> InstanceErrors:
     """Match the objects of a scene with the true ones that once covered `min_px` pixels of a frame, structure aside.
 
-    The rows of `matches` number the ids of either side in ascending order, see `scene_boxes`.
+    What matches a true thing that was hardly in view counts neither way. `matches` names ids, not rows.
     """
-    true = _seen_boxes(truth, min_px)
-    boxes = scene_boxes(scene, S_truth_scene)
-    return evaluate_instances([true[k] for k in sorted(true)], [boxes[k] for k in sorted(boxes)], iou_threshold)
+    true, boxes = scene_boxes(truth), scene_boxes(scene, S_truth_scene)
+    faint = set(true) - _seen_ids(truth, min_px)
+    first = _evaluate_by_id(true, boxes, iou_threshold)
+    ignored = {scene_id for true_id, scene_id, _ in first.matches if true_id in faint}
+    true = {k: box for k, box in true.items() if k not in faint}
+    boxes = {k: box for k, box in boxes.items() if k not in ignored}
+    return _evaluate_by_id(true, boxes, iou_threshold)
+
+
+def _evaluate_by_id(true: dict[int, OrientedBox], boxes: dict[int, OrientedBox], threshold: float) -> InstanceErrors:
+    true_ids, ids = sorted(true), sorted(boxes)
+    errors = evaluate_instances([true[k] for k in true_ids], [boxes[k] for k in ids], threshold)
+    return replace(errors, matches=tuple((true_ids[t], ids[e], iou) for t, e, iou in errors.matches))
 
 
 def evaluate_scene(
@@ -80,16 +91,16 @@ def evaluate_scene(
     """
     loose = evaluate_scene_instances(scene, truth, S_truth_scene, 0.25, min_px)
     strict = evaluate_scene_instances(scene, truth, S_truth_scene, 0.50, min_px)
-    true_ids, scene_ids = sorted(_seen_boxes(truth, min_px)), sorted(scene_boxes(scene, S_truth_scene))
-    matched = [(true_ids[t], scene_ids[e], round(iou, 4)) for t, e, iou in loose.matches]
+    matched = [(true_id, scene_id, round(iou, 4)) for true_id, scene_id, iou in loose.matches]
     found = {t for t, _, _ in matched}
     labels = {int(e["id"]): e.get("label") for e in truth["instances"]}
+    wanted = sorted(_seen_ids(truth, min_px) & set(scene_boxes(truth)))
     return {
         "instances_0.25": _without_rows(loose),
         "instances_0.50": _without_rows(strict),
         "relations": relations_of_matches(scene, truth, matched).as_dict(),
         "matched_ids": matched,
-        "missed": [{"id": k, "label": labels[k]} for k in true_ids if k not in found],
+        "missed": [{"id": k, "label": labels[k]} for k in wanted if k not in found],
     }
 
 
@@ -101,10 +112,8 @@ def relations_of_matches(
     return evaluate_relations(scene_relations(truth), scene_relations(scene), truth_of)
 
 
-def _seen_boxes(truth: Mapping[str, Any], min_px: int) -> dict[int, OrientedBox]:
-    boxes = scene_boxes(truth)
-    area = {int(e["id"]): e.get("largest_px", min_px) for e in truth["instances"]}
-    return {k: box for k, box in boxes.items() if area[k] >= min_px}
+def _seen_ids(truth: Mapping[str, Any], min_px: int) -> set[int]:
+    return {int(e["id"]) for e in truth["instances"] if e.get("largest_px", min_px) >= min_px}
 
 
 def _without_rows(errors: InstanceErrors) -> dict[str, Any]:

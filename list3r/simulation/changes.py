@@ -47,15 +47,29 @@ def random_changes(world: World, seed: int, moved: int = 2, removed: int = 1, ad
         raise OptionError(f"{moved + removed} changes asked for, but only {len(small)} small things stand on tables")
     chosen = [small[k] for k in rng.permutation(len(small))[: moved + removed]]
     numbers = iter(int(n) for n in rng.integers(1 << 30, size=moved + added))
-    changes = []
-    for thing in chosen[:moved]:
-        others = [t for t in tops if t != thing.support]
-        changes.append(Change("moved", thing.id, others[rng.integers(len(others))], seed=next(numbers)))
-    changes += [Change("removed", thing.id) for thing in chosen[moved:]]
-    for _ in range(added):
-        label = SMALL_KINDS[rng.integers(len(SMALL_KINDS))]
-        changes.append(Change("added", None, tops[rng.integers(len(tops))], label, next(numbers)))
+    changes = [Change("removed", thing.id) for thing in chosen[moved:]]
+    world = apply_changes(world, tuple(changes))
+    wishes = [Change("moved", thing.id, seed=next(numbers)) for thing in chosen[:moved]]
+    wishes += [
+        Change("added", label=SMALL_KINDS[rng.integers(len(SMALL_KINDS))], seed=next(numbers)) for _ in range(added)
+    ]
+    for wish in wishes:
+        came_from = None if wish.thing is None else world.thing(wish.thing).support
+        order = [tops[k] for k in rng.permutation(len(tops)) if tops[k] != came_from]
+        change = _first_with_room(world, wish, order)
+        world = apply_changes(world, (change,))
+        changes.append(change)
     return tuple(changes)
+
+
+def _first_with_room(world: World, wish: Change, targets: list[int]) -> Change:
+    for target in targets[:-1]:
+        try:
+            apply_changes(world, (replace(wish, target=target),))
+        except OptionError:
+            continue
+        return replace(wish, target=target)
+    return replace(wish, target=targets[-1])
 
 
 def apply_changes(world: World, changes: tuple[Change, ...]) -> World:
@@ -99,11 +113,13 @@ def _put(world: World, thing: Thing, target: Thing, seed: int) -> Thing:
     box = target.box()
     top = float(box.center[2] + box.size[2] / 2)
     neighbours = [t.box() for t in world.things if t.support == target.id and t.id != thing.id]
-    reach = np.maximum(box.size[:2] / 2 - np.linalg.norm(thing.box().size[:2]) / 2 - 0.01, 0)
-    for _ in range(300):
-        offset = target.rotation()[:2, :2] @ rng.uniform(-reach, reach)
+    for _ in range(1000):
+        offset = target.rotation()[:2, :2] @ rng.uniform(-box.size[:2] / 2, box.size[:2] / 2)
         at = (target.position[0] + float(offset[0]), target.position[1] + float(offset[1]), top)
         placed = replace(thing, position=at, yaw=float(rng.uniform(0, 2 * np.pi)), support=target.id, container=None)
-        if all(footprint_gap(placed.box(), other) > 0.04 for other in neighbours):
+        corners = np.abs((placed.box().corners() - box.center) @ box.rotation)[:, :2]
+        if np.all(corners < box.size[:2] / 2 - 0.01) and all(
+            footprint_gap(placed.box(), other) > 0.03 for other in neighbours
+        ):
             return placed
     raise OptionError(f"no room for {thing.label} {thing.id} on {target.label} {target.id}: choose another target")

@@ -50,10 +50,14 @@ def chair(material: Material, cushion: Material, seat_m: float = 0.44, slats: in
 
 
 def sofa(width: float, fabric: Material, cushion: Material) -> Parts:
-    """Base, back, two arms and two seat cushions."""
+    """Feet, base, back, two arms and two seat cushions."""
     d, arm = 0.85, 0.18
     seat = (width - 2 * arm) / 2
+    feet = [
+        block((0.06, 0.06, 0.05), (i * (width / 2 - 0.08), j * 0.34, 0.025), fabric) for i in (-1, 1) for j in (-1, 1)
+    ]
     return (
+        *feet,
         block((width, d, 0.26), (0, 0, 0.13 + 0.04), fabric),
         block((width, 0.22, 0.78 - 0.04), (0, -d / 2 + 0.11, 0.41), fabric),
         block((arm, d, 0.54), (-width / 2 + arm / 2, 0, 0.31), fabric),
@@ -123,7 +127,7 @@ def mug(radius: float, height: float, material: Material) -> Parts:
 def carton(size: Vec3, material: Material, tape: Material) -> Parts:
     """A closed box with a strip of tape."""
     _, d, h = size
-    return (block(size, (0, 0, h / 2), material), block((0.04, d + 0.002, h + 0.002), (0, 0, h / 2), tape))
+    return (block(size, (0, 0, h / 2), material), block((0.04, d + 0.002, h + 0.001), (0, 0, (h + 0.001) / 2), tape))
 
 
 def book(size: Vec3, cover: Material, paper: Material) -> Parts:
@@ -163,7 +167,7 @@ def ball(radius: float, material: Material) -> Parts:
 def vase(radius: float, height: float, material: Material) -> Parts:
     """A belly with a neck."""
     return (
-        globe(radius, (0, 0, radius * 0.95), material),
+        globe(radius, (0, 0, radius), material),
         pillar(radius * 0.6, height - radius, (0, 0, radius), material, open_top=True),
     )
 

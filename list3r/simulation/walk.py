@@ -22,11 +22,11 @@ class PathSettings:
     fps: float = 12.0
     speed_m_s: float = 0.5
     """Upper bound of the speed along the path, before the hand's own motion."""
-    turn_deg_s: float = 34.0
+    turn_deg_s: float = 33.0
     """Upper bound of the turning rate along the path, before the hand's own motion."""
     sway_m: float = 0.004
     """Deviation of the hand's own motion, about 1 Hz."""
-    sway_deg: float = 0.3
+    sway_deg: float = 0.25
     """Deviation of the hand's own rotation, about 1 Hz."""
 
     def __post_init__(self) -> None:
