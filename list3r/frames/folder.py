@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.decode import read_color, read_raw_depth
+from list3r.frames.decode import clean_depth, read_color, read_raw_depth
 from list3r.frames.layout import FrameFile, Layout, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
 from list3r.frames.rig import build_rig, merge_optics
@@ -29,7 +29,8 @@ class FolderSource:
         self._layout, self._options = layout, options
         self._numbers = selected_frames(len(layout.files), options, root)
         self._fps = options.fps or _rate(layout.files) or DEFAULT_FPS
-        optics, notes = merge_optics(layout, options)
+        self.optics, notes = merge_optics(layout, options)
+        optics = self.optics
         self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files[:_PROBES])
         sizes = self._probe(root)
         self._rig = build_rig(optics, *sizes, options.max_depth_m)
@@ -50,6 +51,17 @@ class FolderSource:
                 yield self._frame(number)
             except FrameError as error:
                 yield BadFrame(number, str(error))
+
+    def read_raw(self, position: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour as stored, shape (H, W, 3), and metric depth on the depth camera's own pixels, shape (h, w).
+
+        Raises `FrameError` when one of them is missing or cannot be decoded.
+        """
+        file = self._layout.files[self._numbers[position]]
+        if file.depth is None:
+            raise FrameError(f"{file.color.name} has no depth image")
+        raw = read_raw_depth(file.depth)
+        return read_color(file.color), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]

@@ -85,8 +85,8 @@ def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intri
 
 def check_distortion(values: Sequence[float]) -> tuple[float, ...]:
     """OpenCV's k1, k2, p1, p2, k3, filled up with zeros; empty when all are zero. Raises `OptionError`."""
-    if not 1 <= len(values) <= 5 or not all(math.isfinite(v) for v in values):
-        raise OptionError(f"distortion {_show(values)}: one to five numbers k1,k2,p1,p2,k3 are needed")
+    if len(values) > 5 or not all(math.isfinite(v) for v in values):
+        raise OptionError(f"distortion {_show(values)}: up to five numbers k1,k2,p1,p2,k3 are needed")
     full = tuple(float(v) for v in values) + (0.0,) * (5 - len(values))
     return full if any(full) else ()
 

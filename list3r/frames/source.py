@@ -13,6 +13,8 @@ from list3r.frames.layout import IMAGE_ENDINGS, Layout
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import SourceError
 
+__all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
+
 FOLDERS: dict[str, Callable[[Path, SourceOptions], Layout | None]] = {
     "7scenes": seven_scenes.find,
     "tum": tum.find,
