@@ -225,6 +225,10 @@ class ChunkVerbs(Connection):
         """The embedding space of a chunk's local features."""
         return str(self._rows("SELECT feature_space FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0])
 
+    def chunk_checksums(self) -> dict[int, int]:
+        """A checksum of what each chunk measured, by chunk id: tells whether something derived from it still holds."""
+        return {int(k): int(crc) for k, crc in self._rows("SELECT chunk_id, crc FROM chunks ORDER BY chunk_id")}
+
     def stage_seconds(self) -> dict[str, float]:
         """CPU seconds spent so far by stage, over all chunks."""
         total: dict[str, float] = {}

@@ -98,6 +98,10 @@ class InstanceVerbs(ChunkVerbs):
             [(o.chunk_id, o.local_id, o.instance_id) for o in observations],
         )
 
+    def clear_observations(self) -> None:
+        """Forget which instance each local instance belongs to, before all of it is said anew."""
+        self._database.execute("DELETE FROM observations")
+
     def observations(self, instance_id: int | None = None) -> list[Observation]:
         """Which local instances make up an instance, or all of them."""
         where, arguments = ("", ()) if instance_id is None else ("WHERE instance = ?", (self.resolve(instance_id),))

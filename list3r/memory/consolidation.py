@@ -1,0 +1,307 @@
+"""Local instances of all chunks to the global library (paper 3.3): merge, keep ids, derive, relate, log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from list3r.memory.bodies import Body
+from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing
+from list3r.memory.describe import describe, median_rgb
+from list3r.memory.geometry import Sim3
+from list3r.memory.gravity import floor_height
+from list3r.memory.identities import Identities, assign_ids
+from list3r.memory.merging import Key, MergeSettings, PairScores, merge_nodes, pair_scores
+from list3r.memory.planes import place_planes
+from list3r.memory.records import ChunkRow, Instance, MergeDecision, Observation, Relation
+from list3r.memory.relations import RelationSettings, relations
+from list3r.memory.store import Store
+from list3r.memory.structure import StructureSettings, classify_structure, flagged_only
+from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, world_unit
+
+
+@dataclass(frozen=True)
+class ConsolidationSettings:
+    """How the library is derived from the chunks."""
+
+    merging: MergeSettings = field(default_factory=MergeSettings)
+    derive: DeriveSettings = field(default_factory=DeriveSettings)
+    structure: StructureSettings = field(default_factory=StructureSettings)
+    relations: RelationSettings = field(default_factory=RelationSettings)
+    min_frames: int = 8
+    """A thing seen in fewer frames, over all chunks, is not shown: it keeps its local instances but gets no id."""
+
+
+@dataclass(frozen=True)
+class ConsolidationReport:
+    """What changed in the library."""
+
+    instances: int
+    """Things in the library now."""
+    structure: int
+    """Pieces of structure in it now."""
+    new: tuple[int, ...]
+    """Ids that appeared."""
+    merged: tuple[tuple[int, int], ...]
+    """(id that retired, id that it is an alias of)."""
+    hidden: int
+    """Groups of local instances that were seen too little to be shown."""
+
+
+def consolidate(
+    store: Store, chunk_id: int | None = None, settings: ConsolidationSettings | None = None
+) -> ConsolidationReport:
+    """Derive the library from the chunks as they are placed now; call inside a transaction.
+
+    `chunk_id` is the chunk that has just come in and names the entries of the merge log; None stands for the last
+    one. The result depends on what the store holds alone, so a build that goes on after a crash comes to the same
+    library: the partition on the local instances and on where the chunks lie, the ids on the observations before.
+    """
+    s = settings or ConsolidationSettings()
+    chunks = store.chunks()
+    if not chunks:
+        return ConsolidationReport(0, 0, (), (), 0)
+    summaries = chunk_summaries(store)
+    groups, decisions = _partition(store, chunks, summaries, s.merging)
+    before = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    frames = _frame_counts(groups, summaries)
+    weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
+    ids = assign_ids(groups, before, weights, shown=[n >= s.min_frames for n in frames], next_id=store.next_id())
+    things = _things(store, groups, ids, chunks, summaries, s)
+    things = _with_structure(store, things, chunks, summaries, s)
+    _write(store, things, groups, ids, summaries)
+    store.replace_relations(None, _relations(store, things, chunks, summaries, s))
+    _log(store, chunk_id if chunk_id is not None else chunks[-1].chunk_id, decisions, before, ids)
+    return ConsolidationReport(
+        instances=sum(t.body.structure is None for t in things),
+        structure=sum(t.body.structure is not None for t in things),
+        new=ids.new,
+        merged=ids.aliases,
+        hidden=sum(n is None for n in ids.of_group),
+    )
+
+
+# ---------------------------------------------------------------------------------------------- merging
+
+
+_scores: WeakKeyDictionary[Store, dict[tuple[int, int], tuple[bytes, PairScores]]] = WeakKeyDictionary()
+
+
+def _partition(
+    store: Store, chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary], settings: MergeSettings
+) -> tuple[list[list[Key]], list[MergeDecision]]:
+    """Groups and decisions of all components, each merged on its own."""
+    groups: list[list[Key]] = []
+    decisions: list[MergeDecision] = []
+    for component in sorted({c.component for c in chunks}):
+        inside = [c for c in chunks if c.component == component]
+        placed = {c.chunk_id: c.S_world_chunk for c in inside}
+        links = [
+            ((c.chunk_id, int(a)), (c.chunk_id, int(b))) for c in inside for a, b in summaries[c.chunk_id].cannot_link
+        ]
+        pairs = _known_pairs(store, inside, summaries)
+        found = merge_nodes([summaries[c.chunk_id].shapes for c in inside], placed, links, settings, pairs)
+        groups += found[0]
+        decisions += found[1]
+    return sorted(groups), decisions
+
+
+def _known_pairs(
+    store: Store, chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
+) -> dict[tuple[int, int], PairScores]:
+    """Scores of all pairs of chunks. Each is computed at the relative pose rounded to about a millimetre, so that it
+    is a function of the store's content and still holds, unread from anywhere, while a graph settles.
+    """
+    known = _scores.setdefault(store, {})
+    checks = store.chunk_checksums()
+    out = {}
+    for n, u in enumerate(chunks):
+        for v in chunks[n:]:
+            unit = summaries[u.chunk_id].unit
+            S_u_v = _rounded(u.S_world_chunk.inverse() @ v.S_world_chunk, unit) if u is not v else Sim3.identity()
+            stamp = np.append(S_u_v.as_matrix(), [checks[u.chunk_id], checks[v.chunk_id]]).tobytes()
+            pair = (u.chunk_id, v.chunk_id)
+            if pair not in known or known[pair][0] != stamp:
+                known[pair] = (stamp, pair_scores(summaries[u.chunk_id].shapes, summaries[v.chunk_id].shapes, S_u_v))
+            out[pair] = known[pair][1]
+    return out
+
+
+def _rounded(transform: Sim3, unit: float) -> Sim3:
+    step = np.array([1e-3 * unit] * 3 + [5e-4] * 4)
+    return Sim3.exp(np.round(transform.log() / step) * step)
+
+
+def _at(summaries: Mapping[int, ChunkSummary], key: Key) -> int:
+    return int(np.searchsorted(summaries[key[0]].shapes.local_id, key[1]))
+
+
+def _frame_counts(groups: Sequence[Sequence[Key]], summaries: Mapping[int, ChunkSummary]) -> list[int]:
+    """Different frames in which each group is seen."""
+    out = []
+    for group in groups:
+        seen: set[tuple[int, int]] = set()
+        for key in group:
+            shapes = summaries[key[0]].shapes
+            seen.update((shapes.session_id, int(f)) for f in shapes.frames[_at(summaries, key)])
+        out.append(len(seen))
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- deriving
+
+
+def _things(
+    store: Store,
+    groups: Sequence[Sequence[Key]],
+    ids: Identities,
+    chunks: Sequence[ChunkRow],
+    summaries: Mapping[int, ChunkSummary],
+    s: ConsolidationSettings,
+) -> list[Thing]:
+    rows = {c.chunk_id: c for c in chunks}
+    upright = _gravity_known(store)
+    first = min(c.component for c in chunks)
+    out = []
+    for group, instance_id in zip(groups, ids.of_group, strict=True):
+        if instance_id is None:
+            continue
+        members = [
+            Member(summaries[k[0]].shapes, _at(summaries, k), rows[k[0]].S_world_chunk, rows[k[0]].image_size)
+            for k in group
+        ]
+        component = rows[group[0][0]].component
+        out.append(
+            derive_thing(instance_id, members, component, upright=upright and component == first, settings=s.derive)
+        )
+    return sorted(out, key=lambda t: t.body.id)
+
+
+def _with_structure(
+    store: Store,
+    things: Sequence[Thing],
+    chunks: Sequence[ChunkRow],
+    summaries: Mapping[int, ChunkSummary],
+    s: ConsolidationSettings,
+) -> list[Thing]:
+    """The same things, told apart into structure and what stands in the room."""
+    kinds: dict[int, str | None] = {}
+    for component in sorted({c.component for c in chunks}):
+        inside = [c for c in chunks if c.component == component]
+        bodies = [t.body for t in things if t.body.component == component]
+        if _gravity_known(store) and component == min(c.component for c in chunks):
+            unit = world_unit(inside, summaries)
+            cameras = cameras_of(store, inside).translation
+            planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in inside])
+            floor = floor_height(np.array([0.0, 0.0, 1.0]), planes, cameras, unit)
+            found = classify_structure(bodies, floor, cameras, unit, s.structure)
+        else:
+            found = flagged_only(bodies)
+        kinds.update(zip((b.id for b in bodies), found, strict=True))
+    return [replace(t, body=replace(t.body, structure=kinds[t.body.id])) for t in things]
+
+
+def _relations(
+    store: Store,
+    things: Sequence[Thing],
+    chunks: Sequence[ChunkRow],
+    summaries: Mapping[int, ChunkSummary],
+    s: ConsolidationSettings,
+) -> list[Relation]:
+    first = min(c.component for c in chunks)
+    unit = world_unit(chunks, summaries)
+    out: list[Relation] = []
+    for component in sorted({c.component for c in chunks}):
+        bodies = [t.body for t in things if t.body.component == component]
+        vertical = _gravity_known(store) and component == first
+        out += relations(bodies, gravity_known=vertical, unit=unit, settings=s.relations)
+    return out
+
+
+def _gravity_known(store: Store) -> bool:
+    return bool(store.get_value("gravity", "unknown") != "unknown")
+
+
+# ---------------------------------------------------------------------------------------------- writing
+
+
+def _write(
+    store: Store,
+    things: Sequence[Thing],
+    groups: Sequence[Sequence[Key]],
+    ids: Identities,
+    summaries: Mapping[int, ChunkSummary],
+) -> None:
+    times = {(f.session_id, f.frame_index): f.time_s for f in store.frames()}
+    metric = store.get_value("scale_kind", "metric") != "relative"
+    unit = world_unit(store.chunks(), summaries)
+    kept = {t.body.id for t in things}
+    for old in [i.id for i in store.instances() if i.id not in kept]:
+        store.drop_instance(old, dict(ids.aliases).get(old))
+    labels = {i.id: i.label for i in store.instances()}
+    store.put_instances(_record(t, labels.get(t.body.id), times, unit, metric=metric) for t in things)
+    store.clear_observations()
+    store.set_observations(
+        Observation(n, *key) for group, n in zip(groups, ids.of_group, strict=True) if n is not None for key in group
+    )
+    spaces = {store.feature_space(k) for k in summaries}
+    if len(spaces) == 1 and things:
+        space = spaces.pop()
+        store.put_embeddings(space, [t.body.id for t in things], np.array([t.feature for t in things], np.float32))
+        store.set_value("feature_space", space)
+    store.set_value("last_id", ids.last_id)
+
+
+def _record(
+    thing: Thing, label: str | None, times: Mapping[tuple[int, int], float], unit: float, *, metric: bool
+) -> Instance:
+    body: Body = thing.body
+    seen = [times[f] for f in thing.frames if f in times] or [0.0]
+    local = (body.points - body.box.center) @ body.box.rotation
+    words, color = describe(local, body.rgb, body.box.size, unit, metric=metric, structure=body.structure)
+    return Instance(
+        id=body.id,
+        label=label,
+        description=words,
+        center=body.box.center,
+        aabb=body.aabb,
+        box=body.box,
+        confidence=body.confidence,
+        observations=len(thing.frames),
+        first_seen_s=min(seen),
+        last_seen_s=max(seen),
+        state="present",
+        structure=body.structure,
+        color_rgb=median_rgb(body.rgb),
+        color_name=color,
+        component=body.component,
+        best_view=thing.best_view,
+    )
+
+
+def _log(
+    store: Store, chunk_id: int, decisions: Sequence[MergeDecision], before: Mapping[Key, int], ids: Identities
+) -> None:
+    """Append what is new: unions that did not hold before, refusals never written, ids that retired or split."""
+    written = {(d.kind, d.a, d.b) for d in store.decisions()}
+    fresh = []
+    for d in decisions:
+        a, b = _key(d.a), _key(d.b)
+        held = d.kind == "merge" and a in before and before[a] == before.get(b)
+        if not held and (d.kind, d.a, d.b) not in written:
+            fresh.append(d)
+    for old, new in ids.aliases:
+        reason = f"#{old} and #{new} are one thing; the older id stays"
+        fresh.append(MergeDecision("alias", f"#{old}", f"#{new}", {}, reason))
+    for old, new in ids.splits:
+        reason = f"what was #{old} is more than one thing; the larger part keeps the id"
+        fresh.append(MergeDecision("split", f"#{old}", f"#{new}", {}, reason))
+    store.log_decisions(chunk_id, fresh)
+
+
+def _key(name: str) -> Key:
+    chunk, local = name.split(":")
+    return int(chunk), int(local)

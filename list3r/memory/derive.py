@@ -1,0 +1,131 @@
+"""A global instance from the local instances that are one thing: points, box, feature, confidence, best view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.bodies import Body, fit_box, without_strays
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.records import BestView
+from list3r.memory.shapes import ChunkShapes
+
+
+@dataclass(frozen=True)
+class DeriveSettings:
+    """How much evidence makes a thing certain, and how its extent is measured."""
+
+    half_frames: float = 12.0
+    """Frames after which half of the doubt is gone."""
+    max_points: int = 1500
+    """Surface points kept for boxes and relations."""
+    trim: float = 0.01
+    """Share of points outside the box at either end of each axis."""
+    flat: float = 0.08
+    """Thickness over the second longest extent of what is flat."""
+    border_px: float = 3.0
+
+
+@dataclass(frozen=True)
+class Member:
+    """One local instance of a thing."""
+
+    shapes: ChunkShapes
+    at: int
+    """Position in the chunk's shapes."""
+    S_world_chunk: Sim3
+    image_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One global instance before it is written."""
+
+    body: Body
+    feature: NDArray[np.float32]
+    """Unit length. Shape (D,)."""
+    frames: tuple[tuple[int, int], ...]
+    """(session id, Frame.index) of every frame in which it is seen, in order."""
+    best_view: BestView | None
+
+
+def derive_thing(
+    instance_id: int, members: Sequence[Member], component: int, *, upright: bool, settings: DeriveSettings
+) -> Thing:
+    """All that follows from the members of one thing; `upright` says that z is up."""
+    s = settings
+    points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[m.shapes.owner == m.at]) for m in members])
+    rgb = np.concatenate([m.shapes.rgb[m.shapes.owner == m.at] for m in members])
+    if len(points) == 0:
+        points, rgb = members[0].S_world_chunk.apply(np.zeros((1, 3))), np.zeros((1, 3), np.uint8)
+    step = -(-len(points) // s.max_points)
+    points, rgb = points[::step], rgb[::step]
+    keep = without_strays(points)
+    points, rgb = points[keep], rgb[keep]
+    frames = sorted({(m.shapes.session_id, int(f)) for m in members for f in m.shapes.frames[m.at]})
+    counts = np.array([len(m.shapes.frames[m.at]) for m in members], dtype=np.float64)
+    stability = float(np.average([m.shapes.stability[m.at] for m in members], weights=np.maximum(counts, 1)))
+    feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
+    box = fit_box(points, upright=upright, trim=s.trim)
+    body = Body(
+        id=instance_id,
+        points=points,
+        rgb=rgb,
+        box=box,
+        aabb=_aabb(points, s.trim),
+        normal=_normal(members, points, s),
+        flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
+        component=component,
+        confidence=_confidence(len(frames), stability, members, s),
+    )
+    unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
+    return Thing(body, unit_feature, tuple(frames), _best_view(members, s))
+
+
+def _aabb(points: Array, trim: float) -> Array:
+    return np.asarray(np.quantile(points, [trim, 1.0 - trim], axis=0))
+
+
+def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:
+    """Normal of a thing that is flat as a whole, towards the cameras that saw it."""
+    flat = [m for m in members if not np.isnan(m.shapes.plane[m.at]).any()]
+    center = points.mean(axis=0)
+    _, spread, axes = np.linalg.svd(points - center, full_matrices=False)
+    if not flat or len(points) < 3 or spread[2] > s.flat * spread[1]:
+        return None
+    toward = np.sum([m.S_world_chunk.rotation @ m.shapes.plane[m.at, :3] for m in flat], axis=0)
+    return np.asarray(axes[2] if axes[2] @ toward >= 0 else -axes[2])
+
+
+def _confidence(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:
+    """Grows with frames and with chunks that found the thing on their own; stability caps it."""
+    chunks = len({m.shapes.chunk_id for m in members})
+    seen = frames / (frames + s.half_frames)
+    agreed = 1.0 - 0.5**chunks
+    return round(float(np.clip(stability, 0.0, 1.0)) * (0.6 * seen + 0.4 * agreed), 4)
+
+
+def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:
+    """The frame with the largest mask, weighted down where the border cuts it or something hides it."""
+    best: tuple[float, int, int] | None = None
+    box: Array = np.zeros(4)
+    for m in members:
+        height, width = m.image_size
+        b = m.shapes.boxes_xyxy[m.at].astype(np.float64)
+        if len(b) == 0:
+            continue
+        cut = (
+            (b[:, :2] <= s.border_px).any(axis=1) | (b[:, 2] >= width - s.border_px) | (b[:, 3] >= height - s.border_px)
+        )
+        score = m.shapes.areas_px[m.at] * np.where(cut, 0.25, 1.0) * (0.2 + 0.8 * m.shapes.visible_fraction[m.at])
+        n = int(np.argmax(score))
+        rank = (-float(score[n]), m.shapes.session_id, int(m.shapes.frames[m.at][n]))
+        if best is None or rank < best:
+            best, box = rank, b[n]
+    if best is None:
+        return None
+    x0, y0, x1, y1 = (float(x) for x in box)
+    return BestView(best[1], best[2], (x0, y0, x1, y1))

@@ -1,0 +1,356 @@
+"""How things stand to each other: deterministic geometry, each relation with confidence and margin.
+
+Vertical relations (on, in, above, under, and their inverses; attached_to) exist only where gravity is known or
+estimated. Inverses are relations of their own, so that a reader never has to know which is which: `on` comes with
+`supports`, `in` with `contains`, `above` with `below`; `next_to` and `near` come in both directions. `near` holds
+wherever `next_to` holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from list3r.memory.bodies import Body, neighbours_of
+from list3r.memory.geometry import Array
+from list3r.memory.records import Relation
+
+INVERSE = {
+    "on": "supports",
+    "supports": "on",
+    "in": "contains",
+    "contains": "in",
+    "above": "below",
+    "below": "above",
+    "next_to": "next_to",
+    "near": "near",
+}
+"""The inverse of each predicate that has one; `under` and `attached_to` have none."""
+PREDICATES = (*INVERSE, "under", "attached_to")
+
+
+@dataclass(frozen=True)
+class RelationSettings:
+    """Decision boundaries. Metres are turned into units of a relative memory by what a metre is there."""
+
+    noise_m: float = 0.015
+    """Standard deviation of a height or gap: depth noise and drift between chunks."""
+    contact_m: float = 0.035
+    """A thing may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
+    contact_per_height: float = 0.12
+    """More of it for tall things, whose thin legs are seldom seen."""
+    enclosed: float = 0.7
+    """Share of directions round a thing in which a container has a side."""
+    inside: float = 0.8
+    """Share of a thing's points inside its container's box."""
+    overhead: float = 0.4
+    """Share of a thing's points that have something over them, to be under it."""
+    above_m: float = 1.5
+    """Higher than this over something is no longer said to be above it."""
+    next_to_m: tuple[float, float] = (0.1, 0.4)
+    """Gap between surfaces: half the mean size of the two, within these."""
+    near_m: tuple[float, float] = (0.3, 1.0)
+    """Gap between surfaces: twice the mean size of the two, within these."""
+    attached_m: float = 0.05
+
+
+def relations(
+    bodies: Sequence[Body], *, gravity_known: bool, unit: float = 1.0, settings: RelationSettings | None = None
+) -> list[Relation]:
+    """All relations among bodies, in the order of (subject, predicate, object).
+
+    `unit` is what a metre is in world units (1 for a metric memory). Bodies of different components have none.
+    """
+    s = settings or RelationSettings()
+    bodies = sorted(bodies, key=lambda b: b.id)
+    scene = _Scene(bodies, unit, s)
+    out: list[Relation] = []
+    holding: set[tuple[int, int]] = set()
+    if gravity_known:
+        inside = _containments(scene)
+        supported = _supports(scene, {a for a, _, _, _ in inside})
+        for predicate, found in (("in", inside), ("on", supported)):
+            for a, b, confidence, margin in found:
+                holding |= {(a, b), (b, a)}
+                out += _both(bodies, a, predicate, b, confidence, margin)
+        out += _overhead(scene, holding)
+        out += _attached(scene, {a for a, _, _, _ in (*inside, *supported)})
+    out += _beside(scene, holding, gravity_known)
+    return sorted(out, key=lambda r: (r.subject, r.predicate, r.object))
+
+
+_Found = tuple[int, int, float, float]
+"""Subject and object by position, confidence, margin."""
+
+
+class _Scene:
+    """Bodies with what is derived from them once."""
+
+    def __init__(self, bodies: Sequence[Body], unit: float, settings: RelationSettings) -> None:
+        self.bodies = bodies
+        self.unit = unit
+        self.s = settings
+        self._trees: dict[int, cKDTree] = {}
+        self._gaps: dict[tuple[int, int], float] = {}
+        low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
+        high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
+        gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
+        self.box_gap = np.linalg.norm(gap, axis=2)
+        component = np.array([b.component for b in bodies])
+        self.box_gap[component[:, None] != component[None]] = np.inf
+        self.low, self.high = low, high
+
+    def tree(self, n: int) -> cKDTree:
+        if n not in self._trees:
+            self._trees[n] = cKDTree(self.bodies[n].points)
+        return self._trees[n]
+
+    def gap(self, a: int, b: int) -> float:
+        """Distance between surfaces: of the nearest support points."""
+        key = (min(a, b), max(a, b))
+        if key not in self._gaps:
+            small, large = sorted(key, key=lambda n: (len(self.bodies[n].points), n))
+            points = self.bodies[small].points
+            self._gaps[key] = float(neighbours_of(points[:: max(1, len(points) // 300)], self.tree(large))[0].min())
+        return self._gaps[key]
+
+
+def _both(bodies: Sequence[Body], a: int, predicate: str, b: int, confidence: float, margin: float) -> list[Relation]:
+    x, y = bodies[a].id, bodies[b].id
+    c, m = round(float(np.clip(confidence, 0, 1)), 4), round(float(margin), 5)
+    return [Relation(x, predicate, y, c, m), Relation(y, INVERSE[predicate], x, c, m)]
+
+
+def _sure(margin: float, noise: float) -> float:
+    """How likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
+    return float(1.0 / (1.0 + np.exp(-1.7 * margin / max(noise, 1e-12))))
+
+
+# ---------------------------------------------------------------------------------------------- on
+
+
+def _supports(scene: _Scene, taken: set[int]) -> list[_Found]:
+    """Each thing on at most one other: the one whose surface it touches best."""
+    out = []
+    for a, body in enumerate(scene.bodies):
+        if a in taken or body.structure is not None:
+            continue
+        best: _Found | None = None
+        for b in range(len(scene.bodies)):
+            if a == b or scene.box_gap[a, b] > _contact(scene, a) + 0.05 * scene.unit:
+                continue
+            found = _stands_on(scene, a, b)
+            if found is not None and (best is None or found[2] > best[2]):
+                best = found
+        if best is not None:
+            out.append(best)
+    on = {a: b for a, b, _, _ in out}
+    return [f for f in out if not (on.get(f[1]) == f[0] and f[0] > f[1])]
+
+
+def _contact(scene: _Scene, a: int) -> float:
+    height = float(scene.bodies[a].box.size[2])
+    return scene.s.contact_m * scene.unit + scene.s.contact_per_height * min(height, scene.unit)
+
+
+def _stands_on(scene: _Scene, a: int, b: int) -> _Found | None:
+    """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
+    subject, other = scene.bodies[a], scene.bodies[b]
+    z = subject.points[:, 2]
+    bottom, tolerance = float(np.quantile(z, 0.03)), _contact(scene, a)
+    sink = scene.s.contact_m * scene.unit + 0.5 * scene.s.contact_per_height * min(float(np.ptp(z)), scene.unit)
+    layer = other.points[(other.points[:, 2] > bottom - tolerance) & (other.points[:, 2] < bottom + sink)]
+    if len(layer) < 3:
+        return None
+    middle = subject.points[:, :2].mean(axis=0)
+    spacing = _spacing(layer)
+    hold = max(0.02 * scene.unit, min(spacing, 0.25 * scene.unit))
+    if _outside_hull(middle, layer[:, :2]) > hold:
+        return None
+    radius = 0.5 * float(np.linalg.norm(subject.box.size[:2])) + max(0.06 * scene.unit, 2.0 * spacing)
+    around = layer[np.linalg.norm(layer[:, :2] - middle, axis=1) < radius]
+    if len(around) < 3:
+        return None
+    distance = neighbours_of(around[:, :2], cKDTree(subject.points[:, :2]))[0][:, 0]
+    close = around[np.argsort(distance, kind="stable")[:24]]
+    surface = float(np.median(close[:, 2]))
+    if float((z > surface - 0.5 * sink).mean()) < 0.6 or float(np.median(z)) < surface - 0.01 * scene.unit:
+        return None
+    gap = bottom - surface
+    margin = tolerance - gap if gap >= 0 else sink + gap
+    if margin < 0:
+        return None
+    noise = scene.s.noise_m * scene.unit
+    below = float((other.points[:, 2] <= float(np.median(z))).mean()) if other.structure is None else 1.0
+    confidence = _sure(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, close)
+    return a, b, confidence, margin
+
+
+def _steady(subject: Body, close: Array) -> float:
+    """1 where the surface is seen all round the thing's middle, less where only on one side of it."""
+    away = close[:, :2] - subject.points[:, :2].mean(axis=0)
+    sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 6).astype(int) % 6)
+    return 0.6 + 0.4 * min(1.0, len(sectors) / 3)
+
+
+def _spacing(points: Array) -> float:
+    """Typical distance between neighbouring points of a layer."""
+    if len(points) < 3:
+        return 0.0
+    sample = points[:: max(1, len(points) // 100)]
+    return float(np.median(neighbours_of(sample, cKDTree(points), 2)[0][:, 1]))
+
+
+def _outside_hull(point: Array, xy: Array) -> float:
+    """How far a point lies outside the convex hull of others in the plane, 0 inside."""
+    try:
+        hull = ConvexHull(xy)
+    except (QhullError, ValueError):
+        return float(np.linalg.norm(xy - point, axis=1).min())
+    return float(max(0.0, (hull.equations[:, :2] @ point + hull.equations[:, 2]).max()))
+
+
+# ---------------------------------------------------------------------------------------------- in
+
+
+def _containments(scene: _Scene) -> list[_Found]:
+    """Each thing in at most one container, the smallest that encloses it."""
+    out = []
+    for a, body in enumerate(scene.bodies):
+        if body.structure is not None:
+            continue
+        holders = [
+            (float(np.prod(scene.bodies[b].box.size)), b)
+            for b in range(len(scene.bodies))
+            if a != b and scene.bodies[b].structure is None and scene.box_gap[a, b] == 0.0
+        ]
+        for _, b in sorted(holders):
+            found = _enclosed(scene, a, b)
+            if found is not None:
+                out.append(found)
+                break
+    return out
+
+
+def _enclosed(scene: _Scene, a: int, b: int) -> _Found | None:
+    """Whether b's box holds a and b has sides round a: a shelf or a box does, a seat or a table top does not."""
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    if np.prod(subject.box.size) > 0.7 * np.prod(holder.box.size):
+        return None
+    local = (subject.points - holder.box.center) @ holder.box.rotation
+    inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
+    if inside < scene.s.inside:
+        return None
+    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
+    rise = high - low
+    sides = holder.points[(holder.points[:, 2] > low + 0.3 * rise) & (holder.points[:, 2] < high + 0.3 * rise)]
+    away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
+    reach = 0.25 * float(np.min(subject.box.size[:2]))
+    away = away[np.linalg.norm(away, axis=1) > reach]
+    sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 12).astype(int) % 12)
+    share = len(sectors) / 12
+    floor = (holder.points[:, 2] < low + 0.3 * rise).sum()
+    if share < scene.s.enclosed or floor < 3:
+        return None
+    margin = (share - scene.s.enclosed) * float(np.min(subject.box.size[:2]))
+    return a, b, inside * min(1.0, 0.5 + share / 2), margin
+
+
+# ---------------------------------------------------------------------------------------------- above, below, under
+
+
+def _overhead(scene: _Scene, holding: set[tuple[int, int]]) -> list[Relation]:
+    """above and below for things apart in height, under for what stands beneath a surface of another."""
+    s, unit = scene.s, scene.unit
+    out: list[Relation] = []
+    for a, upper in enumerate(scene.bodies):
+        for b, lower in enumerate(scene.bodies):
+            if a == b or (a, b) in holding or upper.structure is not None or lower.structure is not None:
+                continue
+            if scene.box_gap[a, b] > s.above_m * unit or scene.high[a, 2] <= scene.high[b, 2]:
+                continue
+            share, clearance = _over(upper, lower, unit)
+            if share < s.overhead:
+                continue
+            gap = float(np.quantile(upper.points[:, 2], 0.03) - np.quantile(lower.points[:, 2], 0.97))
+            noise = s.noise_m * unit
+            if 0.0 < gap < s.above_m * unit:
+                out += _both(scene.bodies, a, "above", b, _sure(gap, noise) * min(1.0, 0.5 + share / 2), gap)
+            elif gap <= 0.0 and clearance > 0.0:
+                c = round(_sure(clearance, noise) * min(1.0, 0.5 + share / 2), 4)
+                out.append(Relation(lower.id, "under", upper.id, c, round(clearance, 5)))
+    return out
+
+
+def _over(upper: Body, lower: Body, unit: float) -> tuple[float, float]:
+    """Share of the lower one's points that have some of the upper one over them, and the median clearance there."""
+    sample = lower.points[:: max(1, len(lower.points) // 150)]
+    top = float(np.quantile(lower.points[:, 2], 0.97))
+    over = upper.points[upper.points[:, 2] > top - 0.02 * unit]
+    if len(over) == 0:
+        return 0.0, 0.0
+    reach = max(0.03 * unit, 1.5 * _spacing(over))
+    distance, at = neighbours_of(sample[:, :2], cKDTree(over[:, :2]))
+    hit = distance[:, 0] < reach
+    if not hit.any():
+        return 0.0, 0.0
+    return float(hit.mean()), float(np.median(over[at[hit, 0], 2])) - top
+
+
+# ---------------------------------------------------------------------------------------------- attached, beside
+
+
+def _attached(scene: _Scene, held: set[int]) -> list[Relation]:
+    """Things that hang on a wall: touching it, standing on nothing."""
+    limit = scene.s.attached_m * scene.unit
+    out = []
+    for a, body in enumerate(scene.bodies):
+        if a in held or body.structure is not None:
+            continue
+        walls = [
+            (scene.gap(a, b), b)
+            for b, other in enumerate(scene.bodies)
+            if other.structure in ("wall", "plane") and scene.box_gap[a, b] < limit
+        ]
+        if walls and min(walls)[0] < limit:
+            gap, b = min(walls)
+            c = round(_sure(limit - gap, scene.s.noise_m * scene.unit), 4)
+            out.append(Relation(body.id, "attached_to", scene.bodies[b].id, c, round(limit - gap, 5)))
+    return out
+
+
+def _beside(scene: _Scene, holding: set[tuple[int, int]], gravity_known: bool) -> list[Relation]:
+    """next_to and near, from the gap between surfaces relative to the sizes of the two."""
+    s, unit = scene.s, scene.unit
+    things = [n for n, b in enumerate(scene.bodies) if b.structure is None]
+    noise = s.noise_m * unit
+    out: list[Relation] = []
+    for at, a in enumerate(things):
+        for b in things[at + 1 :]:
+            mean = 0.5 * (scene.bodies[a].size + scene.bodies[b].size)
+            near = _clamp(2.0 * mean, s.near_m, unit)
+            if (a, b) in holding or scene.box_gap[a, b] > near:
+                continue
+            gap = scene.gap(a, b)
+            if gap > near:
+                continue
+            out += _both(scene.bodies, a, "near", b, _sure(near - gap, noise), near - gap)
+            beside = _clamp(0.5 * mean, s.next_to_m, unit)
+            if gap <= beside and (not gravity_known or _side_by_side(scene, a, b)):
+                out += _both(scene.bodies, a, "next_to", b, _sure(beside - gap, noise), beside - gap)
+    return out
+
+
+def _clamp(value: float, bounds: tuple[float, float], unit: float) -> float:
+    return min(max(value, bounds[0] * unit), bounds[1] * unit)
+
+
+def _side_by_side(scene: _Scene, a: int, b: int) -> bool:
+    """Whether two things share a good part of their heights."""
+    low = max(scene.low[a, 2], scene.low[b, 2])
+    high = min(scene.high[a, 2], scene.high[b, 2])
+    shorter = min(scene.high[a, 2] - scene.low[a, 2], scene.high[b, 2] - scene.low[b, 2])
+    return bool(high - low >= 0.3 * shorter - scene.s.noise_m * scene.unit)

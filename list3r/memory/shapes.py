@@ -1,0 +1,213 @@
+"""Local instances as the occupied cells of adaptive grids: what overlap is measured on.
+
+A surface of a chunk is known to the alignment error of the chunk and to the noise of its depth, so two supports are
+compared within a tolerance: each instance is entered in a grid of half the tolerance, grown by the tolerance. The
+coverage of all instances of one chunk by all of another is then one sparse product. The grid is adaptive: fine for
+what is small or densely sampled, coarser (by powers of two) where the support points lie far apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.chunk_verbs import LocalNode
+from list3r.memory.geometry import Array, Sim3
+
+Ints = NDArray[np.int64]
+
+LEVELS = 5
+"""Grids, each twice as coarse as the one before."""
+_BITS, _HALF = 20, 1 << 19
+_SPAN = range(-2, 3)
+_REACH = np.array(
+    [
+        i * (1 << 2 * _BITS) + j * (1 << _BITS) + k
+        for i in _SPAN
+        for j in _SPAN
+        for k in _SPAN
+        if i * i + j * j + k * k <= 4
+    ],
+    dtype=np.int64,
+)
+"""What to add to a key to get the cells whose centres lie within two cells: the tolerance."""
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """How exactly surfaces of two chunks are expected to meet."""
+
+    tolerance_m: float = 0.03
+    """Distance within which two surfaces are the same one: residual drift between chunks plus depth noise."""
+    crowd: float = 1.2
+    """Support points in an occupied cell, on average, that a grid must have to be filled by the points."""
+    max_points: int = 250
+    """Representative points of one instance, one from each occupied cell."""
+    border_px: float = 3.0
+    """A box that comes this near to the border of the image is cut by it."""
+
+
+@dataclass(frozen=True)
+class ChunkShapes:
+    """The N local instances of one chunk, in chunk coordinates."""
+
+    chunk_id: int
+    session_id: int
+    local_id: Ints
+    """Shape (N,)."""
+    points: Array
+    """Representative support points, R of them over all instances. Shape (R, 3)."""
+    rgb: NDArray[np.uint8]
+    """Their colours. Shape (R, 3)."""
+    owner: Ints
+    """Instance (0 to N - 1) of each point, ascending. Shape (R,)."""
+    cells: Ints
+    """Keys of the grown cells, ascending. Shape (C,)."""
+    cell_owner: Ints
+    """Instance of each grown cell. Shape (C,)."""
+    level: Ints
+    """Grid of each instance. Shape (N,)."""
+    grain: float
+    """Edge of the finest cells, chunk units."""
+    center: Array
+    """Middle of the trimmed extents. Shape (N, 3)."""
+    size: Array
+    """Diagonal of the trimmed extents, chunk units. Shape (N,)."""
+    cell_count: Ints
+    """Occupied cells of the instance's own grid. Shape (N,)."""
+    plane: Array
+    """(n, d), NaN for what is not flat. Shape (N, 4)."""
+    truncated: Array
+    """Share of its frames in which the image's border cuts it, by mask area, in [0, 1]. Shape (N,)."""
+    structure: NDArray[np.bool_]
+    """Shape (N,)."""
+    stability: Array
+    """Shape (N,)."""
+    feature: NDArray[np.float32]
+    """Shape (N, D)."""
+    frames: tuple[Ints, ...]
+    """Frame.index of the visible frames of each."""
+    boxes_xyxy: tuple[NDArray[np.float32], ...]
+    """Boxes in those frames, px. Shape (V, 4) each."""
+    areas_px: tuple[NDArray[np.int32], ...]
+    """Shape (V,) each."""
+    visible_fraction: tuple[NDArray[np.float32], ...]
+    """Shape (V,) each."""
+
+
+def chunk_shapes(
+    nodes: Sequence[LocalNode],
+    image_size: tuple[int, int],
+    unit: float = 1.0,
+    settings: ShapeSettings | None = None,
+    *,
+    chunk_id: int,
+    session_id: int = 1,
+) -> ChunkShapes:
+    """Enter the local instances of one chunk in their grids.
+
+    `image_size` is (height, width); `unit` is what a metre is in chunk units.
+    """
+    s = settings or ShapeSettings()
+    nodes = sorted(nodes, key=lambda n: n.local_id)
+    grain = 0.5 * s.tolerance_m * unit
+    points, rgb, owner, cells, cell_owner = [], [], [], [], []
+    level = np.zeros(len(nodes), np.int64)
+    count = np.zeros(len(nodes), np.int64)
+    center, size = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
+    for n, node in enumerate(nodes):
+        p = node.support.points.astype(np.float64)
+        if len(p) == 0:
+            continue
+        low, high = np.quantile(p, [0.02, 0.98], axis=0)
+        center[n], size[n] = (low + high) / 2, float(np.linalg.norm(high - low))
+        level[n], occupied, first = _own_grid(p, grain, s.crowd, at_least=2 if node.structure else 0)
+        count[n] = len(occupied)
+        grown = np.unique((_key(occupied, int(level[n]))[:, None] + _REACH).ravel())
+        cells.append(grown)
+        cell_owner.append(np.full(len(grown), n))
+        chosen = first[:: max(1, -(-len(first) // s.max_points))]
+        points.append(p[chosen])
+        rgb.append(node.support.rgb[chosen])
+        owner.append(np.full(len(chosen), n))
+    keys, owners = _stack(cells, np.int64), _stack(cell_owner, np.int64)
+    order = np.argsort(keys, kind="stable")
+    return ChunkShapes(
+        chunk_id=chunk_id,
+        session_id=session_id,
+        local_id=np.array([n.local_id for n in nodes], np.int64),
+        points=np.concatenate(points) if points else np.zeros((0, 3)),
+        rgb=np.concatenate(rgb) if rgb else np.zeros((0, 3), np.uint8),
+        owner=_stack(owner, np.int64),
+        cells=keys[order],
+        cell_owner=owners[order],
+        level=level,
+        grain=grain,
+        center=center,
+        size=size,
+        cell_count=count,
+        plane=np.array([np.full(4, np.nan) if n.plane is None else n.plane for n in nodes]).reshape(-1, 4),
+        truncated=np.array([_truncated(n, image_size, s.border_px) for n in nodes]),
+        structure=np.array([n.structure for n in nodes], bool),
+        stability=np.array([n.stability for n in nodes]),
+        feature=np.array([n.feature for n in nodes], np.float32),
+        frames=tuple(n.frames for n in nodes),
+        boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
+        areas_px=tuple(n.areas_px for n in nodes),
+        visible_fraction=tuple(n.visible_fraction for n in nodes),
+    )
+
+
+def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) -> Array:
+    """Share of each source instance's points that lie on each target instance. Shape (N_source, N_target).
+
+    On means within the tolerance of the target's support and, where the target is flat, of its plane.
+    """
+    shape = (len(source.local_id), len(target.local_id))
+    if len(source.points) == 0 or len(target.cells) == 0:
+        return np.zeros(shape)
+    p = S_target_source.apply(source.points)
+    hits = np.zeros(shape[0] * shape[1])
+    for level in np.unique(target.level):
+        keys = _key(np.floor(p / (target.grain * 2.0**level)).astype(np.int64), int(level))
+        start, stop = np.searchsorted(target.cells, keys, "left"), np.searchsorted(target.cells, keys, "right")
+        times = stop - start
+        which = np.repeat(np.arange(len(p)), times)
+        offset = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
+        at = target.cell_owner[np.repeat(start, times) + offset]
+        plane = target.plane[at]
+        off = np.abs(np.einsum("ij,ij->i", p[which], plane[:, :3]) + plane[:, 3])
+        on = ~(off > 2.0 * target.grain)
+        hits += np.bincount(source.owner[which[on]] * shape[1] + at[on], minlength=len(hits))
+    total = np.bincount(source.owner, minlength=shape[0])
+    return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
+
+
+def _own_grid(points: Array, grain: float, crowd: float, at_least: int) -> tuple[int, Ints, Ints]:
+    """The finest level whose cells the points fill: (level, occupied cells (M, 3), one point of each (M,))."""
+    for level in range(at_least, LEVELS):
+        cell = np.floor(points / (grain * 2.0**level)).astype(np.int64)
+        _, first = np.unique(_key(cell, 0), return_index=True)
+        if len(points) >= crowd * len(first) or level == LEVELS - 1:
+            break
+    return level, cell[first], first
+
+
+def _key(cells: Ints, level: int) -> Ints:
+    c = np.clip(cells + _HALF, 0, 2 * _HALF - 1)
+    return np.asarray(level << 3 * _BITS | c[:, 0] << 2 * _BITS | c[:, 1] << _BITS | c[:, 2], dtype=np.int64)
+
+
+def _truncated(node: LocalNode, image_size: tuple[int, int], border: float) -> float:
+    height, width = image_size
+    b = node.boxes_xyxy
+    cut = (b[:, 0] <= border) | (b[:, 1] <= border) | (b[:, 2] >= width - border) | (b[:, 3] >= height - border)
+    weight = node.areas_px.astype(np.float64)
+    return float(weight[cut].sum() / max(float(weight.sum()), 1.0))
+
+
+def _stack(parts: Sequence[NDArray[np.int64]], dtype: type) -> NDArray[np.int64]:
+    return np.concatenate(parts).astype(dtype) if parts else np.zeros(0, dtype)

@@ -1,0 +1,61 @@
+"""Matching words against labels and descriptions."""
+
+from __future__ import annotations
+
+import re
+
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance
+
+_IGNORED = frozenset("a an the of in on at with and or some any my thing things object objects".split())
+_SYNONYMS = {
+    "gray": "grey",
+    "big": "large",
+    "little": "small",
+    "round": "cylinder",
+    "cylindrical": "cylinder",
+    "flat": "sheet",
+    "cup": "mug",
+    "couch": "sofa",
+    "telly": "tv",
+    "television": "tv",
+    "monitor": "screen",
+}
+
+
+def wanted_words(text: str) -> list[str]:
+    """The words that matter, in order. Raises `OptionError` when none is left."""
+    found = [w for w in _split(text) if w not in _IGNORED]
+    if not found:
+        raise OptionError(f"{text!r} has no word to look for; name a thing, a colour or a shape")
+    return list(dict.fromkeys(found))
+
+
+def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]:
+    """(score in [0, 1], words found): a word of the label counts fully, of the kind of structure and of the
+    description nearly so, the beginning of a word half.
+    """
+    fields = [(1.0, instance.label), (0.9, instance.structure), (0.8, instance.description.split(",")[0])]
+    total, hit = 0.0, []
+    for word in wanted:
+        best = 0.0
+        for weight, text in fields:
+            have = _split(text or "")
+            if word in have:
+                best = max(best, weight)
+            elif len(word) >= 3 and any(h.startswith(word) for h in have):
+                best = max(best, 0.5 * weight)
+        if best > 0.0:
+            hit.append(word)
+        total += best
+    return total / len(wanted), hit
+
+
+def _split(text: str) -> list[str]:
+    return [_singular(w) for w in re.findall(r"[^\W_]+", text.lower())]
+
+
+def _singular(word: str) -> str:
+    if len(word) > 3 and word.endswith("s") and not word.endswith("ss"):
+        word = word[:-2] if word.endswith(("ches", "shes", "xes")) else word[:-1]
+    return _SYNONYMS.get(word, word)
