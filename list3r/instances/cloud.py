@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.views import View
+from list3r.instances.fusion import View
 
 Float = NDArray[np.float32]
 
@@ -29,7 +29,9 @@ class Cloud:
     rgb: Float
     """Mean colour in [0, 255]. Shape (N, 3)."""
     sigma: Float
-    """Mean standard deviation of the depth that fell here, chunk units. Shape (N,)."""
+    """Mean standard deviation of the fused depth that fell here, chunk units. Shape (N,)."""
+    reading: Float
+    """Mean standard deviation of the single readings of depth that fell here, chunk units. Shape (N,)."""
     weight: Float
     """Points that fell here. Shape (N,)."""
     voxel: float
@@ -69,8 +71,17 @@ def build_cloud(views: Sequence[View], voxel: float) -> Cloud:
         index.append(image)
         start = stop
     sigma = _mean(inverse, _gather(views, chosen, "sigma")[:, None], weight)[:, 0]
+    reading = _mean(inverse, _gather(views, chosen, "reading")[:, None], weight)[:, 0]
     return Cloud(
-        keys, _mean(inverse, points, weight), normals, _mean(inverse, rgb, weight), sigma, weight, voxel, tuple(index)
+        keys=keys,
+        points=_mean(inverse, points, weight),
+        normals=normals,
+        rgb=_mean(inverse, rgb, weight),
+        sigma=sigma,
+        reading=reading,
+        weight=weight,
+        voxel=voxel,
+        index=tuple(index),
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.base import Proposals
-from list3r.instances.views import ChunkViews, View, project_depth
+from list3r.instances.fusion import View, project_depth
+from list3r.instances.views import ChunkViews
 
 MIN_OVERLAP = 0.4
 """Overlap over union, of what both anchors see, from which two candidates are taken for one thing."""

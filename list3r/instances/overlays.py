@@ -36,7 +36,7 @@ def draw_debug(
 
 def instance_color(number: int) -> tuple[int, int, int]:
     """A colour (RGB) that differs from those of neighbouring numbers."""
-    hue = (number * 0.61803398875) % 1.0
+    hue = (number * 0.61803398875 + 0.17 * (number % 3)) % 1.0
     hsv = np.array([[[hue * 179.0, 150 + 105 * (number % 2), 255 - 60 * (number // 2 % 2)]]], np.uint8)
     r, g, b = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].tolist()
     return r, g, b
@@ -52,7 +52,7 @@ def draw_masks(frame: Frame, library: LocalLibrary) -> NDArray[np.uint8]:
             continue
         mask = decode_mask(instance.track.masks[int(rows[0])], instance.track.image_size)
         color = np.array(instance_color(instance.local_id), np.float32)
-        image[mask] = 0.5 * image[mask] + 0.5 * color
+        image[mask] = 0.45 * image[mask] + 0.55 * color
         outline = mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
         image[outline] = color
         marks.append((instance, _inner_point(mask)))

@@ -69,16 +69,19 @@ class Plane:
         return np.sort(np.asarray(cv2.minAreaRect(rc)[1]) + 1.0)[::-1] * self.raster.cell
 
 
-def plane_tolerance(sigma: Float, voxel: float) -> Float:
-    """How far from a plane a voxel may lie and still belong to it: noise, and bending of depth with distance."""
-    return np.asarray(0.6 * voxel + 3.5 * sigma, dtype=np.float32)
+def plane_tolerance(cloud: Cloud) -> Float:
+    """How far from a plane a voxel may lie and still belong to it. Shape (N,).
+
+    Fused noise, or what bending of depth and pose drift leave between views, which is about that of single readings.
+    """
+    return np.asarray(0.6 * cloud.voxel + np.maximum(3.5 * cloud.sigma, 2.0 * cloud.reading), dtype=np.float32)
 
 
 def find_planes(cloud: Cloud, min_area: float, unit: float) -> list[Plane]:
     """Connected flat surfaces of at least `min_area` (square chunk units), largest hypotheses first."""
     rng = np.random.default_rng(7)
     free = np.linalg.norm(cloud.normals, axis=1) > 0.5
-    tolerance = plane_tolerance(cloud.sigma, cloud.voxel)
+    tolerance = plane_tolerance(cloud)
     planes: list[Plane] = []
     floor_count = min_area / cloud.voxel**2
     for _ in range(60):
@@ -141,21 +144,37 @@ def _pieces(
     if not len(inliers):
         return []
     cell = max(2.0 * cloud.voxel, 0.02 * unit)
-    raster = plane_raster(equation, cloud.points[inliers], cell)
-    rc = raster.cells(cloud.points[inliers])
-    image = np.zeros(raster.shape, np.uint8)
-    image[rc[:, 0], rc[:, 1]] = 1
+    raster, image = _paint(equation, cloud.points[inliers], cell)
     closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     solid = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels = cv2.connectedComponents(solid, connectivity=4)
+    rc = raster.cells(cloud.points[inliers])
     own = labels[rc[:, 0], rc[:, 1]]
     out = []
     for label in range(1, count):
         mask = (labels == label).astype(np.uint8)
         area = float((mask & image).sum()) * cell**2
         if area >= min_area:
-            out.append(Plane(equation, inliers[own == label], area, raster, _fill_holes(mask, 0.25 * unit / cell)))
+            footprint = _fill_holes(mask, 0.25 * unit / cell)
+            out.append(Plane(equation, inliers[own == label], area, raster, footprint))
     return sorted(out, key=lambda plane: -plane.area)
+
+
+def _paint(equation: NDArray[np.float64], points: Float, cell: float) -> tuple[Raster, NDArray[np.uint8]]:
+    raster = plane_raster(equation, points, cell)
+    rc = raster.cells(points)
+    image = np.zeros(raster.shape, np.uint8)
+    image[rc[:, 0], rc[:, 1]] = 1
+    return raster, image
+
+
+def footprint_of(
+    equation: NDArray[np.float64], points: Float, cell: float, unit: float
+) -> tuple[Raster, NDArray[np.uint8]]:
+    """A raster on the plane and 1 where the points are, small gaps and holes filled."""
+    raster, image = _paint(equation, points, cell)
+    closed = np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+    return raster, _fill_holes(closed, 0.25 * unit / cell)
 
 
 def plane_raster(equation: NDArray[np.float64], points: Float, cell: float) -> Raster:

@@ -37,11 +37,11 @@ class SegmentSettings:
 
     voxel_m: float = 0.01
     """Grain of the chunk's cloud."""
-    plane_area_m2: float = 0.08
+    plane_area_m2: float = 0.03
     """Smallest flat surface looked for."""
     big_plane_area_m2: float = 0.7
     """A flat surface at least this large is an instance of its own."""
-    support_area_m2: float = 0.12
+    support_area_m2: float = 0.06
     """Smallest level surface that parts the things above it from those below."""
     thing_size_m: float = 0.035
     """Smallest diameter of a thing that stands out of a surface."""

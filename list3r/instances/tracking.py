@@ -140,7 +140,7 @@ def frame_labels(
     depth = views.small_depth(position)
     labels = np.zeros(depth.shape, np.int32)
     left = depth.copy()
-    pose = views.reconstruction.T_chunk_cam[position]
+    pose = views.pose(position)
     for nearest in np.argsort(np.abs(positions - position), kind="stable")[:3].tolist():
         source = views.view(proposals[nearest].position)
         moved = np.linalg.inv(source.T_chunk_cam) @ pose
@@ -226,7 +226,7 @@ def _look_for(
     count: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """For each instance: share of its samples that are seen, and share of these that lie on its mask."""
-    T_cam_chunk = np.linalg.inv(views.reconstruction.T_chunk_cam[position])
+    T_cam_chunk = np.linalg.inv(views.pose(position))
     p = samples @ T_cam_chunk[:3, :3].T.astype(np.float32) + T_cam_chunk[:3, 3].astype(np.float32)
     z = np.maximum(p[:, 2], 1e-6)
     camera = views.camera
@@ -253,7 +253,7 @@ def _surface(
         for n in np.flatnonzero(owner == number):
             structure |= bool(candidates.structure[n]) if candidates.structure is not None else False
             if np.isfinite(candidates.plane[n]).all():
-                T_cam_chunk = np.linalg.inv(views.reconstruction.T_chunk_cam[candidates.position])
+                T_cam_chunk = np.linalg.inv(views.pose(candidates.position))
                 return np.asarray(candidates.plane[n] @ T_cam_chunk), structure
     return None, structure
 

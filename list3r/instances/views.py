@@ -4,41 +4,25 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import Camera, Frame
-from list3r.instances.settings import InstanceSettings, NoiseSettings, ViewSettings
+from list3r.frames.base import Frame
+from list3r.instances.fusion import (
+    Float,
+    View,
+    depth_edges,
+    normals_of,
+    project_depth,
+    single_sigma,
+    small_color,
+    working_camera,
+)
+from list3r.instances.registration import align_views, moved_view
+from list3r.instances.settings import InstanceSettings, ViewSettings
 from list3r.reconstruction.base import Reconstruction, backproject
-
-Float = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class View:
-    """One frame at working size with fused depth. All images share their shape (h, w)."""
-
-    position: int
-    """Position of the frame in the chunk."""
-    T_chunk_cam: NDArray[np.float64]
-    """Shape (4, 4)."""
-    camera: Camera
-    """Pinhole camera at working size."""
-    depth: Float
-    """Fused depth along z, chunk units, 0 where unknown. Shape (h, w)."""
-    sigma: Float
-    """Standard deviation of the fused depth. Shape (h, w)."""
-    confirmed: NDArray[np.bool_]
-    """True where neighbouring frames agree that there is a surface. Shape (h, w)."""
-    points: Float
-    """Chunk coordinates. Shape (h, w, 3)."""
-    normals: Float
-    """Unit normals towards the camera, chunk frame, 0 where unknown. Shape (h, w, 3)."""
-    rgb: NDArray[np.uint8]
-    """Shape (h, w, 3)."""
 
 
 class ChunkViews:
@@ -52,14 +36,29 @@ class ChunkViews:
         self.anchors = pick_anchors(frames, reconstruction, settings.anchor_step)
         self.noise_scale = 1.0
         self._views: dict[int, View] = {}
-        if len(self.anchors):
+        self._corrections: list[NDArray[np.float64]] = []
+        if self.anchors:
             self.noise_scale = self._measure_noise()
+            given = [self._fuse(position) for position in self.anchors]
+            aligned = align_views(given, self.unit)
+            self._views = {view.position: view for view in aligned}
+            self._corrections = [
+                a.T_chunk_cam @ np.linalg.inv(g.T_chunk_cam) for a, g in zip(aligned, given, strict=True)
+            ]
 
     def view(self, position: int) -> View:
         """The fused view of the frame at `position`."""
         if position not in self._views:
-            self._views[position] = self._fuse(position)
+            self._views[position] = moved_view(self._fuse(position), self._correction(position))
         return self._views[position]
+
+    def pose(self, position: int) -> NDArray[np.float64]:
+        """T_chunk_cam of a frame with the correction of the nearest anchor. Shape (4, 4)."""
+        return np.asarray(self._correction(position) @ self.reconstruction.T_chunk_cam[position])
+
+    def _correction(self, position: int) -> NDArray[np.float64]:
+        nearest = int(np.argmin(np.abs(np.array(self.anchors) - position)))
+        return self._corrections[nearest]
 
     def sigma(self, depth: Float) -> Float:
         """Standard deviation of single depth readings. Shape (...)."""
@@ -103,16 +102,16 @@ class ChunkViews:
             agree += near
             deny += seen & (residual >= tolerance)
         depth = np.where(depth > 0, depth + shift / weight, 0.0).astype(np.float32)
-        edge = _depth_edges(depth, sigma)
+        edge = depth_edges(depth, sigma)
         confirmed = (depth > 0) & (agree >= np.maximum(deny, 1)) & ~(edge & (agree < 2 * deny + 3))
         alone = (agree + deny == 0) & ~edge & (depth > 0)
         T = self.reconstruction.T_chunk_cam[position]
         camera_points = backproject(depth, self.camera)
         points = (camera_points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)).astype(np.float32)
-        normals = _normals(camera_points, depth, sigma) @ T[:3, :3].T.astype(np.float32)
+        normals = normals_of(camera_points, depth, sigma) @ T[:3, :3].T.astype(np.float32)
         fused = np.maximum(sigma / np.sqrt(weight), 0.3 * sigma).astype(np.float32)
         rgb = small_color(self.frames[position].color, self.stride)
-        return View(position, T, self.camera, depth, fused, confirmed | alone, points, normals, rgb)
+        return View(position, T, self.camera, depth, fused, sigma, confirmed | alone, points, normals, rgb)
 
 
 _LAST: list[tuple[weakref.ref[Reconstruction], InstanceSettings, ChunkViews]] = []
@@ -133,21 +132,29 @@ def forget_views() -> None:
 
 
 def pick_anchors(frames: Sequence[Frame], reconstruction: Reconstruction, step: int) -> list[int]:
-    """The sharpest posed frame of each run of `step` frames, ascending."""
-    posed = np.flatnonzero(reconstruction.posed)
-    runs = np.array_split(posed, max(1, round(len(posed) / step))) if len(posed) else []
-    return [int(run[np.argmax([_sharpness(frames[p].color) for p in run])]) for run in runs if len(run)]
+    """The sharpest posed frame of each run, ascending.
+
+    A run ends after `step` frames, or when the camera has turned by 12 degrees or moved by an eighth of the depth.
+    """
+    reach = 0.25 * working_unit(reconstruction)
+    runs: list[list[int]] = []
+    for position in np.flatnonzero(reconstruction.posed).tolist():
+        if runs and len(runs[-1]) < step and _near(reconstruction.T_chunk_cam[[runs[-1][0], position]], reach):
+            runs[-1].append(position)
+        else:
+            runs.append([position])
+    return [run[int(np.argmax([_sharpness(frames[p].color) for p in run]))] for run in runs]
+
+
+def _near(T_chunk_cam: NDArray[np.float64], reach: float) -> bool:
+    """True where two poses (2, 4, 4) see nearly the same."""
+    turn = (np.trace(T_chunk_cam[0, :3, :3].T @ T_chunk_cam[1, :3, :3]) - 1.0) / 2.0
+    return bool(turn > np.cos(np.radians(12.0)) and np.linalg.norm(np.diff(T_chunk_cam[:, :3, 3], axis=0)) < reach)
 
 
 def _sharpness(color: NDArray[np.uint8]) -> float:
     small = np.ascontiguousarray(color[::2, ::2, 1])
     return float(cv2.Laplacian(small, cv2.CV_16S).astype(np.float32).var())
-
-
-def working_camera(camera: Camera, stride: int) -> Camera:
-    """The camera of an image of which every `stride`-th pixel is kept."""
-    height, width = -(-camera.height // stride), -(-camera.width // stride)
-    return Camera(width, height, camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
 
 
 def working_unit(reconstruction: Reconstruction) -> float:
@@ -159,65 +166,8 @@ def working_unit(reconstruction: Reconstruction) -> float:
     return float(np.median(sample)) / 2.0 if len(sample) else 1.0
 
 
-def small_color(color: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
-    """Colour at working size, smoothed before every `stride`-th pixel is kept."""
-    blurred = cv2.blur(color, (2 * stride - 1, 2 * stride - 1)) if stride > 1 else color
-    return np.ascontiguousarray(blurred[::stride, ::stride])
-
-
-def single_sigma(depth: Float, noise: NoiseSettings, unit: float) -> Float:
-    """Standard deviation of depth readings by the noise model. Shape (...)."""
-    metres = depth / np.float32(unit)
-    return np.asarray((noise.base_m + noise.quadratic_per_m * metres * metres) * unit, dtype=np.float32)
-
-
-def project_depth(
-    depth: Float, camera: Camera, T_other_cam: NDArray[np.float64], other: Camera
-) -> tuple[Float, Float, Float]:
-    """Where the pixels of a depth image lie in another camera: x, y in px and z. Shape (h, w) each."""
-    height, width = depth.shape
-    u = (np.arange(width, dtype=np.float32) - camera.cx) / np.float32(camera.fx)
-    v = (np.arange(height, dtype=np.float32) - camera.cy) / np.float32(camera.fy)
-    R, t = T_other_cam[:3, :3].astype(np.float32), T_other_cam[:3, 3].astype(np.float32)
-    row = [R[i, 0] * u[None, :] + (R[i, 1] * v + R[i, 2])[:, None] for i in range(3)]
-    X, Y, Z = (r * depth + t[i] for i, r in enumerate(row))
-    safe = np.where(Z > 1e-6, Z, np.float32(1e-6))
-    x = np.where(depth > 0, X / safe * np.float32(other.fx) + np.float32(other.cx), np.float32(-1e4))
-    y = Y / safe * np.float32(other.fy) + np.float32(other.cy)
-    return np.clip(x, -1e4, 1e4), np.clip(y, -1e4, 1e4), Z
-
-
 def _neighbours(reconstruction: Reconstruction, position: int, settings: ViewSettings) -> list[int]:
     low, high = position - settings.reach, position + settings.reach + 1
     wanted = range(low + (position - low) % settings.step, high, settings.step)
     count = len(reconstruction.posed)
     return [p for p in wanted if 0 <= p < count and p != position and reconstruction.posed[p]]
-
-
-def _depth_edges(depth: Float, sigma: Float) -> NDArray[np.bool_]:
-    """Pixels beside a jump of depth or a hole."""
-    kernel = np.ones((3, 3), np.uint8)
-    far = np.where(depth > 0, depth, np.float32(1e3))
-    low, high = cv2.erode(far, kernel), cv2.dilate(depth, kernel)
-    return np.asarray((high - low) > 6.0 * sigma + 0.02 * depth)
-
-
-def _normals(points: Float, depth: Float, sigma: Float) -> Float:
-    """Normals in camera coordinates from differences of smoothed points, 0 where a depth edge is in the window."""
-    known = (depth > 0).astype(np.float32)
-    mass = cv2.boxFilter(known, -1, (5, 5), normalize=False)
-    mean = cv2.boxFilter(points * known[..., None], -1, (5, 5), normalize=False) / np.maximum(mass, 1.0)[..., None]
-    step = 3
-    dx, dy = np.zeros_like(mean), np.zeros_like(mean)
-    dx[:, step:-step] = mean[:, 2 * step :] - mean[:, : -2 * step]
-    dy[step:-step] = mean[2 * step :] - mean[: -2 * step]
-    normal = np.cross(dy, dx).astype(np.float32)
-    length = np.linalg.norm(normal, axis=-1)
-    far = np.where(depth > 0, depth, np.float32(0))
-    kernel = np.ones((2 * step + 1, 2 * step + 1), np.uint8)
-    near = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), kernel)
-    smooth = (cv2.dilate(far, kernel) - near) < 10.0 * sigma + 0.09 * depth
-    ok = (length > 1e-12) & smooth & (mass > 12) & (depth > 0)
-    normal = np.where(ok[..., None], normal / np.maximum(length, 1e-12)[..., None], 0.0)
-    facing = np.sign(-np.sum(normal * points, axis=-1, keepdims=True))
-    return np.asarray(normal * facing, dtype=np.float32)

@@ -1,0 +1,196 @@
+"""What is left when the surfaces are taken away: connected components, joined to what they are parts of."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from list3r.instances.cloud import Cloud, neighbour_pairs
+from list3r.instances.surfaces import Labels, Scene, Surface
+
+
+def connect_rest(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Connected components of the voxels that belong to no surface, numbered after the surfaces.
+
+    The skirt, the thin layer of noise and sheets just above a level surface, joins nothing: it is given to the
+    component it touches afterwards, or makes components of its own. Components too small to matter even as a part
+    are dropped.
+    """
+    skirt = _skirt(scene, surfaces, labels)
+    out = _components(scene, labels, np.flatnonzero((labels == 0) & ~skirt), len(surfaces))
+    out = _grow_into(scene, out, np.flatnonzero(skirt), len(surfaces))
+    left = np.flatnonzero(skirt & (out == 0))
+    return _components(scene, out, left, int(out.max(initial=0)))
+
+
+def _skirt(scene: Scene, surfaces: list[Surface], labels: Labels) -> NDArray[np.bool_]:
+    """Voxels without a surface that lie less than a centimetre beyond the tolerance of a level one."""
+    points = scene.cloud.points
+    out = np.zeros(len(points), bool)
+    for surface in surfaces:
+        if surface.level:
+            height = surface.plane.height(points)
+            low = (height > 0) & (height < scene.tolerance + 0.01 * scene.unit)
+            rows = np.flatnonzero(low & (labels == 0))
+            raster = surface.plane.raster
+            out[rows] |= raster.look_up(surface.plane.footprint, points[rows]) > 0
+    return out
+
+
+def _components(scene: Scene, labels: Labels, rest: NDArray[np.int64], taken: int) -> Labels:
+    left, right = neighbour_pairs(scene.cloud.keys[rest], 2)
+    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(len(rest), len(rest)))
+    _, component = connected_components(graph, directed=False)
+    keep = np.bincount(component, minlength=1) >= 6
+    number = np.cumsum(keep)
+    out = labels.copy()
+    out[rest] = np.where(keep[component], taken + number[component], 0) if len(rest) else 0
+    return out
+
+
+def _grow_into(scene: Scene, labels: Labels, free: NDArray[np.int64], taken: int) -> Labels:
+    """Labels with free voxels given to the component within three voxels of them."""
+    owners = np.flatnonzero(labels > taken)
+    out = labels.copy()
+    if len(owners) and len(free):
+        tree = cKDTree(scene.cloud.points[owners])
+        distance, nearest = tree.query(scene.cloud.points[free], distance_upper_bound=2.2 * scene.cloud.voxel)
+        found = np.isfinite(distance)
+        out[free[found]] = labels[owners[nearest[found]]]
+    return out
+
+
+def least_voxels(scene: Scene) -> int:
+    """Voxels on the visible half of the smallest thing."""
+    return int(1.4 * (scene.settings.thing_size_m * scene.unit / scene.cloud.voxel) ** 2)
+
+
+def attach_parts(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Give boards that are no structure what carries them, and seats the thing they are part of."""
+    cloud = scene.cloud
+    fixed = np.array([0] + [k + 1 for k, surface in enumerate(surfaces) if surface.structure])
+    contact = contacts(cloud, np.where(np.isin(labels, fixed), 0, labels))
+    parts = members_of(labels, len(surfaces))
+    parent = np.arange(int(labels.max(initial=0)) + 1)
+    for number, surface in enumerate(surfaces):
+        if not surface.level or surface.structure or surface.sheet:
+            continue
+        for part, mine in parts.items():
+            if parent[part] != part:
+                continue
+            points = cloud.points[mine]
+            height = surface.plane.height(points)
+            touching = contact.get((number + 1, part), 0)
+            if np.mean(height < scene.tolerance[mine]) > 0.95:
+                joined = touching >= 12 or _carries(scene, surface, points, height)
+            else:
+                joined = touching >= 12 and (
+                    _is_back(scene, surface, points, height) or _spans(scene, surface, height, touching)
+                )
+            if joined:
+                parent[part] = number + 1
+    return np.asarray(parent[labels], dtype=np.int32)
+
+
+def members_of(labels: Labels, taken: int) -> dict[int, NDArray[np.int64]]:
+    """The voxels of each label above `taken`, ascending."""
+    rows = np.flatnonzero(labels > taken)
+    order = rows[np.argsort(labels[rows], kind="stable")]
+    values, start = np.unique(labels[order], return_index=True)
+    return {int(v): part for v, part in zip(values, np.split(order, start[1:]), strict=True)} if len(rows) else {}
+
+
+def _carries(scene: Scene, surface: Surface, points: NDArray[np.float32], height: NDArray[np.float32]) -> bool:
+    """True for a part under a board that ends close below it: a leg, a side, an apron.
+
+    A view from above hides the topmost part of a leg behind the board's edge, so a gap of 15 cm is allowed.
+    """
+    wide = int(np.ceil(0.04 * scene.unit / surface.plane.raster.cell))
+    footprint = cv2.dilate(surface.plane.footprint, np.ones((2 * wide + 1, 2 * wide + 1), np.uint8))
+    under = surface.plane.raster.look_up(np.asarray(footprint, np.uint8), points) > 0
+    return bool(under.mean() > 0.7 and np.quantile(height, 0.98) > -0.15 * scene.unit)
+
+
+def _is_back(scene: Scene, surface: Surface, points: NDArray[np.float32], height: NDArray[np.float32]) -> bool:
+    """True for what rises from a seat over its whole width: a back, not a thing put there."""
+    plane = surface.plane
+    if plane.area > 0.35 * scene.unit**2:
+        return False
+    local = (points - plane.raster.origin) @ plane.raster.axes.T
+    spread = cv2.minAreaRect(local.astype(np.float32))[1]
+    return max(spread) > 0.6 * plane.extent()[0] and float(np.quantile(height, 0.95)) > 0.15 * scene.unit
+
+
+def _spans(scene: Scene, surface: Surface, height: NDArray[np.float32], touching: int) -> bool:
+    """True for a thing that goes on above and below a seat and touches it along a good part of its edge."""
+    plane = surface.plane
+    if plane.area > 0.35 * scene.unit**2:
+        return False
+    away = 0.04 * scene.unit
+    edge = 2.0 * float(plane.extent().sum()) / scene.cloud.voxel
+    return float(np.mean(height > away)) > 0.15 and float(np.mean(height < -away)) > 0.15 and touching > edge
+
+
+def contacts(cloud: Cloud, labels: Labels) -> dict[tuple[int, int], int]:
+    """Number of neighbouring voxel pairs between different labels, by (smaller, larger) label."""
+    known = np.flatnonzero(labels > 0)
+    left, right = neighbour_pairs(cloud.keys[known], 2)
+    a, b = labels[known[left]], labels[known[right]]
+    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
+    codes, count = np.unique((low << 32 | high)[low != high], return_counts=True)
+    return {(int(c >> 32), int(c & 0xFFFFFFFF)): int(n) for c, n in zip(codes, count, strict=True)}
+
+
+def adopt_fragments(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Give small components to the larger thing they lie beside, unless they rest on a surface of their own.
+
+    Slats of a chair, handles and rims come apart from their thing where depth edges leave a gap.
+    """
+    taken, points = len(surfaces), scene.cloud.points
+    parts = members_of(labels, taken)
+    parent = np.arange(int(labels.max(initial=0)) + 1)
+    size = np.bincount(labels, minlength=len(parent)).astype(np.int64)
+    free = np.flatnonzero(labels > taken)
+    reach = 0.04 * scene.unit
+    for part, mine in sorted(parts.items(), key=lambda item: (len(item[1]), item[0])):
+        if _rests_alone(scene, surfaces, mine):
+            continue
+        low, high = points[mine].min(axis=0) - reach, points[mine].max(axis=0) + reach
+        near = free[((points[free] >= low) & (points[free] <= high)).all(axis=1) & (parent[labels[free]] != part)]
+        if not len(near):
+            continue
+        distance, which = cKDTree(points[near]).query(points[mine], distance_upper_bound=reach)
+        owner = np.bincount(parent[labels[near[which[np.isfinite(distance)]]]], minlength=1)
+        best = int(np.argmax(owner))
+        if size[part] < 0.3 * size[best] and owner[best] > min(0.3 * len(mine), 25):
+            parent[parent == part] = best
+            size[best] += size[part]
+    return np.asarray(parent[labels], dtype=np.int32)
+
+
+def _rests_alone(scene: Scene, surfaces: list[Surface], mine: NDArray[np.int64]) -> bool:
+    """True for a component that is large enough to be a thing and stands on a surface."""
+    if len(mine) < least_voxels(scene):
+        return False
+    points = scene.cloud.points[mine]
+    for surface in surfaces:
+        if surface.level:
+            height = surface.plane.height(points)
+            over = surface.plane.raster.look_up(surface.plane.footprint, points) > 0
+            if over.mean() > 0.5 and -0.01 * scene.unit < np.quantile(height, 0.05) < 0.03 * scene.unit:
+                return True
+    return False
+
+
+def drop_junk(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Labels without components that are too small for a thing, or no larger than the noise of their depth."""
+    out = labels.copy()
+    for mine in members_of(labels, len(surfaces)).values():
+        spread = np.linalg.norm(scene.cloud.points[mine].std(axis=0))
+        if len(mine) < least_voxels(scene) or spread < 2.5 * np.median(scene.cloud.reading[mine]):
+            out[mine] = 0
+    return out
