@@ -28,7 +28,7 @@ class DescriptorSettings:
     """Hyperplanes in a table."""
     grid: int = 4
     """Cells across and down for the gradients."""
-    layout_share: float = 0.4
+    layout_share: float = 0.25
     """Share of the layout half in the cosine."""
 
     @property

@@ -45,6 +45,16 @@ class Samples:
 
 
 @dataclass(frozen=True)
+class Anchors:
+    """Local features of the view that are known in the model: they hold what bare surfaces leave open."""
+
+    points: Floats
+    """Model coordinates, metres. Shape (N, 3)."""
+    rays_xy: Floats
+    """Where the view sees them, x / z and y / z. Shape (N, 2)."""
+
+
+@dataclass(frozen=True)
 class Registration:
     """A view placed against a model."""
 
@@ -64,7 +74,12 @@ class Registration:
 
 
 def register(
-    model: Samples, view: View, T_model_cam: NDArray[np.float64], settings: RegistrationSettings, noise: SensorNoise
+    model: Samples,
+    view: View,
+    T_model_cam: NDArray[np.float64],
+    settings: RegistrationSettings,
+    noise: SensorNoise,
+    anchors: Anchors | None = None,
 ) -> Registration | None:
     """Refine `T_model_cam`; None when too few points meet."""
     frame = _Frame(view, noise)
@@ -80,6 +95,10 @@ def register(
             more, slope = _photometric(pairs, frame, T)
             information += settings.photometric_weight * more
             gradient += settings.photometric_weight * slope
+        if anchors is not None:
+            more, slope = _anchored(anchors, T, view.camera.fx)
+            information += more
+            gradient += slope
         damped = information + 1e-9 * np.trace(information) * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
         T = _exp(step) @ T
@@ -190,6 +209,22 @@ def _photometric(
     slope_model = slope_cam @ T[:3, :3].T.astype(np.float32)
     slope = -np.concatenate([slope_model, _cross(pairs.points, slope_model)], axis=1)
     return _normal_equations(slope, error, scale)
+
+
+def _anchored(
+    anchors: Anchors, T: NDArray[np.float64], focal_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of the reprojection errors of known features, in pixels of the view."""
+    p = ((anchors.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
+    inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
+    error = (p[:, :2] * inverse_z - anchors.rays_xy) * np.float32(focal_px)
+    scale = 1.4826 * float(np.median(np.abs(error))) + 0.05
+    slope_cam = np.zeros((len(p), 2, 3), np.float32)
+    slope_cam[:, 0, 0] = slope_cam[:, 1, 1] = inverse_z[:, 0]
+    slope_cam[:, :, 2] = -p[:, :2] * inverse_z * inverse_z
+    slope_model = (np.float32(focal_px) * slope_cam @ T[:3, :3].T.astype(np.float32)).reshape(-1, 3)
+    slope = -np.concatenate([slope_model, _cross(np.repeat(anchors.points, 2, axis=0), slope_model)], axis=1)
+    return _normal_equations(slope, error.ravel(), scale)
 
 
 def _normal_equations(slope: Floats, error: Floats, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
