@@ -39,7 +39,7 @@ class PlanSettings:
     margin_px: int = 32
     header_px: int = 78
     footer_px: int = 64
-    row_px: int = 23
+    row_px: int = 22
     max_legend_px: int = 960
     """The map grows up to this height for the legend's sake; things that are not listed are drawn all the same."""
     min_map_px: int = 560
@@ -261,7 +261,8 @@ class _Sheet:
 
     def _leader(self, anchor: Anchor, place: tuple[float, float]) -> None:
         (x, y), k = anchor.xy, _OVERSAMPLING
-        if abs(place[0] - x) <= anchor.tag[0] / 2 and abs(place[1] - y) <= anchor.tag[1] / 2:
+        reach = (anchor.tag[0] / 2, anchor.tag[1] / 2) if anchor.small else anchor.half
+        if abs(place[0] - x) <= reach[0] and abs(place[1] - y) <= reach[1]:
             return
         self.draw.line([anchor.xy, place], fill=(*_INK, 170), width=k)
         self.draw.ellipse((x - 2 * k, y - 2 * k, x + 2 * k, y + 2 * k), fill=(*_INK, 220))

@@ -1,0 +1,207 @@
+"""All formats: what they share at the border, and what empty, split or scaleless memories give."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.exporters.palette import instance_color, linear_from_srgb, srgb_from_linear
+from list3r.exporters.registry import FORMATS, export, find_writer
+from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.geometry import OrientedBox, Sim3
+from list3r.memory.records import Instance, Observation, Relation
+from list3r.memory.store import Store
+from tests.conftest import box_points, chunk_result, instance, local_instance
+
+TILTED = Sim3.exp([0.5, -0.2, 0.1, 0.1, 0.2, 0.7, 0.4])
+"""A S_world_chunk with a scale that is not 1."""
+
+
+def tilted_instance(id: int, rotation: np.ndarray, component: int, **more: object) -> Instance:
+    """A thing whose box is turned."""
+    made = instance(id, (1.0, 2.0, 0.5), (0.6, 0.4, 0.2), (200, 80, 40), component=component, **more)
+    box = OrientedBox(made.center, made.box.size, rotation)
+    corners = box.corners()
+    return replace(made, box=box, aabb=np.stack([corners.min(axis=0), corners.max(axis=0)]))
+
+
+def write_split_memory(path: Path) -> Path:
+    """Relative, no gravity; two components, the second has more frames; a thing without points, a lost frame each."""
+    with Store.create(path) as store, store.transaction():
+        session = store.add_session("walk", "abc", {}, 40)
+        for index, count in ((0, 8), (1, 20)):
+            points = box_points((1.0, 2.0, 0.5), (0.6, 0.4, 0.2), 300, index)
+            local = local_instance(0, points, (200, 80, 40), np.arange(20 * index, 20 * index + 5))
+            result = chunk_result(index, 20 * index, count, (local,))
+            posed = np.ones(count, bool)
+            posed[3] = False
+            chunk = store.add_chunk(session, replace(result, posed=posed, scale_kind="relative"))
+            store.place_chunks({chunk: TILTED if index else Sim3.identity()}, {chunk: chunk})
+        store.set_value("scale_kind", "relative")
+        store.set_value("gravity", "unknown")
+        store.put_instances(
+            [
+                tilted_instance(1, TILTED.rotation, 1),
+                tilted_instance(2, TILTED.rotation, 2, label="écran plat"),
+                tilted_instance(3, np.eye(3), 2, description="no points"),
+            ]
+        )
+        store.set_observations([Observation(1, 1, 0), Observation(2, 2, 0)])
+        store.replace_relations(None, [Relation(3, "next to!", 2, 0.5, 0.1), Relation(3, "near", 2, 0.5, float("inf"))])
+    return path
+
+
+@pytest.fixture
+def split_memory(tmp_path: Path) -> Path:
+    """See `write_split_memory`."""
+    return write_split_memory(tmp_path / "split.l3r")
+
+
+def usual_path(folder: Path, name: str) -> Path:
+    """A file name that fits a format."""
+    return folder / f"out{FORMATS[name].suffixes[0]}"
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_writes_what_it_says(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    path = usual_path(tmp_path, name)
+    before = {p.name for p in tmp_path.iterdir()}
+    with Store.open(make_memory()) as store:
+        written = export(store, name, path)
+    assert written == (path,)
+    assert path.stat().st_size > 0
+    assert {p.name for p in tmp_path.iterdir()} == before | {"room.l3r", path.name}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_same_memory_same_bytes(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    with Store.open(make_memory()) as store:
+        contents = []
+        for folder in ("a", "b"):
+            (tmp_path / folder).mkdir()
+            (path,) = export(store, name, usual_path(tmp_path / folder, name))
+            contents.append(path.read_bytes())
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_empty_memory_can_be_exported(name: str, tmp_path: Path) -> None:
+    Store.create(tmp_path / "empty.l3r").close()
+    with Store.open(tmp_path / "empty.l3r") as store:
+        written = export(store, name, usual_path(tmp_path, name))
+    assert [p.stat().st_size > 0 for p in written] == [True]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_components_are_never_laid_over_each_other(name: str, split_memory: Path, tmp_path: Path) -> None:
+    path = usual_path(tmp_path, name)
+    with Store.open(split_memory) as store:
+        written = export(store, name, path)
+    assert written[0] == path
+    assert all(p.is_file() for p in written)
+    assert len(written) == (1 if name in ("json", "usd") else 2)
+    if len(written) == 2:
+        assert "component_1" in written[1].name
+
+
+def test_unknown_format_names_those_there_are() -> None:
+    with pytest.raises(OptionError, match="json, usd, ply, glb, tum, plan"):
+        find_writer("obj")
+
+
+def test_a_suffix_that_lies_is_refused(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    with Store.open(make_memory()) as store, pytest.raises(OptionError, match=r"\.usda or \.usdc or \.usd file"):
+        export(store, "usd", tmp_path / "scene.glb")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_absent_folder_is_one_line(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    with Store.open(make_memory()) as store, pytest.raises(ExportError, match="does not exist; create it") as caught:
+        export(store, name, usual_path(tmp_path / "absent", name))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_must_not_be_replaced_is_kept(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    memory = make_memory()
+    content = memory.read_bytes()
+    with Store.open(memory) as store:
+        with pytest.raises(ExportError, match="is a memory file"):
+            export(store, "json", memory)
+        with pytest.raises(ExportError, match="is a folder"):
+            export(store, "json", tmp_path)
+        with pytest.raises(ExportError, match="not a regular file"):
+            export(store, "json", os.devnull)
+    assert memory.read_bytes() == content
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_folder_without_permission_is_one_line(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    with Store.open(make_memory()) as store, pytest.raises(ExportError, match="not writable"):
+        export(store, "json", tmp_path / "locked" / "out.json")
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from list3r.exporters.registry import FORMATS, export
+from list3r.memory.errors import ExportError
+from list3r.memory.store import Store
+with Store.open(sys.argv[1]) as store:
+    for name in FORMATS:
+        path = Path(sys.argv[2]) / f"out{FORMATS[name].suffixes[0]}"
+        path.write_text("old")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
+        try:
+            export(store, name, path)
+        except ExportError as error:
+            assert "\\n" not in str(error), error
+            assert "cannot be written" in str(error), error
+            assert path.read_text() == "old"
+        else:
+            raise AssertionError(name)
+"""
+"""Every format against a disk that takes 500 bytes of a file."""
+
+
+def test_a_full_disk_leaves_the_old_file(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    pytest.importorskip("resource")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    memory = make_memory()
+    done = subprocess.run([sys.executable, "-c", LIMITED, memory, folder], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in folder.iterdir()} == {usual_path(folder, name).name for name in FORMATS}
+
+
+def test_a_failure_inside_leaves_nothing(
+    make_memory: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "out.ply"
+    with Store.open(make_memory()) as store:
+        store.close()
+        with pytest.raises(Exception):  # noqa: B017 - whatever a closed memory raises
+            export(store, "ply", path)
+    assert [p.name for p in tmp_path.iterdir()] == ["room.l3r"]
+
+
+def test_colours_of_ids_are_stable_and_distinct() -> None:
+    colors = np.array([instance_color(k) for k in range(1, 25)], float)
+    distance = np.linalg.norm(colors[:, None] - colors[None], axis=2) + 1e3 * np.eye(24)
+    assert instance_color(12) == instance_color(12)
+    assert distance.min() > 12
+    assert colors.min() >= 0
+    assert colors.max() <= 255
+
+
+def test_srgb_round_trip() -> None:
+    values = np.arange(256)
+    assert np.allclose(255 * srgb_from_linear(linear_from_srgb(values)), values, atol=1e-9)
+    assert linear_from_srgb(188) == pytest.approx(0.5029, abs=1e-4)

@@ -1,0 +1,122 @@
+"""PLY, GLB and TUM, read back by other hands than ours."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from list3r.exporters.glb import T_GLTF_WORLD, GlbSettings, write_glb
+from list3r.exporters.palette import instance_color
+from list3r.exporters.ply import PlySettings, write_ply
+from list3r.exporters.tum import write_tum
+from list3r.memory.errors import OptionError
+from list3r.memory.store import Store
+from tests.test_exporters import write_split_memory
+
+
+@pytest.fixture
+def room(make_memory: Callable[..., Path]) -> Store:
+    """The small room, open."""
+    return Store.open(make_memory())
+
+
+def test_ply_points_know_their_instance(room: Store, tmp_path: Path) -> None:
+    write_ply(room, tmp_path / "out.ply")
+    cloud = trimesh.load(tmp_path / "out.ply")
+    raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    assert len(cloud.vertices) == 6 * 400
+    for id in range(1, 7):
+        own = raw["instance"].ravel() == id
+        assert np.allclose(np.asarray(cloud.vertices)[own], room.support(id).points, atol=1e-6)
+    mug = np.flatnonzero(raw["instance"].ravel() == 3)[0]
+    assert tuple(cloud.colors[mug][:3]) == instance_color(3)
+
+
+def test_ply_settings(room: Store, tmp_path: Path) -> None:
+    write_ply(room, tmp_path / "out.ply", PlySettings(color="rgb", structure=False, points_per_instance=50))
+    cloud = trimesh.load(tmp_path / "out.ply")
+    raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    assert dict(zip(*np.unique(raw["instance"], return_counts=True), strict=True)) == {2: 50, 3: 50, 4: 50, 5: 50}
+    assert tuple(cloud.colors[raw["instance"].ravel() == 5][0][:3]) == (90, 60, 30)
+    with pytest.raises(OptionError, match="instance or rgb"):
+        PlySettings(color="height")
+
+
+def test_ply_says_its_unit_and_component(tmp_path: Path) -> None:
+    with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
+        main, other = write_ply(store, tmp_path / "out.ply")
+    assert b"lengths in unit, scale relative, gravity unknown, component 2" in main.read_bytes()
+    assert b"not placed against the main one" in other.read_bytes()
+
+
+def test_tum_is_the_trajectory_of_the_store(room: Store, tmp_path: Path) -> None:
+    write_tum(room, tmp_path / "out.txt")
+    rows = np.loadtxt(tmp_path / "out.txt")
+    poses = room.camera_poses()
+    assert rows.shape == (20, 8)
+    assert np.allclose(rows[:, 0], [f.time_s for f, _ in poses], atol=1e-6)
+    assert np.allclose(rows[:, 1:4], [S.translation for _, S in poses])
+    assert np.allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), [S.rotation for _, S in poses], atol=1e-8)
+
+
+def test_tum_gives_rigid_poses_of_posed_frames_by_component(tmp_path: Path) -> None:
+    with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
+        written = write_tum(store, tmp_path / "out.txt")
+        poses = store.camera_poses()
+    rows = [np.loadtxt(p) for p in written]
+    assert [len(r) for r in rows] == [19, 7]
+    assert np.all(np.diff(rows[0][:, 0]) > 0)
+    assert np.allclose(np.linalg.norm(rows[0][:, 4:], axis=1), 1.0, atol=1e-8)
+    assert np.allclose(rows[0][:, 1:4], [S.translation for f, S in poses if f.chunk_id == 2], atol=1e-8)
+
+
+def test_tum_is_read_by_evo(room: Store, tmp_path: Path) -> None:
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    write_tum(room, tmp_path / "out.txt")
+    trajectory = file_interface.read_tum_trajectory_file(str(tmp_path / "out.txt"))
+    assert trajectory.num_poses == 20
+    assert np.allclose(trajectory.poses_se3[3][:3, :3], room.camera_poses()[3][1].rotation, atol=1e-8)
+
+
+def read_gltf(path: Path) -> dict[str, object]:
+    """The JSON part of a binary glTF file."""
+    content = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack("<4sIII4s", content[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
+    return dict(json.loads(content[20 : 20 + size]))
+
+
+def test_glb_holds_named_points_and_boxes_y_up(room: Store, tmp_path: Path) -> None:
+    write_glb(room, tmp_path / "out.glb", GlbSettings(points_per_instance=100))
+    scene = trimesh.load(tmp_path / "out.glb")
+    assert {f"instance_{k}_points" for k in range(1, 7)} <= set(scene.graph.nodes_geometry)
+    assert "instance_3_box" in scene.graph.nodes_geometry
+    assert "instance_1_box" not in scene.graph.nodes_geometry
+    T_scene_node, name = scene.graph.get("instance_3_points")
+    points = trimesh.transform_points(scene.geometry[name].vertices, T_scene_node)
+    assert len(points) == 100
+    world = points @ T_GLTF_WORLD[:3, :3]
+    assert np.all(world >= room.instance(3).aabb[0] - 1e-4)
+    assert np.all(world <= room.instance(3).aabb[1] + 1e-4)
+    assert points[:, 1].min() > 0.7
+
+
+def test_glb_boxes_are_twelve_edges_with_facts(room: Store, tmp_path: Path) -> None:
+    write_glb(room, tmp_path / "out.glb")
+    gltf = read_gltf(tmp_path / "out.glb")
+    meshes = {m["name"]: m for m in gltf["meshes"]}  # type: ignore[attr-defined]
+    accessors = gltf["accessors"]
+    box = meshes["instance_5_box"]
+    assert box["extras"]["id"] == 5
+    assert box["extras"]["description"] == "chair"
+    (primitive,) = box["primitives"]
+    position = accessors[primitive["attributes"]["POSITION"]]  # type: ignore[index]
+    assert (primitive["mode"], position["count"]) == (1, 24)
+    assert np.allclose(position["max"], room.instance(5).aabb[1])

@@ -1,0 +1,95 @@
+"""The plan view: where things land on the page, tags that can be read, and pictures that hold what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from list3r.exporters.components import read_components
+from list3r.exporters.palette import instance_color
+from list3r.exporters.plan import PlanSettings, _plain, _round_length, plan_image, write_plan
+from list3r.exporters.plan_frame import PlanFrame, choose_rotation
+from list3r.exporters.plan_labels import Anchor, place_tags
+from list3r.memory.errors import OptionError
+from list3r.memory.store import Store
+from tests.test_exporters import write_split_memory
+
+
+def test_the_picture_has_its_size_and_its_colours(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    with Store.open(make_memory()) as store:
+        write_plan(store, tmp_path / "plan.png")
+    picture = Image.open(tmp_path / "plan.png")
+    assert picture.width == 1600
+    assert picture.mode == "RGB"
+    pixels = np.asarray(picture).reshape(-1, 3).astype(int)
+    for id in (2, 3, 4, 5):
+        assert (np.abs(pixels - instance_color(id)).max(axis=1) <= 2).sum() > 20, f"the box of {id} is not drawn"
+
+
+def test_width_follows_the_settings(make_memory: Callable[..., Path]) -> None:
+    with Store.open(make_memory()) as store:
+        picture = plan_image(store, read_components(store)[0], PlanSettings(width_px=1000))
+    assert picture.width == 1000
+    with pytest.raises(OptionError, match="at least"):
+        PlanSettings(width_px=500)
+
+
+def test_the_page_is_seen_from_above(make_memory: Callable[..., Path]) -> None:
+    with Store.open(make_memory()) as store:
+        (component,) = read_components(store)
+        rotation, note = choose_rotation(component, "estimated")
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    assert np.allclose(rotation[2], [0, 0, 1])
+    assert "z is up" in note
+    along = np.abs(rotation[:2, :2])
+    assert np.allclose(np.sort(along.ravel()), [0, 0, 1, 1], atol=1e-9), "the walls lie along the page"
+
+
+def test_without_gravity_the_camera_path_gives_the_page(tmp_path: Path) -> None:
+    with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
+        component = read_components(store)[0]
+        rotation, note = choose_rotation(component, store.get_value("gravity"))
+    camera_up = -component.poses[0][1].rotation[:, 1]
+    assert rotation[2] @ camera_up > 0.99
+    assert "gravity unknown" in note
+
+
+def test_world_points_land_on_the_page() -> None:
+    frame = PlanFrame(np.eye(3), np.array([1.0, 2.0]), 100.0, (400, 200), "")
+    assert np.allclose(frame.to_px([[1.0, 2.0, 5.0], [2.0, 2.5, 0.0]]), [[200, 100], [300, 50]])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 40), st.integers(0, 2**16))
+def test_tags_do_not_cover_each_other(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    anchors = [
+        Anchor((float(x), float(y)), (float(w), float(h)), (24.0, 16.0))
+        for x, y, w, h in zip(*rng.uniform(0, 1000, (2, count)), *rng.uniform(2, 60, (2, count)), strict=True)
+    ]
+    places = np.array(place_tags(anchors, (0.0, 0.0, 1000.0, 1000.0)))
+    apart = np.abs(places[:, None] - places[None])
+    touching = (apart[..., 0] < 24.0) & (apart[..., 1] < 16.0)
+    assert touching.sum() == count
+    assert places.min() >= 8.0
+    assert places.max() <= 992.0
+
+
+def test_a_tag_on_a_large_thing_is_on_it() -> None:
+    (place,) = place_tags([Anchor((500.0, 500.0), (100.0, 100.0), (24.0, 16.0))], (0.0, 0.0, 1000.0, 1000.0))
+    assert place == (500.0, 500.0)
+
+
+def test_round_lengths() -> None:
+    assert [_round_length(v) for v in (0.9, 1.0, 4.9, 7.0, 23.0)] == pytest.approx([0.5, 1.0, 2.0, 5.0, 20.0])
+
+
+def test_letters_that_the_font_lacks_are_replaced() -> None:
+    assert _plain("écran 2 × 3 cm · …") == "ecran 2 ? 3 cm · …"
