@@ -142,6 +142,12 @@ def test_a_ball_in_a_bowl_is_not_merged_with_it() -> None:
     assert evaluate_instances([bowl, ball], [bowl]).merged_pairs == 0
 
 
+def test_the_yaw_of_a_round_thing_does_not_count() -> None:
+    ball, turned = box(0, 0, 0, (0.2, 0.2, 0.2)), box(0, 0, 0, (0.2, 0.2, 0.2), 45)
+    assert evaluate_instances([ball], [turned]).mean_iou == pytest.approx(1 / np.sqrt(2))
+    assert evaluate_instances([ball], [turned], is_round=[True]).mean_iou == pytest.approx(1.0)
+
+
 def test_nothing_against_something_counts_without_failing() -> None:
     assert evaluate_instances([], TRUTH).precision == 0.0
     assert evaluate_instances(TRUTH, []).recall == 0.0

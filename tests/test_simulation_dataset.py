@@ -13,7 +13,7 @@ from list3r.evaluation.scene import evaluate_scene, read_scene
 from list3r.evaluation.trajectory import read_tum
 from list3r.frames.base import Frame
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import ExportError, OptionError
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 SETTINGS = WalkSettings(seed=2, frames=26, start=40, size=(160, 120), write_ids=True)
@@ -94,6 +94,12 @@ def test_poses_are_written_as_the_camera_went(walk: Path) -> None:
 def test_a_folder_that_holds_a_walk_is_left_alone(walk: Path) -> None:
     with pytest.raises(OptionError, match="already holds"):
         write_walk(walk, SETTINGS)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExportError, match="file"):
+        write_walk(tmp_path / "file" / "walk", SETTINGS)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,9 +56,20 @@ def intersection_volume(a: OrientedBox, b: OrientedBox) -> float:
     return max(polygon_area(clip_polygon(footprint(a), footprint(b))), 0.0) * float(high - low)
 
 
-def box_overlaps(truth: Sequence[OrientedBox], estimate: Sequence[OrientedBox]) -> tuple[Array, Array]:
-    """IoU, and the share of each estimated box that lies in each true one. Two of shape (T, E)."""
-    shared = np.array([[intersection_volume(a, b) for b in estimate] for a in truth]).reshape(len(truth), len(estimate))
+def box_overlaps(
+    truth: Sequence[OrientedBox], estimate: Sequence[OrientedBox], is_round: Sequence[bool] = ()
+) -> tuple[Array, Array]:
+    """IoU, and the share of each estimated box that lies in each true one. Two of shape (T, E).
+
+    A true box of which `is_round` says that its yaw means nothing is turned to that of the estimate.
+    """
+    turns = list(is_round) or [False] * len(truth)
+    shared = np.array(
+        [
+            [intersection_volume(replace(a, rotation=b.rotation) if turn else a, b) for b in estimate]
+            for a, turn in zip(truth, turns, strict=True)
+        ]
+    ).reshape(len(truth), len(estimate))
     volume_a = np.array([np.prod(box.size) for box in truth]).reshape(-1, 1)
     volume_b = np.array([np.prod(box.size) for box in estimate]).reshape(1, -1)
     union = np.maximum(volume_a + volume_b - shared, 1e-12)

@@ -61,16 +61,19 @@ def match_boxes(iou: Array, threshold: float) -> list[tuple[int, int]]:
 
 
 def evaluate_instances(
-    truth: Sequence[OrientedBox], estimate: Sequence[OrientedBox], iou_threshold: float = 0.25
+    truth: Sequence[OrientedBox],
+    estimate: Sequence[OrientedBox],
+    iou_threshold: float = 0.25,
+    is_round: Sequence[bool] = (),
 ) -> InstanceErrors:
     """Match upright boxes of one frame of reference one to one and count what is left over.
 
     An unmatched estimate is a duplicate when the true object it overlaps best (by IoU) is matched by another one and
     holds more than half of its volume. Two true objects are merged when one estimate covers more than half of either
     and not both are matched; pairs of which one lies mostly in the other's box by right, as a ball in a bowl does, do
-    not count.
+    not count. `is_round` marks true objects without a yaw, see `box_overlaps`.
     """
-    iou, inside = box_overlaps(truth, estimate)
+    iou, inside = box_overlaps(truth, estimate, is_round)
     pairs = match_boxes(iou, iou_threshold)
     matched = len(pairs)
     duplicates = _count_duplicates(iou, inside, pairs)

@@ -68,16 +68,21 @@ def evaluate_scene_instances(
     """
     true, boxes = scene_boxes(truth), scene_boxes(scene, S_truth_scene)
     faint = set(true) - _seen_ids(truth, min_px)
-    first = _evaluate_by_id(true, boxes, iou_threshold)
+    round_ids = {int(e["id"]) for e in truth["instances"] if e.get("round")}
+    first = _evaluate_by_id(true, boxes, iou_threshold, round_ids)
     ignored = {scene_id for true_id, scene_id, _ in first.matches if true_id in faint}
     true = {k: box for k, box in true.items() if k not in faint}
     boxes = {k: box for k, box in boxes.items() if k not in ignored}
-    return _evaluate_by_id(true, boxes, iou_threshold)
+    return _evaluate_by_id(true, boxes, iou_threshold, round_ids)
 
 
-def _evaluate_by_id(true: dict[int, OrientedBox], boxes: dict[int, OrientedBox], threshold: float) -> InstanceErrors:
+def _evaluate_by_id(
+    true: dict[int, OrientedBox], boxes: dict[int, OrientedBox], threshold: float, round_ids: set[int]
+) -> InstanceErrors:
     true_ids, ids = sorted(true), sorted(boxes)
-    errors = evaluate_instances([true[k] for k in true_ids], [boxes[k] for k in ids], threshold)
+    errors = evaluate_instances(
+        [true[k] for k in true_ids], [boxes[k] for k in ids], threshold, [k in round_ids for k in true_ids]
+    )
     return replace(errors, matches=tuple((true_ids[t], ids[e], iou) for t, e, iou in errors.matches))
 
 

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import ExportError, OptionError
 from list3r.simulation.changes import Change, apply_changes
 from list3r.simulation.render import Renderer
 from list3r.simulation.sensor import SensorSettings, sense
@@ -90,12 +90,20 @@ def write_walk(
 
     Writes `rgb/`, `depth/` (16 bit, 5000 per metre), `rgb.txt`, `depth.txt`, `groundtruth.txt` (T_world_cam),
     `calibration.txt` (fx fy cx cy) and `truth.json`. `progress` is called with the number of frames just written.
-    More than one worker starts processes, which asks of a script that it guards its main part.
+    More than one worker starts processes, which asks of a script that it guards its main part. Raises `OptionError`
+    for a folder that holds a walk, `ExportError` for one that cannot be written.
     """
     settings = settings or WalkSettings()
     root = Path(folder)
     if (root / "rgb.txt").exists():
         raise OptionError(f"{root} already holds a sequence: name another folder or remove it first")
+    try:
+        return _write(root, settings, workers, progress)
+    except OSError as error:
+        raise ExportError(f"cannot write the walk to {error.filename or root}: {error.strerror or error}") from error
+
+
+def _write(root: Path, settings: WalkSettings, workers: int, progress: Callable[[int], None] | None) -> Path:
     for name in ("rgb", "depth", *(["ids"] if settings.write_ids else [])):
         (root / name).mkdir(parents=True, exist_ok=True)
     time_s, poses = settings.poses()

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _NEAR_M = 0.05
+_SUBPIXELS = np.array([[-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.125, 0.375]], np.float32)
+"""Offsets of the rays within an edge pixel, px: the rotated grid."""
 _EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)])
 
 
@@ -48,32 +50,40 @@ class Renderer:
 
     def render(self, T_world_cam: Array) -> RenderedFrame:
         """The picture from a pose. Shape (4, 4)."""
-        depth, solid = self._cast(T_world_cam)
-        rotation, eye = T_world_cam[:3, :3].astype(np.float32), T_world_cam[:3, 3].astype(np.float32)
+        rects = self._rectangles(T_world_cam)
+        depth, solid = self._cast(T_world_cam, *rects)
         shape = depth.shape
         hit = np.flatnonzero(solid.ravel() >= 0)
-        seen, z = solid.ravel()[hit], depth.ravel()[hit]
-        rays = np.stack(np.broadcast_arrays(self._x[None, :], self._y[:, None], np.float32(1.0)), -1).reshape(-1, 3)
-        rays = rays[hit] @ rotation.T
-        points = eye + z[:, None] * rays
-        toward = -rays / np.linalg.norm(rays, axis=1)[:, None]
-        normals, u, v = surface(self._solids, seen, points, toward)
-        cosine = np.einsum("nk,nk->n", normals, toward)
-        footprint = z / self._camera.fx / np.sqrt(np.maximum(cosine, 0.05))
-        albedo = self._atlas.sample(self._solids.material[seen], u, v, footprint)
-        light = illumination(self._world, points, normals) * self._shadows.factor(points, normals[:, 2] > 0.9)
+        row, column = np.divmod(hit, shape[1])
+        seen = solid.ravel()[hit]
+        shaded, cosine = self._shade(T_world_cam, seen, depth.ravel()[hit], self._x[column], self._y[row])
         color, ids = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.int32)
         incidence = np.zeros(shape, np.float32)
-        color.reshape(-1, 3)[hit] = np.minimum(albedo * light[:, None], 255)
+        color.reshape(-1, 3)[hit] = shaded
         ids.ravel()[hit], incidence.ravel()[hit] = self._solids.thing[seen], cosine
+        self._smooth_edges(T_world_cam, solid, rects[1], color)
         return RenderedFrame(color, np.where(solid >= 0, depth, 0).astype(np.float32), ids, incidence)
 
-    def _cast(self, T_world_cam: Array) -> tuple[Floats, NDArray[np.int64]]:
+    def _shade(
+        self, T_world_cam: Array, solid: NDArray[np.int64], z: Floats, x: Floats, y: Floats
+    ) -> tuple[Floats, Floats]:
+        """Colour (N, 3) and cosine of incidence (N,) where rays (x, y, 1) meet solids at depth z, all (N,)."""
+        rotation, eye = T_world_cam[:3, :3].astype(np.float32), T_world_cam[:3, 3].astype(np.float32)
+        rays = np.stack([x, y, np.ones_like(x)], axis=1) @ rotation.T
+        points = eye + z[:, None] * rays
+        toward = -rays / np.linalg.norm(rays, axis=1)[:, None]
+        normals, u, v = surface(self._solids, solid, points, toward)
+        cosine = np.einsum("nk,nk->n", normals, toward)
+        footprint = z / np.float32(self._camera.fx) / np.sqrt(np.maximum(cosine, 0.05))
+        albedo = self._atlas.sample(self._solids.material[solid], u, v, footprint)
+        light = illumination(self._world, points, normals) * self._shadows.factor(points, normals[:, 2] > 0.9)
+        return np.minimum(albedo * light[:, None], 255), cosine
+
+    def _cast(self, T_world_cam: Array, nearest: Array, rects: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
         """Depth (inf where nothing is hit) and number of the nearest solid (-1 for none) of every pixel."""
         camera = self._camera
         depth = np.full((camera.height, camera.width), np.inf, np.float32)
         solid = np.full((camera.height, camera.width), -1, np.int64)
-        nearest, rects = self._rectangles(T_world_cam)
         for n in np.argsort(nearest, kind="stable"):
             left, top, right, bottom = rects[n]
             if right <= left or bottom <= top:
@@ -82,11 +92,41 @@ class Renderer:
             before = depth[window]
             if before.max() <= nearest[n]:
                 continue
-            found = self._intersect(int(n), T_world_cam, self._x[left:right], self._y[top:bottom])
+            found = self._intersect(int(n), T_world_cam, self._x[None, left:right], self._y[top:bottom, None])
             closer = found < before
             depth[window] = np.where(closer, found, before)
             solid[window][closer] = n
         return depth, solid
+
+    def _smooth_edges(
+        self, T_world_cam: Array, solid: NDArray[np.int64], rects: NDArray[np.int64], color: Floats
+    ) -> None:
+        """Give pixels between two solids the mean of four rays, in place; only solids in view are met again."""
+        edge = np.zeros(solid.shape, bool)
+        for near, far in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+            differs = solid[near] != solid[far]
+            edge[near] |= differs
+            edge[far] |= differs
+        row, column = np.nonzero(edge)
+        if not len(row):
+            return
+        x = (self._x[column][:, None] + _SUBPIXELS[:, 0] / np.float32(self._camera.fx)).astype(np.float32)
+        y = (self._y[row][:, None] + _SUBPIXELS[:, 1] / np.float32(self._camera.fy)).astype(np.float32)
+        depth, hit = np.full(x.shape, np.inf, np.float32), np.full(x.shape, -1, np.int64)
+        for n in np.unique(solid[solid >= 0]):
+            left, top, right, bottom = rects[n]
+            rows = slice(*np.searchsorted(row, [top - 1, bottom + 1]))
+            chosen = rows.start + np.flatnonzero((column[rows] >= left - 1) & (column[rows] <= right))
+            found = self._intersect(int(n), T_world_cam, x[chosen], y[chosen])
+            closer = found < depth[chosen]
+            depth[chosen] = np.where(closer, found, depth[chosen])
+            hit[chosen] = np.where(closer, n, hit[chosen])
+        shades = np.zeros((hit.size, 3), np.float32)
+        full = np.flatnonzero(hit.ravel() >= 0)
+        shades[full], _ = self._shade(
+            T_world_cam, hit.ravel()[full], depth.ravel()[full], x.ravel()[full], y.ravel()[full]
+        )
+        color[row, column] = shades.reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
 
     def _rectangles(self, T_world_cam: Array) -> tuple[Array, NDArray[np.int64]]:
         """Least depth (N,) and pixel rectangle [left, right) x [top, bottom) (N, 4) of every solid."""
@@ -107,13 +147,13 @@ class Renderer:
         return np.maximum(local[..., 2].min(axis=1), 0.0), np.clip(rects, 0, size).astype(np.int64)
 
     def _intersect(self, n: int, T_world_cam: Array, x: Floats, y: Floats) -> Floats:
-        """Depth at which the rays of a window meet solid `n`, inf where they miss. Shape (len(y), len(x))."""
+        """Depth at which rays (x, y, 1) meet solid `n`, inf where they miss; x and y are broadcast."""
         solids = self._solids
         c, s = np.cos(solids.yaw[n]), np.sin(solids.yaw[n])
         to_local = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         rotation = (to_local @ T_world_cam[:3, :3]).astype(np.float32)
         origin = (to_local @ (T_world_cam[:3, 3] - solids.center[n])).astype(np.float32)
-        rays = [r[0] * x[None, :] + (r[1] * y + r[2])[:, None] for r in rotation]
+        rays = [r[0] * x + (r[1] * y + r[2]) for r in rotation]
         half = solids.half[n].astype(np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
             if solids.kind[n] == BOX:

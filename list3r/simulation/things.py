@@ -65,6 +65,10 @@ class Thing:
     structure: str | None = None
     """floor, wall or ceiling for what bounds the room."""
 
+    def is_round(self) -> bool:
+        """Whether it looks the same from all sides, so that the yaw of its box means nothing."""
+        return all(part.kind != BOX and part.center[:2] == (0, 0) for part in self.parts)
+
     def rotation(self) -> Array:
         """R_world_object. Shape (3, 3)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)

@@ -36,6 +36,7 @@ def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
         "id": thing.id,
         "label": thing.label,
         "structure": thing.structure is not None,
+        "round": thing.is_round(),
         "box": {
             "center": _rounded(box.center),
             "size": _rounded(box.size),
