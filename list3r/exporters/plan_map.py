@@ -44,7 +44,7 @@ def _floor_cover(frame: PlanFrame, support: Support) -> Image:
     reach = _reach(frame, support)
     canvas.stamp(canvas.place(frame, support), np.ones(len(support.points), np.uint32), reach)
     seen = (canvas.picture() > 0).astype(np.float64)
-    return np.clip(2.0 * uniform_filter(seen, 4 * reach + 3), 0.0, 1.0)[..., None]
+    return np.clip(2.5 * uniform_filter(seen, 4 * reach + 3), 0.0, 1.0)[..., None]
 
 
 def _things_from_above(frame: PlanFrame, things: list[Support]) -> Codes:
@@ -81,7 +81,7 @@ def _reach(frame: PlanFrame, support: Support) -> int:
     if not len(support.points):
         return 0
     spacing = point_spacing(support.points) * frame.pixels_per_unit
-    return int(np.clip(spacing * 0.7, 0, 2 * _MAX_REACH_PX)) // 2
+    return int(np.clip(spacing * 0.7, 0, _MAX_REACH_PX))
 
 
 class _Canvas:
