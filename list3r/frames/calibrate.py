@@ -210,8 +210,9 @@ class _Problem:
             self._sideways.append(e.horizontal)
         self.count = sum(map(len, self._points))
         thin = max(1, self.count // _MOST_EDGES)
-        for parts in (self._points, self._pixels, self._sideways):
-            parts[:] = [part[::thin] for part in parts]
+        self._points = [part[::thin] for part in self._points]
+        self._pixels = [part[::thin] for part in self._pixels]
+        self._sideways = [part[::thin] for part in self._sideways]
 
     def start(self) -> Array:
         """The camera as the source is assumed to be, without its offset and distortion."""
@@ -283,7 +284,7 @@ class _Problem:
                 return -self.score(w, maps, members)
 
             simplex = np.vstack([np.zeros(len(free)), np.eye(len(free))]) * (blur / 6.0)
-            limits = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-5, "maxfev": 150 * len(free)}
+            limits: Any = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-5, "maxfev": 150 * len(free)}
             v = base
             v[free] += minimize(miss, np.zeros(len(free)), method="Nelder-Mead", options=limits).x * step
         return v
@@ -362,9 +363,7 @@ def _movement(source: FolderSource, position: int) -> float:
     return round(float(np.hypot(dx, dy)), 3)
 
 
-def _edge_maps(
-    gray: NDArray[np.uint8], blur_px: float, scale: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _edge_maps(gray: NDArray[Any], blur_px: float, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Edges against their surroundings, so that weak outlines count as well as strong print."""
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), max(scale, 0.5))
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)

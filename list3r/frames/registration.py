@@ -85,18 +85,18 @@ class Registration:
         A pixel is filled from two opposite neighbours when the depth pixels these came from are themselves close
         neighbours on one surface, with depth known between them. A true hole or an edge is left as it is.
         """
-        height, width = out.shape
+        width = out.shape[1]
         flat_out, flat_origin, flat_fine = out.ravel(), origin.ravel(), fine.ravel()
         filled = out.copy()
         flat_filled = filled.ravel()
-        for step, view in ((1, np.s_[:, 1:-1]), (width, np.s_[1:-1, :])):
-            before = np.roll(flat_out, step).reshape(height, width)[view]
-            after = np.roll(flat_out, -step).reshape(height, width)[view]
-            here = out[view]
-            limit = np.maximum(before, after) * np.float32(1.0 + 2.0 * self._jump)
-            candidate = np.zeros((height, width), dtype=bool)
-            candidate[view] = (before > 0) & (after > 0) & ((here == 0) | (here > limit))
-            at = np.flatnonzero(candidate.ravel())
+        steep = np.float32(1.0 + 2.0 * self._jump)
+        for step, before, here, after in (
+            (1, out[:, :-2], out[:, 1:-1], out[:, 2:]),
+            (width, out[:-2], out[1:-1], out[2:]),
+        ):
+            gap = ((here == 0) | (here > steep * np.maximum(before, after))) & (before > 0) & (after > 0)
+            row, column = np.nonzero(gap)
+            at = (row * width + column + step).astype(np.int32)
             at = at[self._one_surface(flat_origin[at - step], flat_origin[at + step], flat_fine)]
             value = 0.5 * (flat_out[at - step] + flat_out[at + step])
             still = (flat_filled[at] == 0) | (flat_filled[at] > value)

@@ -39,8 +39,11 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
     intrinsics, note = _file_intrinsics(folder, root)
     if _is_kinect(intrinsics):
         optics = Optics(KINECT_COLOR, KINECT_DISTORTION, KINECT_DEPTH, KINECT_T_COLOR_DEPTH, 1000.0)
-        known = "depth and colour are not registered in 7-Scenes: the measured constants of its Kinect are used"
-        return Layout("7scenes", files, optics, "depth", intrinsics, (note, known))
+        known = (
+            f"{note}; depth and colour are not registered in 7-Scenes, and its depth camera of 585 px is nominal: the "
+            "measured cameras of its Kinect are used"
+        )
+        return Layout("7scenes", files, optics, "depth", intrinsics, (known,))
     other = (
         "the intrinsics are not those of the 7-Scenes Kinect, so depth is taken as registered into the colour image; "
         "give --depth-intrinsics and --depth-to-color if it is not"
