@@ -11,9 +11,9 @@ from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.cloud import Cloud, build_cloud
 from list3r.instances.features import object_feature
+from list3r.instances.fusion import View
 from list3r.instances.segments import Segmentation, segment_cloud
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
-from list3r.instances.fusion import View
 from list3r.instances.views import ChunkViews, chunk_views
 from list3r.reconstruction.base import Reconstruction
 

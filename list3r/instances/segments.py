@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from list3r.instances.cloud import Cloud
 from list3r.instances.planes import find_planes, plane_tolerance
 from list3r.instances.settings import SegmentSettings
+from list3r.instances.sheets import find_sheets
 from list3r.instances.surfaces import Labels, Scene, Surface, assign_surfaces, choose_surfaces, estimate_up
 from list3r.instances.things import adopt_fragments, attach_parts, connect_rest, drop_junk, least_voxels
 
@@ -53,10 +54,11 @@ def segment_cloud(
     labels = attach_parts(scene, surfaces, labels)
     labels = adopt_fragments(scene, surfaces, labels)
     labels = drop_junk(scene, surfaces, labels)
-    return _describe(scene, surfaces, labels)
+    labels, sheets = find_sheets(scene, surfaces, labels)
+    return _describe(scene, surfaces, labels, set(sheets))
 
 
-def _describe(scene: Scene, surfaces: list[Surface], labels: Labels) -> Segmentation:
+def _describe(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: set[int]) -> Segmentation:
     """Number the labels that are left from 1 and say what each is."""
     present = np.unique(labels[labels > 0])
     renumber = np.zeros(int(labels.max(initial=0)) + 1, np.int32)
@@ -72,6 +74,18 @@ def _describe(scene: Scene, surfaces: list[Surface], labels: Labels) -> Segmenta
             kind = "sheet" if surface.sheet else "surface"
             segments.append(Segment(kind, equation, surface.structure, 0.95))
             continue
+        if label in sheets:
+            segments.append(Segment("sheet", _plane_of(scene, mine), False, 0.8))
+            continue
         score = 1.0 - np.exp(-mine.sum() / (2.0 * least_voxels(scene)))
         segments.append(Segment("thing", None, False, float(score)))
     return Segmentation(np.asarray(renumber[labels], np.int32), tuple(segments), scene.up)
+
+
+def _plane_of(scene: Scene, mine: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Least-squares plane through the voxels of a flat level thing, normal up. Shape (4,)."""
+    points = scene.cloud.points[mine].astype(np.float64)
+    mean = points.mean(axis=0)
+    n = np.linalg.eigh(np.cov((points - mean).T))[1][:, 0]
+    n = n if n @ scene.up > 0 else -n
+    return np.append(n, -n @ mean)

@@ -108,6 +108,8 @@ def _same_surface(scene: Scene, big: Plane, small: Plane) -> bool:
         return False
     small_level = scene.level(big) and big.area < 0.35 * scene.unit**2
     reach = 2.0 * big.raster.cell if small_level else 0.25 * float(small.extent()[0])
+    if _share_behind(scene, big) < 0.02 and _share_behind(scene, small) < 0.02:
+        return True
     rc = np.argwhere(big.footprint > 0)
     local = (points - big.raster.origin) @ big.raster.axes.T / big.raster.cell
     low, high = rc.min(axis=0)[::-1], rc.max(axis=0)[::-1]
@@ -151,8 +153,9 @@ def is_structure(scene: Scene, plane: Plane) -> bool:
     if scene.level(plane):
         camera = float(np.median(plane.height(scene.camera_centers.astype(np.float32)))) / scene.unit
         return area > 2.0 or (camera > 0.9 and area > 0.2)
+    wide = area > 0.3 and plane.extent()[0] > 1.2 * scene.unit
     ceiling = plane.normal @ scene.up < -0.94
-    return bool((scene.upright(plane) or ceiling) and area > scene.settings.big_plane_area_m2)
+    return bool((scene.upright(plane) or ceiling) and (area > scene.settings.big_plane_area_m2 or wide))
 
 
 def assign_surfaces(scene: Scene, surfaces: list[Surface]) -> Labels:

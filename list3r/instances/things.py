@@ -166,7 +166,7 @@ def adopt_fragments(scene: Scene, surfaces: list[Surface], labels: Labels) -> La
         distance, which = cKDTree(points[near]).query(points[mine], distance_upper_bound=reach)
         owner = np.bincount(parent[labels[near[which[np.isfinite(distance)]]]], minlength=1)
         best = int(np.argmax(owner))
-        if size[part] < 0.3 * size[best] and owner[best] > min(0.3 * len(mine), 25):
+        if size[part] < 0.5 * size[best] and owner[best] > min(0.3 * len(mine), 25):
             parent[parent == part] = best
             size[best] += size[part]
     return np.asarray(parent[labels], dtype=np.int32)
