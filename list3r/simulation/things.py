@@ -81,6 +81,15 @@ class Thing:
         rotation = self.rotation()
         return OrientedBox(np.array(self.position) + rotation @ ((low + high) / 2), high - low, rotation)
 
+    def part_boxes(self) -> list[OrientedBox]:
+        """The box of each part in the world."""
+        out = []
+        for part in self.parts:
+            low, high = part.extent()
+            rotation = self.rotation()
+            out.append(OrientedBox(np.array(self.position) + rotation @ ((low + high) / 2), high - low, rotation))
+        return out
+
 
 @dataclass(frozen=True)
 class Solids:

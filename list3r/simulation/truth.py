@@ -11,8 +11,10 @@ from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.simulation.things import Thing
 from list3r.simulation.world import World
 
-NEXT_TO_GAP_M = 0.25
-"""Things on one support are next to each other up to this gap between their footprints, metres."""
+NEXT_TO_M = (0.1, 0.4)
+"""Things are next to each other up to half the mean of their longest edges, within these bounds, metres."""
+SHARED_HEIGHT = 0.3
+"""Least share of the shorter one's height that two things side by side have in common."""
 
 
 def world_truth(world: World, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
@@ -51,7 +53,11 @@ def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
 
 
 def true_relations(world: World) -> list[tuple[int, str, int]]:
-    """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `next_to` by gap, both ways."""
+    """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `next_to` by gap, both ways.
+
+    `next_to` is the gap between surfaces against the size of the two, among things that share heights and of which
+    neither holds the other. Rugs are next to nothing: what touches them stands on them.
+    """
     triples: list[tuple[int, str, int]] = []
     for thing in world.things:
         if thing.container is not None:
@@ -60,12 +66,33 @@ def true_relations(world: World) -> list[tuple[int, str, int]]:
             triples.append((thing.id, "on", thing.support))
         if thing.attached is not None:
             triples.append((thing.id, "attached_to", thing.attached))
-    standing = [t for t in world.things if t.support is not None and t.label != "rug"]
-    for a in standing:
-        for b in standing:
-            if a.id != b.id and a.support == b.support and footprint_gap(a.box(), b.box()) <= NEXT_TO_GAP_M:
-                triples.append((a.id, "next_to", b.id))
-    return triples
+    things = [t for t in world.things if t.structure is None and t.label != "rug"]
+    for k, a in enumerate(things):
+        for b in things[:k]:
+            if _side_by_side(a, b):
+                triples += [(a.id, "next_to", b.id), (b.id, "next_to", a.id)]
+    return sorted(triples)
+
+
+def _side_by_side(a: Thing, b: Thing) -> bool:
+    if a.id in (b.support, b.container) or b.id in (a.support, a.container):
+        return False
+    one, two = a.box(), b.box()
+    shared = min(one.center[2] + one.size[2] / 2, two.center[2] + two.size[2] / 2)
+    shared -= max(one.center[2] - one.size[2] / 2, two.center[2] - two.size[2] / 2)
+    if shared < SHARED_HEIGHT * min(one.size[2], two.size[2]):
+        return False
+    limit = float(np.clip(0.25 * (one.size.max() + two.size.max()), *NEXT_TO_M))
+    return footprint_gap(one, two) <= limit and surface_gap(a, b) <= limit
+
+
+def surface_gap(a: Thing, b: Thing) -> float:
+    """Distance between two things, metres, from the boxes of their parts: a chair under a table does not touch it."""
+    return min(
+        float(np.hypot(footprint_gap(p, q), max(abs(p.center[2] - q.center[2]) - (p.size[2] + q.size[2]) / 2, 0.0)))
+        for p in a.part_boxes()
+        for q in b.part_boxes()
+    )
 
 
 def footprint_gap(a: OrientedBox, b: OrientedBox) -> float:
