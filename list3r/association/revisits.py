@@ -6,7 +6,6 @@ between `propose` and `verify`; chunks without metric scale need a joint window 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -128,7 +127,9 @@ def _is_revisit(here: ChunkRow, there: ChunkRow | None, settings: RevisitSetting
     return there.session_id != here.session_id or here.index - there.index > settings.exclude_chunks
 
 
-def _nearest(new: Floats, stored: Floats, settings: RevisitSettings) -> tuple[NDArray, NDArray, NDArray]:
+def _nearest(
+    new: Floats, stored: Floats, settings: RevisitSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
     """Rows, columns and cosines of the best matches of each new descriptor."""
     count = min(len(stored), 8 * settings.per_chunk)
     if len(stored) >= _FAISS_FROM:
@@ -148,8 +149,3 @@ def _nearest(new: Floats, stored: Floats, settings: RevisitSettings) -> tuple[ND
 def _centred(descriptors: Floats, mean: Floats) -> Floats:
     moved = descriptors - mean
     return np.asarray(moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), np.float32(1e-9)))
-
-
-def accepted(edges: Sequence[Edge]) -> list[Edge]:
-    """The edges that geometry accepted."""
-    return [edge for edge in edges if edge.accepted]

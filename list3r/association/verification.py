@@ -88,7 +88,7 @@ def verify(
     found = _refine(side_u, side_v, pose, a, b, chosen)
     if found is None:
         return build.rejected("the depth images do not meet at the pose that the features give")
-    T_v_u = np.linalg.inv(found.T_model_cam)
+    T_v_u: Pose = np.asarray(np.linalg.inv(found.T_model_cam), np.float64)
     checks = (
         _check(side_u, side_v, T_v_u, chosen),
         _check(side_v, side_u, found.T_model_cam, chosen),

@@ -35,16 +35,30 @@ class OdometrySettings:
     """Least share of pixels with depth and normal for a frame to be of use."""
     least_overlap: float = 0.2
     """Least share of the model points in view that fall on known depth, relative to the frame's known share."""
-    least_inliers: float = 0.55
+    least_inliers: float = 0.6
     """Least share of those that agree."""
-    most_residual: float = 4.0
+    most_residual: float = 3.0
     """Largest robust deviation of the depth residuals, in units of the sensor's noise."""
-    least_correlation: float = 0.4
-    """Least correlation of brightness with the model's."""
+    least_correlation: float = 0.5
+    """Least correlation of brightness with the model's, where either has any."""
+    most_looseness_m: float = 0.02
+    """Largest standard deviation of the worst determined motion, at the median depth: guards against bare walls."""
     most_speed_m_per_s: float = 3.0
     most_turn_deg_per_s: float = 360.0
     gap_s: float = 0.15
-    """Frames further apart than this are sought by features first."""
+    """Frames further apart than this are searched for; a prediction of their motion means little."""
+    most_gap_s: float = 1.5
+    """Frames further apart than this are searched for by features only."""
+    search_keyframes: int = 6
+    """Most keyframes whose features are compared in a search."""
+    sweep_samples: int = 800
+    """Model points used by the coarse registrations of a search."""
+    sweep: RegistrationSettings = field(
+        default_factory=lambda: RegistrationSettings(
+            iterations=10, gate_m=0.4, gate_halvings=4, gate_hold=2, huber=3.0, normal_agreement=0.6
+        )
+    )
+    """Those coarse registrations: a wide gate that closes slowly."""
     keyframe_turn_deg: float = 12.0
     keyframe_shift: float = 0.12
     """Translation between keyframes as a share of the median depth."""
@@ -132,14 +146,11 @@ class Tracker:
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
         if gap_s <= self.settings.gap_s:
-            guess = self._predict(segment, last, gap_s)
-            for T in (guess, segment.T_segment_cam[last]):
+            for T in (self._predict(segment, last, gap_s), segment.T_segment_cam[last]):
                 found = self._place(segment, position, T)
                 if found is not None and self._possible(segment, last, found.T_model_cam, gap_s):
                     return found.T_model_cam
-        found = self._seek(segment, position)
-        if found is None and gap_s > self.settings.gap_s:
-            found = self._place(segment, position, segment.T_segment_cam[last])
+        found = self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s)
         if found is None or not self._possible(segment, last, found.T_model_cam, gap_s):
             return None
         return found.T_model_cam
@@ -160,21 +171,24 @@ class Tracker:
         moved[:3, 3] = step[:3, 3] * ratio
         return T_last @ moved
 
-    def _place(self, segment: Segment, position: int, T_guess: Pose) -> Registration | None:
+    def _place(self, segment: Segment, position: int, T_guess: Pose, blind: bool = False) -> Registration | None:
         """Register the frame to the segment's model from a guess, kept only when it can be trusted."""
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         found = register(samples, self.view(position), T_guess, self.settings.registration, self.settings.noise)
-        return found if found is not None and self._trusted(found, samples, position) else None
+        return found if found is not None and self._trusted(found, samples, position, blind) else None
 
-    def _trusted(self, found: Registration, samples: Samples, position: int) -> bool:
+    def _trusted(self, found: Registration, samples: Samples, position: int, blind: bool) -> bool:
+        """Whether a registration can be believed; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
         share = float(view.valid.mean())
-        return (
-            found.overlap >= s.least_overlap * share
-            and len(samples.points) * found.overlap >= s.least_overlap * view.valid.sum() * 0.25
+        agrees = found.correlation >= s.least_correlation if blind else not found.correlation < s.least_correlation
+        return bool(
+            agrees
+            and found.overlap >= s.least_overlap * share
+            and len(samples.points) * found.overlap >= 0.25 * s.least_overlap * view.valid.sum()
             and found.inliers >= s.least_inliers
             and found.residual <= s.most_residual
-            and not found.correlation < s.least_correlation
+            and found.looseness_m(float(np.median(view.depth[view.depth > 0]))) <= s.most_looseness_m
         )
 
     def _possible(self, segment: Segment, last: int, T: Pose, gap_s: float) -> bool:
@@ -185,19 +199,25 @@ class Tracker:
             and _angle_deg(step) <= self.settings.most_turn_deg_per_s * gap_s
         )
 
-    def _seek(self, segment: Segment, position: int) -> Registration | None:
-        """Find the frame by features against the segment's last frame and keyframes, then register it."""
+    def _search(self, segment: Segment, position: int, nearby: bool) -> Registration | None:
+        """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`."""
         last = max(segment.T_segment_cam)
-        candidates = [last, *[k for k in reversed(segment.keyframes) if k != last]]
-        best: Registration | None = None
-        for candidate in candidates[:6]:
-            T = self._feature_guess(candidate, position)
-            if T is None:
-                continue
-            found = self._place(segment, position, segment.T_segment_cam[candidate] @ T)
-            if found is not None and (best is None or found.inliers > best.inliers):
-                best = found
-        return best
+        known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
+        guesses = [(segment.T_segment_cam[k], self._feature_guess(k, position)) for k in known]
+        starts = [(T_segment_known @ T, False) for T_segment_known, T in guesses if T is not None]
+        if nearby:
+            starts += [(T, True) for T in self._sweep(segment, last, position)]
+        placed = [self._place(segment, position, T, blind) for T, blind in starts]
+        return max((p for p in placed if p is not None), key=lambda p: p.overlap * p.inliers, default=None)
+
+    def _sweep(self, segment: Segment, last: int, position: int) -> list[Pose]:
+        """The best of several coarse registrations, started from motions that a slow video makes between frames."""
+        view, T_last = self.view(position), segment.T_segment_cam[last]
+        far = float(np.median(view.depth[view.depth > 0]))
+        samples = segment.model.samples(T_last, self.small, self.settings.sweep_samples)
+        found = [register(samples, view, T_last @ T, self.settings.sweep, self.settings.noise) for T in _starts(far)]
+        ranked = sorted((f for f in found if f is not None), key=lambda f: -f.overlap * f.inliers)
+        return [f.T_model_cam for f in ranked[:3]]
 
     def _feature_guess(self, a: int, b: int) -> Pose | None:
         fa, fb = self.features(a), self.features(b)
@@ -228,7 +248,7 @@ class Tracker:
 
     def _connect(self, base: Segment, other: Segment) -> Pose | None:
         for position in other.keyframes[:4]:
-            found = self._seek(base, position)
+            found = self._search(base, position, nearby=False)
             if found is not None:
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
         return None
@@ -239,6 +259,20 @@ class Tracker:
         for position in other.keyframes:
             base.model.fuse(self.view(position), base.T_segment_cam[position])
         base.keyframes = sorted([*base.keyframes, *other.keyframes])
+
+
+def _starts(far_m: float) -> list[Pose]:
+    """No motion, shifts by a tenth of the depth, and orbits of twelve degrees about a point at that depth."""
+    out = [np.eye(4)]
+    for axis in (0, 1):
+        for sign in (-1.0, 1.0):
+            shift, orbit, turn = np.eye(4), np.eye(4), np.zeros(3)
+            shift[axis, 3] = 0.1 * sign * far_m
+            turn[1 - axis] = np.radians(12.0) * sign
+            orbit[:3, :3] = cv2.Rodrigues(turn)[0]
+            orbit[:3, 3] = far_m * (np.eye(3) - orbit[:3, :3])[:, 2]
+            out += [shift, orbit]
+    return out
 
 
 def _angle_deg(T: Pose) -> float:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.geometry import skew
 from list3r.reconstruction.view import Floats, SensorNoise, View
 
 
@@ -22,7 +23,13 @@ class RegistrationSettings:
 
     iterations: int = 12
     gate_m: float = 0.10
-    """First limit of the point-to-plane distance; halved in each of the first two iterations."""
+    """First limit of the point-to-plane distance."""
+    gate_halvings: int = 2
+    """How often that limit is halved on the way."""
+    gate_hold: int = 1
+    """Iterations before it is halved again."""
+    huber: float = 1.345
+    """Limit of the quadratic part of the kernel, in robust standard deviations."""
     normal_agreement: float = 0.7
     """Least cosine between the normals of a pair."""
     photometric_weight: float = 2.0
@@ -72,6 +79,15 @@ class Registration:
     information: NDArray[np.float64]
     """Of the left-hand tangent (translation, rotation) in model coordinates. Shape (6, 6)."""
 
+    def looseness_m(self, lever_m: float) -> float:
+        """Standard deviation of the motion that the pairs determine worst, metres at `lever_m` from the camera."""
+        T = self.T_model_cam
+        shift = np.eye(6)
+        shift[:3, 3:] = skew(T[:3, 3])  # rotate about the camera instead of the model's origin
+        scale = np.diag([1.0, 1.0, 1.0, *[1.0 / lever_m] * 3])
+        about_camera = scale @ shift.T @ self.information @ shift @ scale
+        return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(about_camera)[0], 1e-12)))
+
 
 def register(
     model: Samples,
@@ -87,10 +103,11 @@ def register(
     T = np.array(T_model_cam, dtype=np.float64)
     pairs = None
     for iteration in range(settings.iterations):
-        pairs = _pair(model, frame, T, settings.gate_m * 0.5 ** min(iteration, 2), settings.normal_agreement)
+        halved = min(iteration // settings.gate_hold, settings.gate_halvings)
+        pairs = _pair(model, frame, T, settings.gate_m * 0.5**halved, settings.normal_agreement)
         if pairs.count < settings.least_pairs:
             return None
-        information, gradient = _geometric(pairs)
+        information, gradient = _geometric(pairs, settings.huber)
         if photometric:
             more, slope = _photometric(pairs, frame, T)
             information += settings.photometric_weight * more
@@ -102,7 +119,7 @@ def register(
         damped = information + 1e-9 * np.trace(information) * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
         T = _exp(step) @ T
-        if iteration > 2 and np.abs(step).max() < settings.converged:
+        if halved == settings.gate_halvings and iteration > 2 and np.abs(step).max() < settings.converged:
             break
     assert pairs is not None
     return Registration(
@@ -187,10 +204,10 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
     )
 
 
-def _geometric(pairs: _Pairs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _geometric(pairs: _Pairs, huber: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
     slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1) * pairs.inverse_sigma[:, None]
-    return _normal_equations(slope, pairs.residual, pairs.scale)
+    return _normal_equations(slope, pairs.residual, pairs.scale, huber)
 
 
 def _photometric(
@@ -217,7 +234,7 @@ def _anchored(
     """Normal equations of the reprojection errors of known features, in pixels of the view."""
     p = ((anchors.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
     inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
-    error = (p[:, :2] * inverse_z - anchors.rays_xy) * np.float32(focal_px)
+    error: Floats = np.asarray((p[:, :2] * inverse_z - anchors.rays_xy) * focal_px, np.float32)
     scale = 1.4826 * float(np.median(np.abs(error))) + 0.05
     slope_cam = np.zeros((len(p), 2, 3), np.float32)
     slope_cam[:, 0, 0] = slope_cam[:, 1, 1] = inverse_z[:, 0]
@@ -227,9 +244,11 @@ def _anchored(
     return _normal_equations(slope, error.ravel(), scale)
 
 
-def _normal_equations(slope: Floats, error: Floats, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _normal_equations(
+    slope: Floats, error: Floats, scale: float, huber: float = 1.345
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Huber-weighted, with the residuals in units of their robust scale."""
-    limit = 1.345 * scale
+    limit = huber * scale
     weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-9)).astype(np.float32) / np.float32(scale * scale)
     weighted = slope * weight[:, None]
     return (weighted.T @ slope).astype(np.float64), (weighted.T @ error).astype(np.float64)
