@@ -62,10 +62,12 @@ def gravity_from_planes(
     """Up from planes and cameras.
 
     `S_graph_cam` holds the poses of the colour cameras, batched over F frames; `unit` is what a metre is in the
-    graph's units (1 for a metric memory). Candidates are the planes' own normals. A candidate wins by the area of
-    the planes that are level or upright with respect to it, among those that the cameras allow: people hold a camera
-    level, so its x axis is level too, and its up is never far from up. The winner is refined on the planes that agree
-    with it by reweighted least squares, to which level planes give one direction and walls a plane of directions.
+    graph's units (1 for a metric memory). Candidates are the normals of planes seen from above: floors and tables, not
+    ceilings, for a wall seen by a camera that looks down and a ceiling seen by one that looks up are the same picture.
+    A candidate wins by the area of the planes that are level or upright with respect to it, among those that the
+    cameras allow: people hold a camera level, so its x axis is level too, and its up is never far from up. The winner
+    is refined on the planes that agree with it by reweighted least squares, to which level planes give one direction
+    and walls a plane of directions.
     """
     s = settings or GravitySettings()
     if len(S_graph_cam.rotation) == 0:
@@ -76,12 +78,11 @@ def gravity_from_planes(
     unknown = Gravity("unknown", mean_up, np.inf, 0.0, 0.0, None, "no level surface agrees with the cameras")
     big = planes.area >= s.plane_area_m2 * unit**2
     normals, areas = planes.normal[big], planes.area[big]
-    candidates = normals * np.where(normals @ mean_up < 0, -1.0, 1.0)[:, None]
-    allowed = _camera_allows(candidates, S_graph_cam, mean_up, s)
-    if not allowed.any():
+    candidates = normals[_camera_allows(normals, S_graph_cam, mean_up, s)]
+    if len(candidates) == 0:
         return unknown
-    votes = _votes(candidates[allowed], normals, areas, s)
-    up = _refine(candidates[allowed][int(np.argmax(votes))], normals, areas, s)
+    votes = _votes(candidates, normals, areas, s)
+    up = _refine(candidates[int(np.argmax(votes))], normals, areas, s)
     level = np.abs(normals @ up) > np.cos(np.radians(s.level_deg))
     upright = np.abs(normals @ up) < np.sin(np.radians(s.level_deg))
     off = np.where(

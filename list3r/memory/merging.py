@@ -30,8 +30,8 @@ class MergeSettings:
     """Share of its frames in which the image's border must cut a partial view."""
     min_cosine: float = 0.0
     """Of the features; spaces without calibration only tell opposites apart."""
-    max_center_offset: float = 0.6
-    """Between the centres of two whole views of one thing, in sizes of the thing."""
+    max_center_offset: float = 0.45
+    """Between the centres of two whole views of one thing that share no surface, over the diagonal of its extents."""
     max_size_ratio: float = 2.5
     """Of two whole views of one thing."""
     min_shared_frames: int = 3
@@ -155,6 +155,7 @@ class _Table:
             normal = c.plane[:, :3] @ placed.rotation.T
             plane.append(np.column_stack([normal, c.plane[:, 3] * float(placed.scale) - normal @ placed.translation]))
             tolerance.append(np.full(len(c.local_id), 2.0 * c.grain * float(placed.scale)))
+        features = [c.feature for c in chunks if len(c.local_id)]
         return _Table(
             keys,
             start,
@@ -163,7 +164,7 @@ class _Table:
             np.concatenate(plane) if plane else np.zeros((0, 4)),
             np.concatenate([c.truncated for c in chunks]) if chunks else np.zeros(0),
             np.concatenate([c.structure for c in chunks]) if chunks else np.zeros(0, bool),
-            np.concatenate([c.feature for c in chunks]) if chunks else np.zeros((0, 1), np.float32),
+            np.concatenate(features) if features else np.zeros((0, 1), np.float32),
             np.concatenate(tolerance) if tolerance else np.zeros(0),
         )
 

@@ -42,6 +42,8 @@ class RelationSettings:
     """A thing may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
     contact_per_height: float = 0.12
     """More of it for tall things, whose thin legs are seldom seen."""
+    least_base: float = 0.25
+    """Least area of the surface under a thing over the thing's own footprint: a floor does not stand on table legs."""
     enclosed: float = 0.7
     """Share of directions round a thing in which a container has a side."""
     inside: float = 0.8
@@ -140,7 +142,8 @@ def _supports(scene: _Scene, taken: set[int]) -> list[_Found]:
             continue
         best: _Found | None = None
         for b in range(len(scene.bodies)):
-            if a == b or scene.box_gap[a, b] > _contact(scene, a) + 0.05 * scene.unit:
+            holds = a != b and scene.bodies[b].structure not in ("wall", "ceiling")
+            if not holds or scene.box_gap[a, b] > _contact(scene, a) + 0.05 * scene.unit:
                 continue
             found = _stands_on(scene, a, b)
             if found is not None and (best is None or found[2] > best[2]):
@@ -148,7 +151,8 @@ def _supports(scene: _Scene, taken: set[int]) -> list[_Found]:
         if best is not None:
             out.append(best)
     on = {a: b for a, b, _, _ in out}
-    return [f for f in out if not (on.get(f[1]) == f[0] and f[0] > f[1])]
+    base = [float(np.prod(b.box.size[:2])) for b in scene.bodies]
+    return [f for f in out if not (on.get(f[1]) == f[0] and (base[f[0]], f[0]) > (base[f[1]], f[1]))]
 
 
 def _contact(scene: _Scene, a: int) -> float:
@@ -160,7 +164,7 @@ def _stands_on(scene: _Scene, a: int, b: int) -> _Found | None:
     """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
     subject, other = scene.bodies[a], scene.bodies[b]
     z = subject.points[:, 2]
-    bottom, tolerance = float(np.quantile(z, 0.03)), _contact(scene, a)
+    bottom, tolerance = float(np.quantile(z, 0.01)), _contact(scene, a)
     sink = scene.s.contact_m * scene.unit + 0.5 * scene.s.contact_per_height * min(float(np.ptp(z)), scene.unit)
     layer = other.points[(other.points[:, 2] > bottom - tolerance) & (other.points[:, 2] < bottom + sink)]
     if len(layer) < 3:
@@ -168,7 +172,8 @@ def _stands_on(scene: _Scene, a: int, b: int) -> _Found | None:
     middle = subject.points[:, :2].mean(axis=0)
     spacing = _spacing(layer)
     hold = max(0.02 * scene.unit, min(spacing, 0.25 * scene.unit))
-    if _outside_hull(middle, layer[:, :2]) > hold:
+    outside, area = _hull_under(middle, layer[:, :2])
+    if outside > hold or area < scene.s.least_base * float(np.prod(subject.box.size[:2])):
         return None
     radius = 0.5 * float(np.linalg.norm(subject.box.size[:2])) + max(0.06 * scene.unit, 2.0 * spacing)
     around = layer[np.linalg.norm(layer[:, :2] - middle, axis=1) < radius]
@@ -177,7 +182,7 @@ def _stands_on(scene: _Scene, a: int, b: int) -> _Found | None:
     distance = neighbours_of(around[:, :2], cKDTree(subject.points[:, :2]))[0][:, 0]
     close = around[np.argsort(distance, kind="stable")[:24]]
     surface = float(np.median(close[:, 2]))
-    if float((z > surface - 0.5 * sink).mean()) < 0.6 or float(np.median(z)) < surface - 0.01 * scene.unit:
+    if float((z > surface - 0.7 * sink).mean()) < 0.6:
         return None
     gap = bottom - surface
     margin = tolerance - gap if gap >= 0 else sink + gap
@@ -204,13 +209,13 @@ def _spacing(points: Array) -> float:
     return float(np.median(neighbours_of(sample, cKDTree(points), 2)[0][:, 1]))
 
 
-def _outside_hull(point: Array, xy: Array) -> float:
-    """How far a point lies outside the convex hull of others in the plane, 0 inside."""
+def _hull_under(point: Array, xy: Array) -> tuple[float, float]:
+    """How far a point lies outside the convex hull of others in the plane, 0 inside, and the area of the hull."""
     try:
         hull = ConvexHull(xy)
     except (QhullError, ValueError):
-        return float(np.linalg.norm(xy - point, axis=1).min())
-    return float(max(0.0, (hull.equations[:, :2] @ point + hull.equations[:, 2]).max()))
+        return float(np.linalg.norm(xy - point, axis=1).min()), 0.0
+    return float(max(0.0, (hull.equations[:, :2] @ point + hull.equations[:, 2]).max())), float(hull.volume)
 
 
 # ---------------------------------------------------------------------------------------------- in
@@ -246,7 +251,8 @@ def _enclosed(scene: _Scene, a: int, b: int) -> _Found | None:
         return None
     low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
     rise = high - low
-    sides = holder.points[(holder.points[:, 2] > low + 0.3 * rise) & (holder.points[:, 2] < high + 0.3 * rise)]
+    brim = low + max(0.3 * rise, 2.5 * scene.s.noise_m * scene.unit)
+    sides = holder.points[(holder.points[:, 2] > brim) & (holder.points[:, 2] < max(high, brim) + 0.3 * rise)]
     away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
     reach = 0.25 * float(np.min(subject.box.size[:2]))
     away = away[np.linalg.norm(away, axis=1) > reach]
@@ -272,32 +278,34 @@ def _overhead(scene: _Scene, holding: set[tuple[int, int]]) -> list[Relation]:
                 continue
             if scene.box_gap[a, b] > s.above_m * unit or scene.high[a, 2] <= scene.high[b, 2]:
                 continue
-            share, clearance = _over(upper, lower, unit)
-            if share < s.overhead:
+            found = _over(upper, lower, unit)
+            if found is None:
                 continue
-            gap = float(np.quantile(upper.points[:, 2], 0.03) - np.quantile(lower.points[:, 2], 0.97))
+            share, covered, gap = found
             noise = s.noise_m * unit
-            if 0.0 < gap < s.above_m * unit:
-                out += _both(scene.bodies, a, "above", b, _sure(gap, noise) * min(1.0, 0.5 + share / 2), gap)
-            elif gap <= 0.0 and clearance > 0.0:
-                c = round(_sure(clearance, noise) * min(1.0, 0.5 + share / 2), 4)
-                out.append(Relation(lower.id, "under", upper.id, c, round(clearance, 5)))
+            if gap < 2.0 * noise or gap > s.above_m * unit:
+                continue
+            sure = _sure(gap - 2.0 * noise, noise) * min(1.0, 0.5 + share / 2)
+            if covered >= s.overhead and scene.low[a, 2] < scene.high[b, 2]:
+                out.append(Relation(lower.id, "under", upper.id, round(sure, 4), round(gap, 5)))
+            elif share >= s.overhead and scene.low[a, 2] >= scene.low[b, 2]:
+                out += _both(scene.bodies, a, "above", b, sure, gap)
     return out
 
 
-def _over(upper: Body, lower: Body, unit: float) -> tuple[float, float]:
-    """Share of the lower one's points that have some of the upper one over them, and the median clearance there."""
-    sample = lower.points[:: max(1, len(lower.points) // 150)]
-    top = float(np.quantile(lower.points[:, 2], 0.97))
-    over = upper.points[upper.points[:, 2] > top - 0.02 * unit]
-    if len(over) == 0:
-        return 0.0, 0.0
-    reach = max(0.03 * unit, 1.5 * _spacing(over))
-    distance, at = neighbours_of(sample[:, :2], cKDTree(over[:, :2]))
-    hit = distance[:, 0] < reach
+def _over(upper: Body, lower: Body, unit: float) -> tuple[float, float, float] | None:
+    """How far one thing is over another: (share of the smaller footprint where it is, share of the lower one's points
+    that it covers, clearance there), None where it is nowhere.
+    """
+    low, high = (b.points[:: max(1, len(b.points) // 200)] for b in (lower, upper))
+    reach = max(0.03 * unit, 1.5 * max(_spacing(low), _spacing(high)))
+    covered = float((neighbours_of(low[:, :2], cKDTree(high[:, :2]))[0][:, 0] < reach).mean())
+    back, under = neighbours_of(high[:, :2], cKDTree(low[:, :2]))
+    hit = back[:, 0] < reach
     if not hit.any():
-        return 0.0, 0.0
-    return float(hit.mean()), float(np.median(over[at[hit, 0], 2])) - top
+        return None
+    gap = float(np.quantile(high[hit, 2], 0.1) - np.quantile(low[under[hit, 0], 2], 0.9))
+    return max(covered, float(hit.mean())), covered, gap
 
 
 # ---------------------------------------------------------------------------------------------- attached, beside

@@ -153,7 +153,7 @@ def chunk_shapes(
         truncated=np.array([_truncated(n, image_size, s.border_px) for n in nodes]),
         structure=np.array([n.structure for n in nodes], bool),
         stability=np.array([n.stability for n in nodes]),
-        feature=np.array([n.feature for n in nodes], np.float32),
+        feature=np.array([n.feature for n in nodes], np.float32) if nodes else np.zeros((0, 0), np.float32),
         frames=tuple(n.frames for n in nodes),
         boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
         areas_px=tuple(n.areas_px for n in nodes),

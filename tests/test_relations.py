@@ -1,0 +1,172 @@
+"""Relations: what stands on what, in what, beside what; and what does not follow from where one stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from list3r.memory.bodies import Body, fit_box
+from list3r.memory.geometry import rotation_exp
+from list3r.memory.relations import INVERSE, relations
+from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, WALL, Piece, surface
+
+LEGS = [Piece("leg", (x, y, 0.35), (0.05, 0.05, 0.7), points=150) for x in (-0.65, 0.65) for y in (-0.35, 0.35)]
+SEAT = Piece("seat", (0, 1.0, 0.45), (0.45, 0.45, 0.03), points=900)
+BACK = Piece("back", (0, 1.22, 0.75), (0.45, 0.03, 0.5), points=700)
+CHAIR_LEGS = [Piece("leg", (x, 1 + y, 0.22), (0.03, 0.03, 0.44), points=60) for x in (-0.2, 0.2) for y in (-0.2, 0.2)]
+
+
+def body(id: int, *pieces: Piece, structure: str | None = None, seed: int = 0, view: float | None = 0.6) -> Body:
+    points = np.concatenate([surface(p, seed + 31 * id + n, view) for n, p in enumerate(pieces)]).astype(float)
+    rgb = np.tile(np.uint8([200, 200, 200]), (len(points), 1))
+    box = fit_box(points, upright=True)
+    return Body(id, points, rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, structure)
+
+
+def moved(b: Body, offset: tuple[float, float, float]) -> Body:
+    points = b.points + np.asarray(offset)
+    box = fit_box(points, upright=True)
+    return Body(b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure)
+
+
+def facts(bodies: list[Body], **more: object) -> set[tuple[int, str, int]]:
+    found = relations(bodies, gravity_known=True, **more)  # type: ignore[arg-type]
+    return {(r.subject, r.predicate, r.object) for r in found}
+
+
+def kitchen(seed: int = 0) -> list[Body]:
+    return [
+        body(1, FLOOR, structure="floor", seed=seed),
+        body(2, TABLE, *LEGS, seed=seed),
+        body(3, MUG, seed=seed),
+        body(4, TWIN, seed=seed),
+        body(5, BOX, seed=seed),
+        body(6, MAGAZINE, seed=seed),
+        body(7, SEAT, BACK, *CHAIR_LEGS, seed=seed),
+        body(8, WALL, structure="wall", seed=seed, view=-1.5),
+    ]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_small_things_stand_on_the_table_and_furniture_on_the_floor(seed: int) -> None:
+    on = {(s, o) for s, p, o in facts(kitchen(seed)) if p == "on"}
+    assert on == {(3, 2), (4, 2), (5, 2), (6, 2), (2, 1), (7, 1)}
+
+
+@pytest.mark.parametrize("drift", [-0.02, -0.01, 0.01, 0.03])
+def test_contact_survives_heights_that_are_off(drift: float) -> None:
+    bodies = kitchen()
+    shifted = [moved(b, (0, 0, drift)) if b.id in (3, 4, 5, 6) else b for b in bodies]
+    assert {(3, 2), (4, 2), (5, 2), (6, 2)} <= {(s, o) for s, p, o in facts(shifted) if p == "on"}
+
+
+def test_what_floats_or_stands_beside_is_not_on() -> None:
+    table = body(2, TABLE, *LEGS)
+    assert (3, "on", 2) not in facts([table, moved(body(3, MUG), (0, 0, 0.15))])
+    assert (3, "above", 2) in facts([table, moved(body(3, MUG), (0, 0, 0.15))])
+    assert (3, "on", 2) not in facts([table, moved(body(3, MUG), (0.9, 0, 0))])
+
+
+def test_a_thing_on_a_seat_is_on_the_chair_though_its_back_is_higher() -> None:
+    chair = body(7, SEAT, BACK, *CHAIR_LEGS)
+    cushion = body(9, Piece("cushion", (0, 0.98, 0.5), (0.35, 0.35, 0.07), points=600))
+    assert (9, "on", 7) in facts([chair, cushion])
+
+
+def test_a_stack_stands_on_what_is_just_below() -> None:
+    table = body(2, TABLE, *LEGS)
+    lower = body(5, BOX)
+    upper = moved(body(3, MUG), (-0.5, -0.3, 0.16))
+    found = facts([table, lower, upper])
+    assert (5, "on", 2) in found and (3, "on", 5) in found and (3, "on", 2) not in found
+
+
+def test_each_thing_is_on_at_most_one() -> None:
+    subjects = [s for s, p, _ in facts(kitchen()) if p == "on"]
+    assert len(subjects) == len(set(subjects))
+
+
+def test_a_thing_in_a_box_is_in_it_and_not_on_it() -> None:
+    walls = [
+        Piece("side", (x, y, 0.8), (0.02 if x else 0.4, 0.02 if y else 0.4, 0.16), points=300)
+        for x, y in ((0.2, 0), (-0.2, 0), (0, 0.2), (0, -0.2))
+    ]
+    bottom = Piece("bottom", (0, 0, 0.725), (0.4, 0.4, 0.01), points=500)
+    crate = body(2, *walls, bottom, view=None)
+    ball = body(3, Piece("ball", (0.02, 0.0, 0.775), (0.1, 0.1, 0.09), round=True, points=300))
+    found = facts([crate, ball])
+    assert (3, "in", 2) in found and (2, "contains", 3) in found and (3, "on", 2) not in found
+
+
+def test_a_stool_pushed_under_the_table_is_under_it() -> None:
+    stool = body(3, Piece("stool", (0.1, 0, 0.2), (0.35, 0.35, 0.4), points=700))
+    found = facts([body(2, TABLE, *LEGS), stool])
+    assert (3, "under", 2) in found and (2, "on", 3) not in found
+
+
+def test_a_picture_hangs_on_the_wall() -> None:
+    wall = body(8, WALL, structure="wall", view=-1.5)
+    picture = body(3, Piece("picture", (0.5, 1.97, 1.5), (0.5, 0.02, 0.4), points=500), view=-1.5)
+    assert (3, "attached_to", 8) in facts([wall, picture])
+
+
+def test_neighbours_are_next_to_each_other_and_near() -> None:
+    found = facts([body(2, CHAIR), moved(body(3, CHAIR), (0.7, 0, 0)), moved(body(4, CHAIR), (4.0, 0, 0))])
+    assert {(2, "next_to", 3), (3, "next_to", 2), (2, "near", 3), (3, "near", 2)} <= found
+    assert not any(4 in (s, o) for s, _, o in found)
+
+
+def test_inverses_come_together_with_the_same_numbers() -> None:
+    found = relations(kitchen(), gravity_known=True)
+    table = {(r.subject, r.predicate, r.object): r for r in found}
+    assert len(table) == len(found)
+    for r in found:
+        if r.predicate in INVERSE:
+            other = table[(r.object, INVERSE[r.predicate], r.subject)]
+            assert (other.confidence, other.margin) == (r.confidence, r.margin)
+        assert 0.0 <= r.confidence <= 1.0 and r.margin >= 0.0
+
+
+def test_without_gravity_there_are_no_vertical_relations() -> None:
+    found = relations(kitchen(), gravity_known=False)
+    assert {r.predicate for r in found} == {"near", "next_to"}
+
+
+@given(st.floats(-np.pi, np.pi), st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3, 3)))
+@settings(max_examples=8, deadline=None)
+def test_relations_do_not_change_when_the_world_is_turned_about_the_vertical_and_shifted(
+    yaw: float, offset: tuple[float, float, float]
+) -> None:
+    rotation = rotation_exp(np.array([0, 0, yaw]))
+    turned = []
+    for b in kitchen():
+        points = b.points @ rotation.T + np.asarray(offset)
+        box = fit_box(points, upright=True)
+        turned.append(
+            Body(b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure)
+        )
+    assert facts(turned) == facts(kitchen())
+
+
+@pytest.mark.parametrize("scale", [0.1, 8.0])
+def test_relations_scale_with_the_unit_of_a_relative_memory(scale: float) -> None:
+    scaled = []
+    for b in kitchen():
+        points = b.points * scale
+        box = fit_box(points, upright=True)
+        scaled.append(
+            Body(b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure)
+        )
+    assert facts(scaled, unit=scale) == facts(kitchen())
+
+
+def test_parts_of_different_frames_of_reference_have_no_relations() -> None:
+    a, b = body(2, CHAIR), moved(body(3, CHAIR), (0.6, 0, 0))
+    apart = Body(3, b.points, b.rgb, b.box, b.aabb, None, None, component=5)
+    assert relations([a, apart], gravity_known=True) == []
+
+
+def test_no_bodies_no_relations() -> None:
+    assert relations([], gravity_known=True) == []
