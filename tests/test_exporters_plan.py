@@ -13,9 +13,10 @@ from PIL import Image
 
 from list3r.exporters.components import read_components
 from list3r.exporters.palette import instance_color
-from list3r.exporters.plan import PlanSettings, _plain, _round_length, plan_image, write_plan
+from list3r.exporters.plan import _plain, _round_length, plan_image, write_plan
 from list3r.exporters.plan_frame import PlanFrame, choose_rotation
 from list3r.exporters.plan_labels import Anchor, place_tags
+from list3r.exporters.plan_layout import PlanSettings, choose_layout
 from list3r.memory.errors import OptionError
 from list3r.memory.store import Store
 from tests.test_exporters import write_split_memory
@@ -93,3 +94,12 @@ def test_round_lengths() -> None:
 
 def test_letters_that_the_font_lacks_are_replaced() -> None:
     assert _plain("écran 2 × 3 cm · …") == "ecran 2 ? 3 cm · …"
+
+
+def test_a_wide_scene_has_its_legend_below() -> None:
+    wide, square = (choose_layout(np.array(span), 60, PlanSettings()) for span in ((10.0, 4.0), (4.0, 4.0)))
+    assert (wide.columns, square.columns) == (3, 1)
+    assert wide.legend_xy[1] > wide.map_px[1]
+    assert square.legend_xy[0] > square.map_px[0]
+    assert wide.rows * wide.columns < 60
+    assert choose_layout(np.array((10.0, 4.0)), 0, PlanSettings()).rows == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import unicodedata
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ from list3r.exporters.output import part_path, replacing, units
 from list3r.exporters.palette import Color, instance_color
 from list3r.exporters.plan_frame import PlanFrame, choose_rotation, is_wall, quarter_turn
 from list3r.exporters.plan_labels import Anchor, place_tags
+from list3r.exporters.plan_layout import Layout, PlanSettings, choose_layout
 from list3r.exporters.plan_map import pale_picture
-from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance, Support
 from list3r.memory.store import Store
 
@@ -28,30 +27,6 @@ _START: Color = (22, 140, 100)
 _END: Color = (196, 48, 72)
 _OVERSAMPLING = 2
 """Drawn so many times larger and averaged down: Pillow does not smooth its lines."""
-
-
-@dataclass(frozen=True)
-class PlanSettings:
-    """How the picture is laid out; lengths in px of the finished picture."""
-
-    width_px: int = 1600
-    legend_px: int = 470
-    margin_px: int = 32
-    header_px: int = 78
-    footer_px: int = 64
-    row_px: int = 22
-    max_legend_px: int = 960
-    """The map grows up to this height for the legend's sake; things that are not listed are drawn all the same."""
-    min_map_px: int = 560
-    max_map_px: int = 1400
-    points_per_instance: int = 8000
-    """At most so many points of each thing are drawn."""
-    points_per_structure: int = 40000
-    """At most so many points of a floor, a wall and the like."""
-
-    def __post_init__(self) -> None:
-        if self.width_px < self.legend_px + 400:
-            raise OptionError(f"the picture is {self.width_px} px wide; at least {self.legend_px + 400} px are needed")
 
 
 def write_plan(store: Store, path: str | Path, settings: PlanSettings | None = None) -> tuple[Path, ...]:
@@ -73,8 +48,8 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
     limits = (settings.points_per_instance, settings.points_per_structure)
     supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
     things = [i for i in component.instances if not i.structure and has_box(i)]
-    frame = _frame(store, component, supports, settings, len(things))
-    sheet = _Sheet(frame, settings)
+    frame, layout = _frame(store, component, supports, settings, len(things))
+    sheet = _Sheet(frame, layout, settings)
     sheet.picture(component, supports)
     sheet.boxes(things)
     sheet.camera_path(component)
@@ -108,8 +83,8 @@ def _subtitle(store: Store, component: Component) -> str:
 
 
 def _frame(
-    store: Store, component: Component, supports: dict[int, Support], settings: PlanSettings, rows: int
-) -> PlanFrame:
+    store: Store, component: Component, supports: dict[int, Support], settings: PlanSettings, things: int
+) -> tuple[PlanFrame, Layout]:
     """Walls along the page, everything inside, as large as the page allows."""
     rotation, note = choose_rotation(component, store.get_value("gravity", "unknown"))
     low, high = _extent(component, supports, rotation)
@@ -117,11 +92,9 @@ def _frame(
         rotation = quarter_turn(rotation)
         low, high = _extent(component, supports, rotation)
     span = np.maximum(high - low, 1e-6) * 1.06
-    width = settings.width_px - settings.legend_px - 3 * settings.margin_px
-    height = int(np.clip(width * span[1] / span[0], settings.min_map_px, settings.max_map_px))
-    height = max(height, min(rows * settings.row_px + 70, settings.max_legend_px))
-    size = (width * _OVERSAMPLING, height * _OVERSAMPLING)
-    return PlanFrame(rotation, (low + high) / 2, float(min(size / span)), size, note)
+    layout = choose_layout(span, things, settings)
+    size = (layout.map_px[0] * _OVERSAMPLING, layout.map_px[1] * _OVERSAMPLING)
+    return PlanFrame(rotation, (low + high) / 2, float(min(size / span)), size, note), layout
 
 
 def _extent(
@@ -141,13 +114,12 @@ def _extent(
 class _Sheet:
     """The page while it is drawn, at `_OVERSAMPLING` times its size."""
 
-    def __init__(self, frame: PlanFrame, settings: PlanSettings) -> None:
-        self.frame, self.settings = frame, settings
+    def __init__(self, frame: PlanFrame, layout: Layout, settings: PlanSettings) -> None:
+        self.frame, self.layout, self.settings = frame, layout, settings
         k = _OVERSAMPLING
         self.left, self.top = settings.margin_px * k, settings.header_px * k
         self.map_size = frame.size_px
-        height = self.top + self.map_size[1] + settings.footer_px * k
-        self.image = Image.new("RGB", (settings.width_px * k, height), (255, 255, 255))
+        self.image = Image.new("RGB", (settings.width_px * k, layout.height_px * k), (255, 255, 255))
         self.draw = ImageDraw.Draw(self.image, "RGBA")
         self.tag_font, self.text_font = _font(13), _font(14)
 
@@ -168,8 +140,9 @@ class _Sheet:
         walls = [supports[i.id] for i in seen if is_wall(i, up)]
         floors = [supports[i.id] for i in seen if i.structure and not is_wall(i, up)]
         things = [supports[i.id] for i in seen if not i.structure]
-        pixels = pale_picture(self.frame, things, floors, walls)
-        self.image.paste(Image.fromarray(np.round(pixels).astype(np.uint8)), (self.left, self.top))
+        pixels = pale_picture(self.frame.reduced(_OVERSAMPLING), things, floors, walls)
+        picture = Image.fromarray(np.round(pixels).astype(np.uint8)).resize(self.map_size, Image.Resampling.BICUBIC)
+        self.image.paste(picture, (self.left, self.top))
         bare = [i for i in component.instances if is_wall(i, up) and not len(supports[i.id].points)]
         for instance in bare:
             self.draw.polygon(self._footprint(instance), fill=(62, 68, 82, 200))
@@ -188,7 +161,8 @@ class _Sheet:
         """Oriented boxes, the small ones over the large ones."""
         for instance in sorted(things, key=lambda i: (-_area(self._footprint(i)), i.id)):
             color, outline = instance_color(instance.id), self._footprint(instance)
-            self.draw.polygon(outline, fill=(*color, 46))
+            side_px = _area(outline) ** 0.5 / _OVERSAMPLING
+            self.draw.polygon(outline, fill=(*color, int(np.interp(side_px, [20, 120], [60, 14]))))
             self.draw.line([*outline, outline[0], outline[1]], fill=(*color, 255), width=2 * _OVERSAMPLING)
 
     def camera_path(self, component: Component) -> None:
@@ -250,7 +224,7 @@ class _Sheet:
             names.append(name if room < 1.8 * half[0] and half[1] > 20 * k else "")
             anchors.append(Anchor((x, y), (half[0], half[1]), (room if names[-1] else width, 18.0 * k)))
         page = (self.left + 4.0, self.top + 4.0, self.left + self.map_size[0] - 4.0, self.top + self.map_size[1] - 4.0)
-        places = place_tags(anchors, page, [self._scale_bar_place()])
+        places = place_tags(anchors, page)
         for anchor, place in zip(anchors, places, strict=True):
             self._leader(anchor, place)
         for instance, anchor, name, (x, y) in zip(things, anchors, names, places, strict=True):
@@ -279,21 +253,15 @@ class _Sheet:
         )
         self._text((x, y), str(instance_id), self.tag_font, _contrast(color), anchor="mm")
 
-    def _scale_bar_place(self) -> tuple[float, float, float, float]:
-        k, bottom = _OVERSAMPLING, self.top + self.map_size[1]
-        return self.left + 10.0 * k, bottom - 52.0 * k, self.left + 240.0 * k, bottom - 8.0 * k
-
     def scale_bar(self, unit: str) -> None:
-        """A bar of a round length at the lower left of the map."""
+        """A bar of a round length at the right under the map."""
         k = _OVERSAMPLING
-        length = _round_length(200 * k / self.frame.pixels_per_unit)
-        place = self._scale_bar_place()
-        x0, y0 = place[0] + 10 * k, place[3] - 12 * k
-        x1 = x0 + length * self.frame.pixels_per_unit
-        self.draw.rectangle(place, fill=(255, 255, 255, 225))
-        self.draw.line([(x0, y0 - 6 * k), (x0, y0), (x1, y0), (x1, y0 - 6 * k)], fill=_INK, width=2 * k)
+        length = _round_length(260 * k / self.frame.pixels_per_unit)
+        x1, y = float(self.left + self.map_size[0]), self.top + self.map_size[1] + 38.0 * k
+        x0 = x1 - length * self.frame.pixels_per_unit
+        self.draw.line([(x0, y - 6 * k), (x0, y), (x1, y), (x1, y - 6 * k)], fill=_INK, width=2 * k)
         words = f"{length:g} m" if unit == "m" else f"{length:g} x the memory's unit (relative scale)"
-        self._text((x0, y0 - 11 * k), words, self.text_font, _INK, anchor="ls")
+        self._text((x1, y - 11 * k), words, self.text_font, _INK, anchor="rs")
 
     def axes(self) -> None:
         """The world's axes as they lie on the page, and what is up, under the map."""
@@ -322,28 +290,35 @@ class _Sheet:
 
     def legend(self, things: list[Instance], unit: str) -> None:
         """A table of ids, descriptions and sizes; where it is too long, those that were seen most."""
-        k, settings = _OVERSAMPLING, self.settings
-        x = self.left + self.map_size[0] + settings.margin_px * k
-        right, y = x + settings.legend_px * k, self.top + 4 * k
-        fits = (self.map_size[1] - 50 * k) // (settings.row_px * k)
-        chosen = sorted(sorted(things, key=lambda i: (-i.observations, i.id))[:fits], key=lambda i: i.id)
-        sizes = [_size_text(i) for i in chosen]
-        column = max([self.draw.textlength(s, font=self.text_font) for s in sizes], default=0.0) + 12 * k
-        self._text((x + 46 * k, y), "description", self.text_font, _GREY)
-        self._text((right, y), f"size, {unit}", self.text_font, _GREY, anchor="ra")
-        self.draw.line([(x, y + 21 * k), (right, y + 21 * k)], fill=(205, 207, 212), width=k)
-        for row, (instance, size) in enumerate(zip(chosen, sizes, strict=True)):
-            middle = y + 24 * k + (row + 0.5) * settings.row_px * k
-            width = max(30.0 * k, self._chip_width(instance.id))
-            self._chip((x + 18 * k, middle), (width, 18.0 * k), instance.id)
-            words = _shorten(
-                self.draw, instance.label or instance.description, self.text_font, right - column - x - 46 * k
-            )
+        k, layout = _OVERSAMPLING, self.layout
+        chosen = sorted(things, key=lambda i: (-i.observations, i.id))[: layout.columns * layout.rows]
+        chosen.sort(key=lambda i: i.id)
+        x, y = layout.legend_xy[0] * k, layout.legend_xy[1] * k
+        for column in range(layout.columns):
+            rows = chosen[column * layout.rows : (column + 1) * layout.rows]
+            if rows:
+                self._legend_column(rows, unit, x, y)
+            x += (layout.column_px + self.settings.margin_px) * k
+        if len(things) > len(chosen):
+            below = (layout.legend_xy[0] + 46) * k, y + (32 + layout.rows * self.settings.row_px) * k
+            words = f"and {len(things) - len(chosen)} more, seen in fewer frames"
+            self._text(below, words, self.text_font, _GREY)
+
+    def _legend_column(self, rows: list[Instance], unit: str, x: float, y: float) -> None:
+        k = _OVERSAMPLING
+        right = x + self.layout.column_px * k
+        sizes = [_size_text(i) for i in rows]
+        reserved = max(self.draw.textlength(s, font=self.text_font) for s in sizes) + 12 * k
+        self._text((x + 46 * k, y + 4 * k), "description", self.text_font, _GREY)
+        self._text((right, y + 4 * k), f"size, {unit}", self.text_font, _GREY, anchor="ra")
+        self.draw.line([(x, y + 25 * k), (right, y + 25 * k)], fill=(205, 207, 212), width=k)
+        for row, (instance, size) in enumerate(zip(rows, sizes, strict=True)):
+            middle = y + 28 * k + (row + 0.5) * self.settings.row_px * k
+            self._chip((x + 18 * k, middle), (max(30.0 * k, self._chip_width(instance.id)), 18.0 * k), instance.id)
+            room = right - reserved - x - 46 * k
+            words = _shorten(self.draw, instance.label or instance.description, self.text_font, room)
             self._text((x + 46 * k, middle), words, self.text_font, _INK, anchor="lm")
             self._text((right, middle), size, self.text_font, _GREY, anchor="rm")
-        if len(things) > len(chosen):
-            y_more = y + 24 * k + len(chosen) * settings.row_px * k
-            self._text((x + 46 * k, y_more + 4 * k), f"and {len(things) - len(chosen)} more", self.text_font, _GREY)
 
 
 def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

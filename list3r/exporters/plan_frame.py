@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,11 @@ class PlanFrame:
     """(width, height) of the map."""
     note: str
     """What is up in the picture."""
+
+    def reduced(self, times: int) -> PlanFrame:
+        """The same view in so many times fewer pixels each way."""
+        width, height = self.size_px
+        return replace(self, pixels_per_unit=self.pixels_per_unit / times, size_px=(width // times, height // times))
 
     def to_px(self, points_world: ArrayLike) -> Array:
         """Pixel positions (x right, y down) of world points. Shape (N, 3) -> (N, 2)."""

@@ -31,16 +31,14 @@ class Anchor:
         return self.half[0] < self.tag[0] or self.half[1] < self.tag[1] * 1.2
 
 
-def place_tags(anchors: Sequence[Anchor], page: Rect, taken: Sequence[Rect] = ()) -> list[tuple[float, float]]:
+def place_tags(anchors: Sequence[Anchor], page: Rect) -> list[tuple[float, float]]:
     """Middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
 
-    Tags avoid each other, the rectangles `taken` and the small things. Where nothing is free within the search
-    radius the place of least overlap is taken.
+    Tags avoid each other and the small things. Where nothing is free within the search radius the place of least
+    overlap is taken.
     """
-    obstacles = [_around(a.xy, a.half) for a in anchors if a.small]
-    owners = [n for n, a in enumerate(anchors) if a.small]
-    boxes = [*taken, *obstacles]
-    owner = np.array([-1] * len(taken) + owners, dtype=int)
+    boxes = [_around(a.xy, a.half) for a in anchors if a.small]
+    owner = np.array([n for n, a in enumerate(anchors) if a.small], dtype=int)
     places: list[tuple[float, float]] = [(0.0, 0.0)] * len(anchors)
     order = sorted(range(len(anchors)), key=lambda n: (not anchors[n].small, anchors[n].half[0] * anchors[n].half[1]))
     for n in order:

@@ -12,9 +12,10 @@ from list3r.memory.records import Support
 
 PAPER = 255.0
 _WALL = np.array([62.0, 68.0, 82.0])
-_FLOOR = np.array([238.0, 236.0, 231.0])
-_FADE = 0.42
-"""How much of the seen colour stays in the pale picture."""
+_FADE_THINGS = 0.6
+"""How much of the seen colour of things stays in the pale picture."""
+_FADE_FLOOR = 0.3
+"""The same for the floor."""
 _LAYERS = 48
 _MAX_REACH_PX = 20
 """A point covers at most a disc of this radius."""
@@ -25,38 +26,42 @@ Pixels = NDArray[np.int64]
 
 
 def pale_picture(frame: PlanFrame, things: list[Support], floors: list[Support], walls: list[Support]) -> Image:
-    """Floor as one tint, things in their colours faded and the higher over the lower, walls dark. Shape (H, W, 3)."""
+    """Floor smoothed, things above it, the higher over the lower, all faded; walls dark. Shape (H, W, 3)."""
     width, height = frame.size_px
     image = np.full((height, width, 3), PAPER)
     for support in floors:
-        cover = _floor_cover(frame, support)
-        image = image * (1 - cover) + _FLOOR * cover
-    codes = _things_from_above(frame, things)
+        color, cover = _smooth_floor(frame, support)
+        image = image * (1 - cover) + color * cover
+    codes = _from_above(frame, things)
     seen = codes > 0
-    image[seen] = np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255], axis=-1)[seen]
+    image[seen] = _rgb(codes[seen])
     alpha = 0.9 * _wall_density(frame, walls)
     return image * (1 - alpha) + _WALL * alpha
 
 
-def _floor_cover(frame: PlanFrame, support: Support) -> Image:
-    """Where a floor was seen, in [0, 1], smoothed over the gaps between its points. Shape (H, W, 1)."""
-    canvas = _Canvas(frame)
-    reach = _reach(frame, support)
-    canvas.stamp(canvas.place(frame, support), np.ones(len(support.points), np.uint32), reach)
-    seen = (canvas.picture() > 0).astype(np.float64)
-    return np.clip(2.5 * uniform_filter(seen, 4 * reach + 3), 0.0, 1.0)[..., None]
+def _smooth_floor(frame: PlanFrame, support: Support) -> tuple[Image, Image]:
+    """Faded colour (H, W, 3) and cover in [0, 1] (H, W, 1) of a floor, averaged over the gaps between its points."""
+    canvas, reach = _Canvas(frame), _reach(frame, support)
+    canvas.stamp(canvas.place(frame, support), _codes(support.rgb, _FADE_FLOOR), min(reach, 2))
+    codes = canvas.picture()
+    layers = np.dstack([_rgb(codes), codes > 0]).astype(np.float32)
+    layers[codes == 0] = 0.0
+    window = 4 * reach + 3
+    mean = uniform_filter(uniform_filter(layers, (window, window, 1)), (window, window, 1))
+    weight = mean[..., 3:]
+    usual = float(np.median(weight[codes > 0])) if (codes > 0).any() else 1.0
+    return mean[..., :3] / np.maximum(weight, 1e-6), np.clip(2.0 * weight / usual, 0.0, 1.0).astype(np.float64)
 
 
-def _things_from_above(frame: PlanFrame, things: list[Support]) -> Codes:
-    """Colours as 1 << 24 | red << 16 | green << 8 | blue, 0 where nothing is, from low to high. Shape (H, W)."""
+def _from_above(frame: PlanFrame, supports: list[Support]) -> Codes:
+    """Faded colours of things as `_codes`, painted from low to high, 0 where nothing is. Shape (H, W)."""
     canvas = _Canvas(frame)
-    if not things:
+    if not supports:
         return canvas.picture()
-    place = np.concatenate([canvas.place(frame, s) for s in things])
-    reach = np.concatenate([np.full(len(s.points), _reach(frame, s)) for s in things])
-    rgb = np.round(np.concatenate([s.rgb for s in things]) * _FADE + PAPER * (1 - _FADE)).astype(np.uint32)
-    codes = np.uint32(1 << 24) | rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
-    order = np.argsort(np.concatenate([frame.height(s.points) for s in things]), kind="stable")
+    place = np.concatenate([canvas.place(frame, s) for s in supports])
+    reach = np.concatenate([np.full(len(s.points), _reach(frame, s)) for s in supports])
+    codes = np.concatenate([_codes(s.rgb, _FADE_THINGS) for s in supports])
+    order = np.argsort(np.concatenate([frame.height(s.points) for s in supports]), kind="stable")
     for layer in np.array_split(order, _LAYERS):
         for size in np.unique(reach[layer]):
             chosen = layer[reach[layer] == size]
@@ -64,12 +69,23 @@ def _things_from_above(frame: PlanFrame, things: list[Support]) -> Codes:
     return canvas.picture()
 
 
+def _codes(rgb: NDArray[np.uint8], fade: float) -> Codes:
+    """Faded colours in one number each, never 0: 1 << 24 | red << 16 | green << 8 | blue. Shape (N, 3) -> (N,)."""
+    faded = np.round(rgb * fade + PAPER * (1 - fade)).astype(np.uint32)
+    return np.asarray(np.uint32(1 << 24) | faded[:, 0] << 16 | faded[:, 1] << 8 | faded[:, 2])
+
+
+def _rgb(codes: Codes) -> NDArray[np.uint32]:
+    """The colours of `_codes`. Shape (...) -> (..., 3)."""
+    return np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255], axis=-1)
+
+
 def _wall_density(frame: PlanFrame, walls: list[Support]) -> Image:
     """How many wall points stand over each pixel, in [0, 1] of what is usual. Shape (H, W, 1)."""
     canvas = _Canvas(frame)
     counts = np.zeros(canvas.codes.size)
     for support in walls:
-        cells = canvas.place(frame, support)[:, None] + canvas.disc(min(_reach(frame, support), 2))
+        cells = canvas.place(frame, support)[:, None] + canvas.disc(min(_reach(frame, support), 1))
         counts += np.bincount(cells.ravel(), minlength=counts.size)
     inner = canvas.crop(counts)
     usual = np.quantile(inner[inner > 0], 0.7) if inner.any() else 1.0
