@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +14,7 @@ import pytest
 
 from list3r.exporters.palette import instance_color, linear_from_srgb, srgb_from_linear
 from list3r.exporters.registry import FORMATS, export, find_writer
-from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.errors import ExportError, MemoryFileError, OptionError
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import Instance, Observation, Relation
 from list3r.memory.store import Store
@@ -186,7 +185,7 @@ def test_a_failure_inside_leaves_nothing(make_memory: Callable[..., Path], tmp_p
     path = tmp_path / "out.ply"
     with Store.open(make_memory()) as store:
         store.close()
-        with pytest.raises(sqlite3.ProgrammingError):
+        with pytest.raises(MemoryFileError):
             export(store, "ply", path)
     assert [p.name for p in tmp_path.iterdir()] == ["room.l3r"]
 
