@@ -357,6 +357,12 @@ def test_what_is_no_source_is_refused_in_one_line(tmp_path: Path, make: object) 
     assert str(tmp_path) in str(caught.value) or "--" in str(caught.value)
 
 
+def test_a_depth_scale_that_cannot_be_is_doubted(tmp_path: Path) -> None:
+    root = write_tum(tmp_path / "walk")
+    said = SourceOptions(intrinsics=(70, 70, 39.5, 29.5), depth_scale=5.0)
+    assert any("--depth-scale" in note for note in open_source(root, said).info.notes)
+
+
 def test_a_wrong_depth_size_names_the_option(tmp_path: Path) -> None:
     root = wrong_depth_size(tmp_path)
     with pytest.raises(SourceError, match="--depth-intrinsics"):

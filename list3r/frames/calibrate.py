@@ -15,21 +15,13 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from list3r.frames.edges import depth_edges
+from list3r.frames.edge_fit import Array, EdgeFit
 from list3r.frames.folder import FolderSource
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import FrameError, SourceError
-
-Array = NDArray[np.float64]
-
-_NAMES = ("f", "k1", "tx", "ty", "tz", "cx", "cy", "rx", "ry", "rz")
-_MOST_EDGES = 30_000
-_STEP = np.array([15.0, 0.05, 0.015, 0.015, 0.015, 8.0, 8.0, 0.01, 0.01, 0.01])
-"""About how far each number can be off at the coarsest level; px, 1, metres, px, radians."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +75,8 @@ class Calibration:
     """Colour edges met at the best fit, 1 is chance."""
     score_assumed: float
     """The same as the source was assumed to be at the start."""
-    moved_px: float
-    """Median shift of depth edges between taking depth as registered and the best fit."""
+    moved_px: float | None
+    """Median shift of depth edges between taking depth as registered and the best fit; None for images of two sizes."""
     frames: tuple[int, ...]
     """Positions used."""
     edges: int
@@ -149,186 +141,87 @@ def calibrate(
     if source.info.camera is None:
         raise SourceError(f"{source_path}: a first guess of the camera is needed; give --intrinsics fx,fy,cx,cy")
     positions, pairs = _still_pairs(source, settings)
-    problem = _Problem(source, pairs)
-    start = problem.start()
-    if problem.count < settings.least_edges or len(pairs) < settings.groups:
-        reason = f"only {problem.count} edge pixels in {len(pairs)} frames: too few steps in depth to see an offset"
-        return problem.result("undetermined", reason, start, {}, positions)
-    free = [0, 1, 2, 3] + ([5, 6] if settings.center else []) + ([7, 8, 9] if settings.rotation else [])
-    best = problem.search(start, free, settings)
-    std = problem.jackknife(best, free, settings)
+    depth_intrinsics = source.optics.depth_intrinsics or _four(source.info.camera)
+    fit = EdgeFit(pairs, source.info.camera, depth_intrinsics)
+    assumed = _assumed(fit, source)
+    if fit.count < settings.least_edges or fit.frames < settings.groups:
+        reason = f"only {fit.count} edge pixels in {fit.frames} frames: too few steps in depth to see an offset"
+        return _result(fit, ("undetermined", reason), assumed, assumed, {}, depth_intrinsics, positions)
+    best, std = _search(fit, settings)
+    verdict = _judge(fit, best, std, settings)
+    return _result(fit, verdict, assumed, best, std, depth_intrinsics, positions)
+
+
+def _search(fit: EdgeFit, settings: CalibrateSettings) -> tuple[Array, dict[str, float]]:
+    """The best camera from coarse to fine, without a distortion that the data do not show, and its uncertainty."""
+    finest, free = settings.levels_px[-1], [0, 1, 2, 3]
+    free += ([5, 6] if settings.center else []) + ([7, 8, 9] if settings.rotation else [])
+    best = fit.grid(fit.start(), settings.focal_range, settings.offset_range_m)
+    for level, blur in enumerate(settings.levels_px):
+        best = fit.climb(best, free if level else [0, 2, 3], blur)
+    std = fit.jackknife(best, free, finest, settings.groups)
     if std["k1"] > 0.05 or abs(best[1]) < std["k1"]:
         free.remove(1)
         best[1] = 0.0
-        best = problem.refine(best, free, settings.levels_px[-2:])
-        std = problem.jackknife(best, free, settings)
-    status, reason = _judge(problem, start, best, std, settings)
-    return problem.result(status, reason, best, std, positions)
+        best = fit.climb(best, free, finest)
+        std = fit.jackknife(best, free, finest, settings.groups)
+    return best, std
 
 
-def _judge(
-    problem: _Problem, start: Array, best: Array, std: dict[str, float], settings: CalibrateSettings
-) -> tuple[str, str]:
-    score = problem.score(best, problem.edge_maps(settings.levels_px[-1]))
+def _judge(fit: EdgeFit, best: Array, std: dict[str, float], settings: CalibrateSettings) -> tuple[str, str]:
+    """Status and reason."""
+    score, start = fit.score(best, settings.levels_px[-1]), fit.start()
     if score < settings.least_score:
         return "undetermined", f"depth edges meet colour edges only {score:.1f} times as well as chance"
-    moved = problem.moved_from_registered(best)
-    if moved is not None and moved < settings.registered_px * problem.scale:
+    moved = fit.moved_px(best)
+    if moved is not None and moved < settings.registered_px * fit.scale:
         return "registered", f"the best fit moves depth edges by {moved:.1f} px: depth lies on the colour pixels"
-    if std["f"] > 0.02 * best[0] or max(std["tx"], std["ty"]) > 0.01:
-        found = f"f by {std['f']:.1f} px, offset by {1000 * max(std['tx'], std['ty']):.0f} mm"
+    offset = max(std["tx"], std["ty"])
+    if std["f"] > 0.02 * best[0] or offset > 0.01:
+        found = f"f by {std['f']:.1f} px, offset by {1000 * offset:.0f} mm"
         return "undetermined", f"groups of frames disagree ({found}); more frames with near and far edges are needed"
     if abs(best[0] / start[0] - 1.0) > settings.focal_range or np.abs(best[2:4]).max() > 1.5 * settings.offset_range_m:
         return "undetermined", "the best fit lies at the border of the search; give a better first --intrinsics"
     return "estimated", f"depth edges meet colour edges {score:.1f} times as well as chance"
 
 
-class _Problem:
-    """Depth edges in 3D and the colour images they must fall on. A vector of `_NAMES` is a camera."""
+def _assumed(fit: EdgeFit, source: FolderSource) -> Array:
+    """The camera as the source is opened with."""
+    optics, v = source.optics, fit.start()
+    v[1] = optics.distortion[0] if optics.distortion else 0.0
+    if optics.T_color_depth is not None:
+        v[2:5] = optics.T_color_depth[:3, 3]
+        v[7:] = Rotation.from_matrix(optics.T_color_depth[:3, :3]).as_rotvec()
+    return v
 
-    def __init__(self, source: FolderSource, pairs: list[tuple[NDArray[np.uint8], NDArray[np.float32]]]) -> None:
-        info, optics = source.info, source.optics
-        assert info.camera is not None
-        self._grays = [cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color, _ in pairs]
-        self._size = self._grays[0].shape if pairs else (info.camera.height, info.camera.width)
-        self.scale = self._size[1] / 640.0
-        """Width of the colour images against the 640 px that the settings speak of."""
-        self._assumed = np.eye(4) if optics.T_color_depth is None else optics.T_color_depth
-        self._aspect = info.camera.fy / info.camera.fx
-        self._camera = info.camera
-        self._distortion = optics.distortion
-        self.depth_intrinsics: Intrinsics = optics.depth_intrinsics or _four(info.camera)
-        self._same_size = all(depth.shape == self._size for _, depth in pairs)
-        self._points, self._pixels, self._sideways = [], [], []
-        fx, fy, cx, cy = self.depth_intrinsics
-        for _, depth in pairs:
-            e = depth_edges(depth)
-            self._points.append(
-                np.stack([(e.x - cx) / fx * e.z, (e.y - cy) / fy * e.z, e.z], axis=1).astype(np.float64)
-            )
-            self._pixels.append(np.stack([e.x, e.y], axis=1))
-            self._sideways.append(e.horizontal)
-        self.count = sum(map(len, self._points))
-        thin = max(1, self.count // _MOST_EDGES)
-        self._points = [part[::thin] for part in self._points]
-        self._pixels = [part[::thin] for part in self._pixels]
-        self._sideways = [part[::thin] for part in self._sideways]
 
-    def start(self) -> Array:
-        """The camera as the source is assumed to be, without its offset and distortion."""
-        v = np.zeros(len(_NAMES))
-        v[[0, 5, 6]] = self._camera.fx, self._camera.cx, self._camera.cy
-        return v
-
-    def assumed(self) -> Array:
-        """The camera as the source is assumed to be."""
-        v = self.start()
-        v[1] = self._distortion[0] if self._distortion else 0.0
-        v[2:5] = self._assumed[:3, 3]
-        v[7:] = Rotation.from_matrix(self._assumed[:3, :3]).as_rotvec()
-        return v
-
-    def edge_maps(self, blur_px: float) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Strength of vertical and of horizontal colour edges, blurred, 1 on average. One pair for each frame."""
-        return [_edge_maps(gray, blur_px * self.scale, self.scale) for gray in self._grays]
-
-    def project(self, v: Array, points: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Pixels of points of the depth camera. Shape (N, 3) -> (N,), (N,)."""
-        p = points @ Rotation.from_rotvec(v[7:]).as_matrix().T if np.any(v[7:]) else points
-        z = p[:, 2] + v[4]
-        x, y = (p[:, 0] + v[2]) / z, (p[:, 1] + v[3]) / z
-        bend = 1.0 + v[1] * (x * x + y * y)
-        return (v[0] * x * bend + v[5]).astype(np.float32), (v[0] * self._aspect * y * bend + v[6]).astype(np.float32)
-
-    def score(self, v: Array, maps: list, members: list[int] | None = None, thin: int = 1) -> float:  # type: ignore[type-arg]
-        """Mean colour edge under the projected depth edges, 1 is chance; frames count by the root of their edges."""
-        total = weight = 0.0
-        for k in range(len(maps)) if members is None else members:
-            points, sideways = self._points[k][::thin], self._sideways[k][::thin]
-            if len(points) == 0:
-                continue
-            u, w = self.project(v, points)
-            met = np.where(sideways, _sample(maps[k][0], u, w), _sample(maps[k][1], u, w))
-            share = len(points) ** 0.5
-            total += share * float(met.mean())
-            weight += share
-        return total / weight if weight else 0.0
-
-    def search(self, start: Array, free: list[int], settings: CalibrateSettings) -> Array:
-        """Grid over focal length and offset on blurred edges, then refinement."""
-        maps = self.edge_maps(8.0)
-        thin = max(1, min(self.count, _MOST_EDGES) // 6000)
-        reach = settings.offset_range_m
-        best, best_score = start, -1.0
-        for f in start[0] * np.linspace(1 - settings.focal_range, 1 + settings.focal_range, 17):
-            for tx in np.linspace(-reach, reach, 9):
-                for ty in np.linspace(-reach / 2, reach / 2, 5):
-                    v = start.copy()
-                    v[[0, 2, 3]] = f, tx, ty
-                    score = self.score(v, maps, thin=thin)
-                    if score > best_score:
-                        best, best_score = v, score
-        best = self.refine(best, [i for i in free if i in (0, 2, 3)], settings.levels_px[:1])
-        return self.refine(best, free, settings.levels_px[1:])
-
-    def refine(
-        self, v: Array, free: list[int], levels_px: tuple[float, ...], members: list[int] | None = None
-    ) -> Array:
-        """Climb from `v` over the free numbers, level by level (Nelder and Mead's simplex)."""
-        for blur in levels_px:
-            maps, base, step = self.edge_maps(blur), v.copy(), _STEP[free]
-
-            def miss(x: Array, maps: list = maps, base: Array = base, step: Array = step) -> float:  # type: ignore[type-arg]
-                w = base.copy()
-                w[free] += x * step
-                return -self.score(w, maps, members)
-
-            simplex = np.vstack([np.zeros(len(free)), np.eye(len(free))]) * (blur / 6.0)
-            limits: Any = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-5, "maxfev": 150 * len(free)}
-            v = base
-            v[free] += minimize(miss, np.zeros(len(free)), method="Nelder-Mead", options=limits).x * step
-        return v
-
-    def jackknife(self, best: Array, free: list[int], settings: CalibrateSettings) -> dict[str, float]:
-        """Standard deviations from leaving out groups of frames in turn (Efron and Stein, 1981)."""
-        groups = settings.groups
-        fits = []
-        for g in range(groups):
-            members = [k for k in range(len(self._points)) if k % groups != g]
-            fits.append(self.refine(best.copy(), free, settings.levels_px[-1:], members))
-        spread = np.sqrt((groups - 1) / groups * np.sum((np.array(fits) - np.mean(fits, axis=0)) ** 2, axis=0))
-        return {name: float(spread[i]) for i, name in enumerate(_NAMES) if i in free or name == "k1"}
-
-    def moved_from_registered(self, v: Array) -> float | None:
-        """Median distance between an edge's own pixel and where it is projected; None for images of two sizes."""
-        if not self._same_size or self.count == 0:
-            return None
-        shifts = []
-        for points, pixels in zip(self._points, self._pixels, strict=True):
-            u, w = self.project(v, points)
-            shifts.append(np.hypot(u - pixels[:, 0], w - pixels[:, 1]))
-        return float(np.median(np.concatenate(shifts)))
-
-    def result(self, status: str, reason: str, v: Array, std: dict[str, float], positions: list[int]) -> Calibration:
-        maps = self.edge_maps(1.0) if self.count else []
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_rotvec(v[7:]).as_matrix()
-        matrix[:3, 3] = v[2:5]
-        moved = self.moved_from_registered(v)
-        return Calibration(
-            status=status,
-            reason=reason,
-            intrinsics=(float(v[0]), float(v[0] * self._aspect), float(v[5]), float(v[6])),
-            distortion=(float(v[1]), 0.0, 0.0, 0.0, 0.0) if v[1] else (),
-            depth_intrinsics=self.depth_intrinsics,
-            T_color_depth=matrix,
-            std=std,
-            score=self.score(v, maps),
-            score_assumed=self.score(self.assumed(), maps),
-            moved_px=float("nan") if moved is None else moved,
-            frames=tuple(positions),
-            edges=self.count,
-        )
+def _result(
+    fit: EdgeFit,
+    verdict: tuple[str, str],
+    assumed: Array,
+    v: Array,
+    std: dict[str, float],
+    depth_intrinsics: Intrinsics,
+    positions: list[int],
+) -> Calibration:
+    T_color_depth = np.eye(4)
+    T_color_depth[:3, :3] = Rotation.from_rotvec(v[7:]).as_matrix()
+    T_color_depth[:3, 3] = v[2:5]
+    aspect, moved = fit.aspect, fit.moved_px(v)
+    return Calibration(
+        status=verdict[0],
+        reason=verdict[1],
+        intrinsics=(float(v[0]), float(v[0] * aspect), float(v[5]), float(v[6])),
+        distortion=(float(v[1]), 0.0, 0.0, 0.0, 0.0) if v[1] else (),
+        depth_intrinsics=depth_intrinsics,
+        T_color_depth=T_color_depth,
+        std=std,
+        score=fit.score(v, 1.0),
+        score_assumed=fit.score(assumed, 1.0),
+        moved_px=moved,
+        frames=tuple(positions),
+        edges=fit.count,
+    )
 
 
 def _still_pairs(
@@ -361,29 +254,6 @@ def _movement(source: FolderSource, position: int) -> float:
     window = cv2.createHanningWindow((160, 120), cv2.CV_32F)
     (dx, dy), _ = cv2.phaseCorrelate(small[0].astype(np.float32), small[1].astype(np.float32), window)
     return round(float(np.hypot(dx, dy)), 3)
-
-
-def _edge_maps(gray: NDArray[Any], blur_px: float, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Edges against their surroundings, so that weak outlines count as well as strong print."""
-    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), max(scale, 0.5))
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)
-    power = gx * gx + gy * gy
-    around = cv2.GaussianBlur(power, (0, 0), 20.0 * scale) + 4.0
-    strength = power / (power + 2.0 * around) / (np.sqrt(power) + 1e-6)
-    out = [cv2.GaussianBlur(strength * np.abs(g), (0, 0), blur_px) for g in (gx, gy)]
-    return out[0] / max(float(out[0].mean()), 1e-6), out[1] / max(float(out[1].mean()), 1e-6)
-
-
-def _sample(image: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Bilinear values of an image at pixels, its border repeated outside. Shape (N,)."""
-    height, width = image.shape
-    u, v = np.clip(np.nan_to_num(u), 0.0, width - 1.001), np.clip(np.nan_to_num(v), 0.0, height - 1.001)
-    x, y = u.astype(np.int32), v.astype(np.int32)
-    a, b, at, flat = u - x, v - y, y * width + x, image.ravel()
-    top = (1 - a) * flat[at] + a * flat[at + 1]
-    bottom = (1 - a) * flat[at + width] + a * flat[at + width + 1]
-    return np.asarray((1 - b) * top + b * bottom)
 
 
 def _four(camera: Any) -> Intrinsics:

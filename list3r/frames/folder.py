@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from list3r.memory.errors import FrameError, OptionError, SourceError
 
 DEFAULT_FPS = 30.0
 _PROBES = 9
+_LEAST_M, _MOST_M = 0.1, 30.0
 
 
 class FolderSource:
@@ -32,12 +34,13 @@ class FolderSource:
         self.optics, notes = merge_optics(layout, options)
         optics = self.optics
         self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files[:_PROBES])
+        self._typical_raw = 0.0
         sizes = self._probe(root)
         self._rig = build_rig(optics, *sizes, options.max_depth_m)
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
-        self._info = self._describe(root, notes)
+        self._info = self._describe(root, (*notes, *self._doubts()))
 
     @property
     def info(self) -> SourceInfo:
@@ -96,10 +99,19 @@ class FolderSource:
                 if not self._has_depth:
                     return color.shape[:2], None
                 if file.depth is not None:
-                    return color.shape[:2], read_raw_depth(file.depth).shape
+                    raw = read_raw_depth(file.depth)
+                    self._typical_raw = _median_known(raw)
+                    return color.shape[:2], raw.shape
             except FrameError as error:
                 reason = reason or str(error)
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
+
+    def _doubts(self) -> tuple[str, ...]:
+        """What looks wrong with the depth scale."""
+        typical_m = self._typical_raw / self._rig.depth_scale
+        if not self._has_depth or typical_m == 0 or _LEAST_M <= typical_m <= _MOST_M:
+            return ()
+        return (f"depth is {typical_m:.3g} m in the middle of its range, hardly indoors: --depth-scale may be wrong",)
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
@@ -153,6 +165,12 @@ def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:
             size = -1
         out.append((path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, size))
     return out
+
+
+def _median_known(raw: NDArray[Any]) -> float:
+    """Median of the values that can be depth, in stored units; 0 when there are none."""
+    known = raw[clean_depth(raw, 1.0, None) > 0]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def _rate(files: tuple[FrameFile, ...]) -> float | None:
