@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import pytest
 from list3r.frames.base import Camera
 from list3r.frames.calibrate import CalibrateSettings, calibrate
 from list3r.frames.edges import depth_edges
+from list3r.frames.inspection import describe, lines
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError
 from tests.frames_scenes import cards, moved, paint, write_png
@@ -46,6 +48,9 @@ def test_a_known_camera_is_found_from_a_wrong_start(tmp_path: Path) -> None:
     assert found.score > 1.5 * found.score_assumed and found.std["f"] < 3.0
     assert "--depth-to-color" in found.command_line()
     opened = open_source(root, found.options(START))
+    report = {**describe(opened.info), "calibration": found.as_dict()}
+    assert any("--depth-to-color" in line for line in lines(report))
+    json.dumps(report, allow_nan=False)
     assert opened.info.depth_camera is not None
     again = calibrate(root, START, CalibrateSettings(frames=12, candidates=1))
     assert again.as_dict() == found.as_dict()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 from dataclasses import replace
@@ -12,8 +13,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import BadFrame, Frame, FrameSource
-from list3r.frames.describe import describe, describe_text
-from list3r.frames.overlay import write_overlay
+from list3r.frames.inspection import describe, draw_registration, lines
 from list3r.frames.source import SourceOptions, check_bad_share, open_source, require_camera
 from list3r.frames.tum import associate, poses_at
 from list3r.memory.errors import ExportError, OptionError, SourceError
@@ -200,18 +200,20 @@ def test_the_account_is_honest_and_fits_json(tmp_path: Path) -> None:
     info = open_source(write_seven_scenes(tmp_path / "s")).info
     told = describe(info)
     assert told["depth_registered"] is False and told["size"] == [640, 480] and told["poses"] is True
-    assert "note" in describe_text(info)
+    assert any(line.startswith("note") for line in lines(told))
     bare = describe(replace(info, camera=None, depth_camera=None, has_depth=False, T_color_depth=None))
     assert bare["camera"] is None and bare["depth_registered"] is False
+    assert any("unknown" in line for line in lines(bare))
+    json.dumps(told, allow_nan=False)
 
 
 def test_overlays_are_written_or_refused(tmp_path: Path) -> None:
     source = open_source(write_seven_scenes(tmp_path / "s"))
-    numbers = write_overlay(source, tmp_path / "o.png", 2)
+    numbers = draw_registration(source, tmp_path / "o.png", 2)
     sheet = cv2.imread(str(tmp_path / "o.png"))
     assert sheet is not None and sheet.shape == (480 * len(numbers), 1280, 3)
     with pytest.raises(ExportError):
-        write_overlay(source, tmp_path / "absent" / "o.png")
+        draw_registration(source, tmp_path / "absent" / "o.png")
 
 
 # ------------------------------------------------------------------------------------------ damage

@@ -47,13 +47,13 @@ class EdgeFit:
             e = depth_edges(depth)
             points.append(np.stack([(e.x - cx) / fx * e.z, (e.y - cy) / fy * e.z, e.z], axis=1))
             pixels.append(np.stack([e.x, e.y], axis=1))
-            slots.append(2 * k + np.where(e.horizontal, 0, 1))
+            slots.append(2 * k + np.where(e.horizontal, 0, 1).astype(np.int64))
         self.count = sum(map(len, points))
         """Edge pixels found; an even choice of them is used."""
         thin = max(1, self.count // _MOST_EDGES)
         self._points = np.concatenate([p[::thin] for p in points] or [np.zeros((0, 3))]).astype(np.float64)
         self._pixels = np.concatenate([p[::thin] for p in pixels] or [np.zeros((0, 2))])
-        self._slots = np.concatenate([s[::thin] for s in slots] or [np.zeros(0)]).astype(np.int64)
+        self._slots = np.concatenate([s[::thin] for s in slots] or [np.zeros(0, np.int64)])
         self.frames = len(pairs)
         self._maps: tuple[float, Floats] = (-1.0, np.zeros(0, np.float32))
 

@@ -30,7 +30,7 @@ def draw_overlay(frame: Frame) -> NDArray[np.uint8]:
     return np.concatenate([marked, np.asarray(tinted, dtype=np.uint8)], axis=1)
 
 
-def write_overlay(source: FrameSource, path: str | Path, count: int = 4) -> list[int]:
+def draw_registration(source: FrameSource, path: str | Path, count: int = 4) -> list[int]:
     """Write overlays of `count` frames spread over the source into one PNG; the frames' numbers come back.
 
     Raises `SourceError` when there is no depth, `ExportError` when the file cannot be written.
