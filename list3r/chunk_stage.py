@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +16,8 @@ import numpy as np
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
-from list3r.instances.library import InstanceSettings, build_library
+from list3r.instances.library import build_library
+from list3r.instances.settings import InstanceSettings
 from list3r.instances.overlays import draw_debug
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.records import ChunkResult, Keyframe, LocalLibrary, OverlapSamples
@@ -75,6 +76,8 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
         reconstruction = make_reconstructor(task.settings)(frames, camera)
     except TrackingError:
         return _without_geometry(task, frames, camera, bad, clock.seconds)
+    if task.settings.poses == "given":
+        reconstruction = _in_source_world(reconstruction, frames)
     clock.mark("reconstruction")
     library = build_library(frames, reconstruction, task.settings.instances)
     clock.mark("instances")
@@ -137,8 +140,17 @@ def _without_geometry(
         scale_kind="metric",
         keyframes=np.zeros(0, np.int64),
     )
-    library = LocalLibrary((), np.zeros((0, 2), np.int32), task.settings.instances.feature_space)
+    library = LocalLibrary((), np.zeros((0, 2), np.int32), FEATURE_SPACE)
     return _result(task, frames, empty, library, nothing, bad, seconds, ())
+
+
+def _in_source_world(reconstruction: Reconstruction, frames: Sequence[Frame]) -> Reconstruction:
+    """With given poses the source's own world is every chunk's frame, so that chunks need no alignment."""
+    first = int(np.flatnonzero(reconstruction.posed)[0])
+    T_source_cam = frames[first].T_source_cam
+    assert T_source_cam is not None
+    T_source_chunk = T_source_cam @ np.linalg.inv(reconstruction.T_chunk_cam[first])
+    return replace(reconstruction, T_chunk_cam=T_source_chunk @ reconstruction.T_chunk_cam)
 
 
 def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
+import types
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -31,14 +34,13 @@ def default_workers() -> int:
 class OrderedPool:
     """Runs one function over tasks in processes; results come in the order of the tasks.
 
-    The processes start with the pool, before the caller opens files, so that they hold none of the caller's locks.
+    The processes are started afresh (spawned), so that they share neither locks nor half-used threads with the caller.
     """
 
     def __init__(self, work: Callable[[Task], Result], workers: int) -> None:
         self._work = work
         self._workers = workers
-        self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _prepare, (os.getpid(),))
-        self._executor.submit(os.getpid).result()
+        self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare, (os.getpid(),))
 
     def map(self, tasks: Sequence[Task]) -> Iterator[Result]:
         """Results in order; at most `workers + 1` tasks are under way or waiting to be taken."""
@@ -46,7 +48,8 @@ class OrderedPool:
         upcoming = iter(tasks)
         try:
             for task in upcoming:
-                waiting.append(self._executor.submit(self._work, task))
+                with _no_main_module():
+                    waiting.append(self._executor.submit(self._work, task))
                 if len(waiting) > self._workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -62,6 +65,17 @@ class OrderedPool:
         self._executor.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.kill()
+
+
+@contextlib.contextmanager
+def _no_main_module() -> Iterator[None]:
+    """Keep new processes from running the caller's script again, which asks every script for a guard otherwise."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _prepare(parent: int) -> None:
