@@ -192,6 +192,8 @@ def test_the_fingerprint_follows_what_shapes_frames_only(tmp_path: Path) -> None
     assert open_source(root, SourceOptions(kind="7scenes")).info.fingerprint == mark
     assert open_source(root, SourceOptions(every=2)).info.fingerprint != mark
     assert open_source(root, SourceOptions(max_depth_m=3.0)).info.fingerprint != mark
+    assert open_source(root.rename(tmp_path / "elsewhere")).info.fingerprint == mark
+    root = tmp_path / "elsewhere"
     (root / "frame-000003.pose.txt").unlink()
     assert open_source(root).info.fingerprint != mark
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -156,14 +157,13 @@ def fingerprint(kind: str, listing: list[tuple[str, int]], options: SourceOption
 
 
 def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:
-    paths = [p for f in files for p in (f.color, f.depth, f.pose) if p is not None]
-    out = []
-    for path in paths:
+    above, out = f"{root}{os.sep}", []
+    for path in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
         try:
             size = path.stat().st_size
         except OSError:
             size = -1
-        out.append((path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, size))
+        out.append((str(path).removeprefix(above).replace(os.sep, "/"), size))
     return out
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from list3r.frames.layout import FrameFile, Layout, Optics, read_calibration, read_numbers, read_text
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
@@ -82,27 +82,21 @@ def poses_at(
     along the shortest arc; otherwise the nearest stamp within `MAX_PAIR_GAP_S` counts. `stamps_s` (N,) ascend,
     `poses_xyzw` (N, 7) are translations in metres and quaternions.
     """
-    matrices = np.tile(np.eye(4), (len(stamps_s), 1, 1))
-    matrices[:, :3, :3] = Rotation.from_quat(poses_xyzw[:, 3:]).as_matrix()
-    matrices[:, :3, 3] = poses_xyzw[:, :3]
-    out: list[NDArray[np.float64] | None] = []
-    for time in times_s:
-        after = int(np.searchsorted(stamps_s, time))
-        before = after - 1
-        if 0 < after < len(stamps_s) and stamps_s[after] - stamps_s[before] <= MAX_POSE_BRACKET_S:
-            out.append(_between(float(time), stamps_s[before : after + 1], matrices[before : after + 1]))
-            continue
-        near = min((k for k in (before, after) if 0 <= k < len(stamps_s)), key=lambda k: abs(stamps_s[k] - time))
-        out.append(matrices[near] if abs(stamps_s[near] - time) <= MAX_PAIR_GAP_S else None)
-    return out
-
-
-def _between(time: float, stamps: NDArray[np.float64], matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    w = (time - stamps[0]) / (stamps[1] - stamps[0])
-    out = np.eye(4)
-    out[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(matrices[:, :3, :3]))(w).as_matrix()
-    out[:3, 3] = (1 - w) * matrices[0, :3, 3] + w * matrices[1, :3, 3]
-    return out
+    rotations = Rotation.from_quat(poses_xyzw[:, 3:])
+    after = np.clip(np.searchsorted(stamps_s, times_s), 1, max(1, len(stamps_s) - 1))
+    after = np.minimum(after, len(stamps_s) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = stamps_s[after] - stamps_s[before]
+    inside = (times_s >= stamps_s[before]) & (times_s <= stamps_s[after]) & (gap <= MAX_POSE_BRACKET_S)
+    near = _nearest(times_s, stamps_s)
+    known = inside | (np.abs(stamps_s[near] - times_s) <= MAX_PAIR_GAP_S)
+    w = np.where(inside & (gap > 0), (times_s - stamps_s[before]) / np.where(gap > 0, gap, 1.0), 0.0)
+    first, second = np.where(inside, before, near), np.where(inside, after, near)
+    turn = (rotations[first].inv() * rotations[second]).as_rotvec()
+    matrices = np.tile(np.eye(4), (len(times_s), 1, 1))
+    matrices[:, :3, :3] = (rotations[first] * Rotation.from_rotvec(w[:, None] * turn)).as_matrix()
+    matrices[:, :3, 3] = (1 - w[:, None]) * poses_xyzw[first, :3] + w[:, None] * poses_xyzw[second, :3]
+    return [matrix if ok else None for matrix, ok in zip(matrices, known, strict=True)]
 
 
 def _nearest(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.int64]:
