@@ -103,3 +103,13 @@ def test_a_wide_scene_has_its_legend_below() -> None:
     assert square.legend_xy[0] > square.map_px[0]
     assert wide.rows * wide.columns < 60
     assert choose_layout(np.array((10.0, 4.0)), 0, PlanSettings()).rows == 0
+
+
+def test_things_without_a_tag_are_faint(make_memory: Callable[..., Path]) -> None:
+    with Store.open(make_memory()) as store:
+        picture = plan_image(store, read_components(store)[0], PlanSettings(max_tags=2))
+    pixels = np.asarray(picture).reshape(-1, 3).astype(int)
+    drawn = [int((np.abs(pixels - instance_color(id)).max(axis=1) <= 2).sum()) for id in (2, 3)]
+    legend_only = (np.abs(pixels - instance_color(5)).max(axis=1) <= 2).sum()
+    assert min(drawn) > 2 * 20
+    assert 0 < legend_only < drawn[0]

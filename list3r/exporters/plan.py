@@ -48,14 +48,15 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
     limits = (settings.points_per_instance, settings.points_per_structure)
     supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
     things = [i for i in component.instances if not i.structure and has_box(i)]
+    tagged = _seen_most(things, settings.max_tags)
     frame, layout = _frame(store, component, supports, settings, len(things))
     sheet = _Sheet(frame, layout, settings)
     sheet.picture(component, supports)
-    sheet.boxes(things)
+    sheet.boxes(things, {i.id for i in tagged})
     sheet.camera_path(component)
-    sheet.tags(things)
+    sheet.tags(tagged)
     sheet.scale_bar(units(store))
-    sheet.axes()
+    sheet.axes("" if len(tagged) == len(things) else f"; the {len(tagged)} things seen most have tags")
     sheet.header(_title(store, component), _subtitle(store, component))
     sheet.legend(things, units(store))
     return sheet.finish()
@@ -157,10 +158,13 @@ class _Sheet:
             corners = np.array([corners.min(axis=0), corners.max(axis=0) + 1.0])
         return [(float(x), float(y)) for x, y in corners]
 
-    def boxes(self, things: list[Instance]) -> None:
-        """Oriented boxes, the small ones over the large ones."""
+    def boxes(self, things: list[Instance], tagged: set[int]) -> None:
+        """Oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
         for instance in sorted(things, key=lambda i: (-_area(self._footprint(i)), i.id)):
             color, outline = instance_color(instance.id), self._footprint(instance)
+            if instance.id not in tagged:
+                self.draw.line([*outline, outline[0], outline[1]], fill=(*color, 110), width=_OVERSAMPLING)
+                continue
             side_px = _area(outline) ** 0.5 / _OVERSAMPLING
             self.draw.polygon(outline, fill=(*color, int(np.interp(side_px, [20, 120], [60, 14]))))
             self.draw.line([*outline, outline[0], outline[1]], fill=(*color, 255), width=2 * _OVERSAMPLING)
@@ -263,8 +267,8 @@ class _Sheet:
         words = f"{length:g} m" if unit == "m" else f"{length:g} x the memory's unit (relative scale)"
         self._text((x1, y - 11 * k), words, self.text_font, _INK, anchor="rs")
 
-    def axes(self) -> None:
-        """The world's axes as they lie on the page, and what is up, under the map."""
+    def axes(self, remark: str) -> None:
+        """The world's axes as they lie on the page, what is up, and a remark, under the map."""
         k = _OVERSAMPLING
         origin = np.array([self.left + 24.0 * k, self.top + self.map_size[1] + 32.0 * k])
         for axis, (name, color) in enumerate((("x", (200, 60, 60)), ("y", (40, 140, 60)), ("z", (50, 90, 200)))):
@@ -279,7 +283,11 @@ class _Sheet:
             at = tip + arrow * 0.45
             self._text((float(at[0]), float(at[1])), name, _font(12), color, anchor="mm")
         self._text(
-            (self.left + 66.0 * k, self.top + self.map_size[1] + 32.0 * k), self.frame.note, self.text_font, _GREY, "lm"
+            (self.left + 66.0 * k, self.top + self.map_size[1] + 32.0 * k),
+            self.frame.note + remark,
+            self.text_font,
+            _GREY,
+            "lm",
         )
 
     def header(self, title: str, subtitle: str) -> None:
@@ -291,8 +299,7 @@ class _Sheet:
     def legend(self, things: list[Instance], unit: str) -> None:
         """A table of ids, descriptions and sizes; where it is too long, those that were seen most."""
         k, layout = _OVERSAMPLING, self.layout
-        chosen = sorted(things, key=lambda i: (-i.observations, i.id))[: layout.columns * layout.rows]
-        chosen.sort(key=lambda i: i.id)
+        chosen = _seen_most(things, layout.columns * layout.rows)
         x, y = layout.legend_xy[0] * k, layout.legend_xy[1] * k
         for column in range(layout.columns):
             rows = chosen[column * layout.rows : (column + 1) * layout.rows]
@@ -319,6 +326,11 @@ class _Sheet:
             words = _shorten(self.draw, instance.label or instance.description, self.text_font, room)
             self._text((x + 46 * k, middle), words, self.text_font, _INK, anchor="lm")
             self._text((right, middle), size, self.text_font, _GREY, anchor="rm")
+
+
+def _seen_most(things: list[Instance], limit: int) -> list[Instance]:
+    """At most so many things, those with the most observations, by id."""
+    return sorted(sorted(things, key=lambda i: (-i.observations, i.id))[:limit], key=lambda i: i.id)
 
 
 def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

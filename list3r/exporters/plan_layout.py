@@ -25,6 +25,8 @@ class PlanSettings:
     """The map grows up to this height for the sake of a legend beside it."""
     max_rows_below: int = 16
     """At most so many rows of a legend below the map; things that are not listed are drawn all the same."""
+    max_tags: int = 80
+    """The things seen most have tags; where there are more, the others are faint outlines."""
     min_map_px: int = 420
     max_map_px: int = 1400
     wide: float = 0.62
