@@ -11,6 +11,7 @@ import numpy as np
 from list3r.memory.bodies import Body
 from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing
 from list3r.memory.describe import describe, median_rgb
+from list3r.memory.evidence import Evidence, EvidenceSettings, weigh
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import floor_height
 from list3r.memory.identities import Identities, assign_ids
@@ -31,8 +32,7 @@ class ConsolidationSettings:
     derive: DeriveSettings = field(default_factory=DeriveSettings)
     structure: StructureSettings = field(default_factory=StructureSettings)
     relations: RelationSettings = field(default_factory=RelationSettings)
-    min_frames: int = 8
-    """A thing seen in fewer frames, over all chunks, is not shown: it keeps its local instances but gets no id."""
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ConsolidationReport:
     merged: tuple[tuple[int, int], ...]
     """(id that retired, id that it is an alias of)."""
     hidden: int
-    """Groups of local instances that were seen too little to be shown."""
+    """Groups of local instances that are not shown: seen too little, or fragments of a thing that is."""
 
 
 def consolidate(
@@ -65,12 +65,15 @@ def consolidate(
     if not chunks:
         return ConsolidationReport(0, 0, (), (), 0)
     summaries = chunk_summaries(store)
-    groups, decisions = _partition(store, chunks, summaries, s.merging)
+    pairs = _known_pairs(store, chunks, summaries)
+    groups, decisions = _partition(chunks, summaries, pairs, s.merging)
     before = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
-    frames = _frame_counts(groups, summaries)
+    evidence = weigh(groups, {k: v.shapes for k, v in summaries.items()}, pairs, s.evidence)
     weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
-    ids = assign_ids(groups, before, weights, shown=[n >= s.min_frames for n in frames], next_id=store.next_id())
-    things = _things(store, groups, ids, chunks, summaries, s)
+    shown = [e.shown(s.evidence) for e in evidence]
+    within = [next((w for w in e.within if shown[w]), None) for e in evidence]
+    ids = assign_ids(groups, before, weights, shown, within, store.next_id())
+    things = _things(store, groups, ids, evidence, chunks, summaries, s)
     things = _with_structure(store, things, chunks, summaries, s)
     _write(store, things, groups, ids, summaries)
     store.replace_relations(None, _relations(store, things, chunks, summaries, s))
@@ -91,7 +94,10 @@ _scores: WeakKeyDictionary[Store, dict[tuple[int, int], tuple[bytes, PairScores]
 
 
 def _partition(
-    store: Store, chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary], settings: MergeSettings
+    chunks: Sequence[ChunkRow],
+    summaries: Mapping[int, ChunkSummary],
+    pairs: Mapping[tuple[int, int], PairScores],
+    settings: MergeSettings,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     """Groups and decisions of all components, each merged on its own."""
     groups: list[list[Key]] = []
@@ -102,7 +108,6 @@ def _partition(
         links = [
             ((c.chunk_id, int(a)), (c.chunk_id, int(b))) for c in inside for a, b in summaries[c.chunk_id].cannot_link
         ]
-        pairs = _known_pairs(store, inside, summaries)
         found = merge_nodes([summaries[c.chunk_id].shapes for c in inside], placed, links, settings, pairs)
         groups += found[0]
         decisions += found[1]
@@ -112,14 +117,16 @@ def _partition(
 def _known_pairs(
     store: Store, chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
 ) -> dict[tuple[int, int], PairScores]:
-    """Scores of all pairs of chunks. Each is computed at the relative pose rounded to about a millimetre, so that it
-    is a function of the store's content and still holds, unread from anywhere, while a graph settles.
+    """Scores of all pairs of chunks of one component. Each is computed at the pose rounded to about a millimetre: it
+    is a function of what the store holds, and it need not be computed again while a graph settles.
     """
     known = _scores.setdefault(store, {})
     checks = store.chunk_checksums()
     out = {}
     for n, u in enumerate(chunks):
         for v in chunks[n:]:
+            if u.component != v.component:
+                continue
             unit = summaries[u.chunk_id].unit
             S_u_v = _rounded(u.S_world_chunk.inverse() @ v.S_world_chunk, unit) if u is not v else Sim3.identity()
             stamp = np.append(S_u_v.as_matrix(), [checks[u.chunk_id], checks[v.chunk_id]]).tobytes()
@@ -139,18 +146,6 @@ def _at(summaries: Mapping[int, ChunkSummary], key: Key) -> int:
     return int(np.searchsorted(summaries[key[0]].shapes.local_id, key[1]))
 
 
-def _frame_counts(groups: Sequence[Sequence[Key]], summaries: Mapping[int, ChunkSummary]) -> list[int]:
-    """Different frames in which each group is seen."""
-    out = []
-    for group in groups:
-        seen: set[tuple[int, int]] = set()
-        for key in group:
-            shapes = summaries[key[0]].shapes
-            seen.update((shapes.session_id, int(f)) for f in shapes.frames[_at(summaries, key)])
-        out.append(len(seen))
-    return out
-
-
 # ---------------------------------------------------------------------------------------------- deriving
 
 
@@ -158,6 +153,7 @@ def _things(
     store: Store,
     groups: Sequence[Sequence[Key]],
     ids: Identities,
+    evidence: Sequence[Evidence],
     chunks: Sequence[ChunkRow],
     summaries: Mapping[int, ChunkSummary],
     s: ConsolidationSettings,
@@ -166,7 +162,7 @@ def _things(
     upright = _gravity_known(store)
     first = min(c.component for c in chunks)
     out = []
-    for group, instance_id in zip(groups, ids.of_group, strict=True):
+    for group, instance_id, seen in zip(groups, ids.of_group, evidence, strict=True):
         if instance_id is None:
             continue
         members = [
@@ -174,9 +170,8 @@ def _things(
             for k in group
         ]
         component = rows[group[0][0]].component
-        out.append(
-            derive_thing(instance_id, members, component, upright=upright and component == first, settings=s.derive)
-        )
+        up = upright and component == first
+        out.append(derive_thing(instance_id, members, component, seen.agreement, upright=up, settings=s.derive))
     return sorted(out, key=lambda t: t.body.id)
 
 

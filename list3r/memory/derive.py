@@ -24,8 +24,10 @@ class DeriveSettings:
     """Surface points kept for boxes and relations."""
     trim: float = 0.01
     """Share of points outside the box at either end of each axis."""
-    flat: float = 0.08
+    flat: float = 0.15
     """Thickness over the second longest extent of what is flat."""
+    confirmed: float = 0.25
+    """Share of the members, where there are at least four whole views, that must have a surface at a point."""
     border_px: float = 3.0
 
 
@@ -53,16 +55,28 @@ class Thing:
 
 
 def derive_thing(
-    instance_id: int, members: Sequence[Member], component: int, *, upright: bool, settings: DeriveSettings
+    instance_id: int,
+    members: Sequence[Member],
+    component: int,
+    agreement: float,
+    *,
+    upright: bool,
+    settings: DeriveSettings,
 ) -> Thing:
-    """All that follows from the members of one thing; `upright` says that z is up."""
+    """All that follows from the members of one thing.
+
+    `agreement` is the share of the chunks that saw its place and found it; `upright` says that z is up.
+    """
     s = settings
     points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[m.shapes.owner == m.at]) for m in members])
     rgb = np.concatenate([m.shapes.rgb[m.shapes.owner == m.at] for m in members])
     if len(points) == 0:
         points, rgb = members[0].S_world_chunk.apply(np.zeros((1, 3))), np.zeros((1, 3), np.uint8)
+    owner = np.repeat(np.arange(len(members)), [int((m.shapes.owner == m.at).sum()) for m in members])
     step = -(-len(points) // s.max_points)
-    points, rgb = points[::step], rgb[::step]
+    points, rgb, owner = points[::step], rgb[::step], owner[::step]
+    keep = _confirmed(points, owner, members, s)
+    points, rgb = points[keep], rgb[keep]
     keep = without_strays(points)
     points, rgb = points[keep], rgb[keep]
     frames = sorted({(m.shapes.session_id, int(f)) for m in members for f in m.shapes.frames[m.at]})
@@ -79,7 +93,7 @@ def derive_thing(
         normal=_normal(members, points, s),
         flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
         component=component,
-        confidence=_confidence(len(frames), stability, members, s),
+        confidence=_confidence(len(frames), stability, members, agreement, s),
     )
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
     return Thing(body, unit_feature, tuple(frames), _best_view(members, s))
@@ -89,23 +103,53 @@ def _aabb(points: Array, trim: float) -> Array:
     return np.asarray(np.quantile(points, [trim, 1.0 - trim], axis=0))
 
 
+def _confirmed(
+    points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings
+) -> NDArray[np.int64]:
+    """Points that enough of the members agree on: what a single chunk added to a thing that others saw whole is a bit
+    of something else. Members that the image's border cut have no say, and where they are many nothing is dropped.
+    """
+    whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
+    need = int(np.ceil(s.confirmed * whole.sum()))
+    if whole.sum() < 4 or whole.mean() < 0.7 or need < 2:
+        return np.arange(len(points))
+    grain = 2.0 * members[0].shapes.grain * float(members[0].S_world_chunk.scale)
+    cells = np.floor((points - points.min(axis=0)) / grain).astype(np.int64) + 1
+    shape = cells.max(axis=0) + 2
+    flat = np.ravel_multi_index(tuple(cells.T), tuple(shape))
+    reach = np.array([np.ravel_multi_index((i + 1, j + 1, k + 1), tuple(shape)) for i, j, k in _NEAR]) - int(
+        np.ravel_multi_index((1, 1, 1), tuple(shape))
+    )
+    seen = np.unique((flat[:, None] + reach) * len(members) + owner[:, None])
+    held, count = np.unique(seen[whole[seen % len(members)]] // len(members), return_counts=True)
+    at = np.minimum(np.searchsorted(held, flat), len(held) - 1)
+    keep = np.flatnonzero((held[at] == flat) & (count[at] >= need))
+    return keep if len(keep) >= 0.3 * len(points) else np.arange(len(points))
+
+
+_NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
+
+
 def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:
-    """Normal of a thing that is flat as a whole, towards the cameras that saw it."""
+    """Normal of a thing that is flat in most of its views and as a whole, towards the cameras that saw it."""
     flat = [m for m in members if not np.isnan(m.shapes.plane[m.at]).any()]
-    center = points.mean(axis=0)
-    _, spread, axes = np.linalg.svd(points - center, full_matrices=False)
-    if not flat or len(points) < 3 or spread[2] > s.flat * spread[1]:
+    if 2 * len(flat) < len(members) or len(points) < 3:
+        return None
+    center = np.median(points, axis=0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2]
+    extent = np.ptp(np.quantile((points - center) @ axes.T, [0.1, 0.9], axis=0), axis=0)
+    if extent[2] > s.flat * extent[1]:
         return None
     toward = np.sum([m.S_world_chunk.rotation @ m.shapes.plane[m.at, :3] for m in flat], axis=0)
     return np.asarray(axes[2] if axes[2] @ toward >= 0 else -axes[2])
 
 
-def _confidence(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:
-    """Grows with frames and with chunks that found the thing on their own; stability caps it."""
+def _confidence(frames: int, stability: float, members: Sequence[Member], agreement: float, s: DeriveSettings) -> float:
+    """Grows with frames and with chunks that found the thing on their own; stability and agreement cap it."""
     chunks = len({m.shapes.chunk_id for m in members})
     seen = frames / (frames + s.half_frames)
     agreed = 1.0 - 0.5**chunks
-    return round(float(np.clip(stability, 0.0, 1.0)) * (0.6 * seen + 0.4 * agreed), 4)
+    return round(float(np.clip(stability, 0.0, 1.0)) * agreement * (0.6 * seen + 0.4 * agreed), 4)
 
 
 def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:

@@ -30,14 +30,17 @@ def assign_ids(
     before: Mapping[Key, int],
     weights: Mapping[Key, int],
     shown: Sequence[bool],
+    within: Sequence[int | None],
     next_id: int,
 ) -> Identities:
-    """Give every group an id.
+    """Give every shown group an id.
 
     An id goes on with the group that holds most (by `weights`) of what it named before; where several ids come to one
     group the oldest stays and the others become aliases. Parts that left an id, and groups never seen, get new ids in
-    the order of the groups; ids are never used again. A group that is not `shown` gets an id only if it had one.
+    the order of the groups; ids are never used again. A group that is not `shown` has no id; one that it had becomes an
+    alias of the group that it lies `within`, and it stays shown where there is none.
     """
+    visible = [s or w is None for s, w in zip(shown, within, strict=True)]
     share: dict[int, dict[int, int]] = {}
     for n, group in enumerate(groups):
         for key in group:
@@ -47,9 +50,13 @@ def assign_ids(
     heirs = {old: min(parts, key=lambda n: (-parts[n], n)) for old, parts in share.items()}
     owner: dict[int, int] = {}
     aliases: list[tuple[int, int]] = []
+    retired: list[tuple[int, int]] = []
     for old in sorted(heirs):
         n = heirs[old]
-        if n in owner:
+        other = within[n]
+        if not visible[n] and other is not None:
+            retired.append((old, other))
+        elif n in owner:
             aliases.append((old, owner[n]))
         else:
             owner[n] = old
@@ -62,5 +69,6 @@ def assign_ids(
         new.append(next_id)
         splits += [(old, next_id) for old in sorted({before[key] for key in group if key in before})]
         next_id += 1
+    aliases += [(old, owner[n]) for old, n in retired]
     ids = tuple(owner.get(n) for n in range(len(groups)))
     return Identities(ids, tuple(new), tuple(aliases), tuple(splits), next_id - 1)

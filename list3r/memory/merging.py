@@ -38,6 +38,9 @@ class MergeSettings:
     """Frames that two chunks share, before what the masks do in them counts."""
     same_mask_iou: float = 0.5
     """Mean IoU of the boxes in shared frames that makes up for poor overlap in space."""
+    max_whole_m: float = 1.6
+    """Diagonal up to which a view that the border does not cut is taken for whole; the far end of a larger thing is
+    hidden or out of range."""
     max_conflicts: float = 0.25
     """Share of the pairs across two clusters that may speak against joining them."""
     max_angle_deg: float = 10.0
@@ -141,11 +144,12 @@ class _Table:
     structure: NDArray[np.bool_]
     feature: NDArray[np.float32]
     tolerance: Array
+    unit: Array
 
     @staticmethod
     def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> _Table:
         keys: list[Key] = []
-        start, center, size, plane, tolerance = {}, [], [], [], []
+        start, center, size, plane, tolerance, unit = {}, [], [], [], [], []
         for c in chunks:
             placed = S_world_chunk[c.chunk_id]
             start[c.chunk_id] = len(keys)
@@ -155,6 +159,7 @@ class _Table:
             normal = c.plane[:, :3] @ placed.rotation.T
             plane.append(np.column_stack([normal, c.plane[:, 3] * float(placed.scale) - normal @ placed.translation]))
             tolerance.append(np.full(len(c.local_id), 2.0 * c.grain * float(placed.scale)))
+            unit.append(np.full(len(c.local_id), c.unit * float(placed.scale)))
         features = [c.feature for c in chunks if len(c.local_id)]
         return _Table(
             keys,
@@ -166,6 +171,7 @@ class _Table:
             np.concatenate([c.structure for c in chunks]) if chunks else np.zeros(0, bool),
             np.concatenate(features) if features else np.zeros((0, 1), np.float32),
             np.concatenate(tolerance) if tolerance else np.zeros(0),
+            np.concatenate(unit) if unit else np.zeros(0),
         )
 
     def coplanar(self, a: Ints, b: Ints, angle_deg: float) -> NDArray[np.bool_]:
@@ -303,6 +309,7 @@ def _objection(
         return f"{_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
     left, right = (x.ravel() for x in np.meshgrid(a, b, indexing="ij"))
     whole = (t.truncated[left] < s.min_truncated) & (t.truncated[right] < s.min_truncated)
+    whole &= np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
     compared = np.flatnonzero(whole & ~t.coplanar(left, right, s.max_angle_deg))
     if len(compared) == 0:
         return ""

@@ -55,7 +55,7 @@ class RelationSettings:
     next_to_m: tuple[float, float] = (0.1, 0.4)
     """Gap between surfaces: half the mean size of the two, within these."""
     near_m: tuple[float, float] = (0.3, 1.0)
-    """Gap between surfaces: twice the mean size of the two, within these."""
+    """Gap between surfaces: twice the size of the smaller one, within these."""
     attached_m: float = 0.05
 
 
@@ -97,6 +97,7 @@ class _Scene:
         self.s = settings
         self._trees: dict[int, cKDTree] = {}
         self._gaps: dict[tuple[int, int], float] = {}
+        self._plans: dict[int, _Plan] = {}
         low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
         high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
         gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
@@ -106,6 +107,7 @@ class _Scene:
         self.low, self.high = low, high
 
     def tree(self, n: int) -> cKDTree:
+        """KD-tree of a body's points."""
         if n not in self._trees:
             self._trees[n] = cKDTree(self.bodies[n].points)
         return self._trees[n]
@@ -115,9 +117,33 @@ class _Scene:
         key = (min(a, b), max(a, b))
         if key not in self._gaps:
             small, large = sorted(key, key=lambda n: (len(self.bodies[n].points), n))
-            points = self.bodies[small].points
-            self._gaps[key] = float(neighbours_of(points[:: max(1, len(points) // 300)], self.tree(large))[0].min())
+            self._gaps[key] = float(neighbours_of(self.plan(small).points, self.tree(large))[0].min())
         return self._gaps[key]
+
+    def plan(self, n: int) -> _Plan:
+        """A body as it is seen from above."""
+        if n not in self._plans:
+            points = self.bodies[n].points
+            sample = points[:: -(-len(points) // _SAMPLE)]
+            self._plans[n] = _Plan(sample, cKDTree(sample[:, :2]), _spacing(sample))
+        return self._plans[n]
+
+    def footprints_meet(self, a: int, b: int, slack: float) -> bool:
+        """Whether the axis-aligned footprints of two bodies come within `slack` of each other."""
+        low = np.maximum(self.low[a, :2], self.low[b, :2])
+        high = np.minimum(self.high[a, :2], self.high[b, :2])
+        return bool((low <= high + slack).all())
+
+
+_SAMPLE = 200
+"""Points that stand for a body where its outline matters, not its detail."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    points: Array
+    tree: cKDTree
+    spacing: float
 
 
 def _both(bodies: Sequence[Body], a: int, predicate: str, b: int, confidence: float, margin: float) -> list[Relation]:
@@ -137,13 +163,18 @@ def _sure(margin: float, noise: float) -> float:
 def _supports(scene: _Scene, taken: set[int]) -> list[_Found]:
     """Each thing on at most one other: the one whose surface it touches best."""
     out = []
+    holds = [n for n, b in enumerate(scene.bodies) if b.structure not in ("wall", "ceiling")]
     for a, body in enumerate(scene.bodies):
         if a in taken or body.structure is not None:
             continue
         best: _Found | None = None
-        for b in range(len(scene.bodies)):
-            holds = a != b and scene.bodies[b].structure not in ("wall", "ceiling")
-            if not holds or scene.box_gap[a, b] > _contact(scene, a) + 0.05 * scene.unit:
+        reach = _contact(scene, a) + 0.05 * scene.unit
+        middle = body.points[:, :2].mean(axis=0)
+        for b in holds:
+            if a == b or scene.box_gap[a, b] > reach or scene.low[b, 2] > scene.low[a, 2] + reach:
+                continue
+            aside = np.maximum(scene.low[b, :2] - middle, middle - scene.high[b, :2]).max()
+            if aside > 0.25 * scene.unit:
                 continue
             found = _stands_on(scene, a, b)
             if found is not None and (best is None or found[2] > best[2]):
@@ -231,6 +262,7 @@ def _containments(scene: _Scene) -> list[_Found]:
             (float(np.prod(scene.bodies[b].box.size)), b)
             for b in range(len(scene.bodies))
             if a != b and scene.bodies[b].structure is None and scene.box_gap[a, b] == 0.0
+            if np.prod(body.box.size) <= 0.7 * np.prod(scene.bodies[b].box.size)
         ]
         for _, b in sorted(holders):
             found = _enclosed(scene, a, b)
@@ -243,8 +275,6 @@ def _containments(scene: _Scene) -> list[_Found]:
 def _enclosed(scene: _Scene, a: int, b: int) -> _Found | None:
     """Whether b's box holds a and b has sides round a: a shelf or a box does, a seat or a table top does not."""
     subject, holder = scene.bodies[a], scene.bodies[b]
-    if np.prod(subject.box.size) > 0.7 * np.prod(holder.box.size):
-        return None
     local = (subject.points - holder.box.center) @ holder.box.rotation
     inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
     if inside < scene.s.inside:
@@ -276,9 +306,11 @@ def _overhead(scene: _Scene, holding: set[tuple[int, int]]) -> list[Relation]:
         for b, lower in enumerate(scene.bodies):
             if a == b or (a, b) in holding or upper.structure is not None or lower.structure is not None:
                 continue
-            if scene.box_gap[a, b] > s.above_m * unit or scene.high[a, 2] <= scene.high[b, 2]:
+            if scene.high[a, 2] <= scene.high[b, 2] or scene.low[a, 2] - scene.high[b, 2] > s.above_m * unit:
                 continue
-            found = _over(upper, lower, unit)
+            if not np.isfinite(scene.box_gap[a, b]) or not scene.footprints_meet(a, b, 0.0):
+                continue
+            found = _over(scene.plan(a), scene.plan(b), unit)
             if found is None:
                 continue
             share, covered, gap = found
@@ -293,18 +325,17 @@ def _overhead(scene: _Scene, holding: set[tuple[int, int]]) -> list[Relation]:
     return out
 
 
-def _over(upper: Body, lower: Body, unit: float) -> tuple[float, float, float] | None:
+def _over(upper: _Plan, lower: _Plan, unit: float) -> tuple[float, float, float] | None:
     """How far one thing is over another: (share of the smaller footprint where it is, share of the lower one's points
     that it covers, clearance there), None where it is nowhere.
     """
-    low, high = (b.points[:: max(1, len(b.points) // 200)] for b in (lower, upper))
-    reach = max(0.03 * unit, 1.5 * max(_spacing(low), _spacing(high)))
-    covered = float((neighbours_of(low[:, :2], cKDTree(high[:, :2]))[0][:, 0] < reach).mean())
-    back, under = neighbours_of(high[:, :2], cKDTree(low[:, :2]))
+    reach = max(0.03 * unit, 1.5 * max(upper.spacing, lower.spacing))
+    covered = float((neighbours_of(lower.points[:, :2], upper.tree)[0][:, 0] < reach).mean())
+    back, under = neighbours_of(upper.points[:, :2], lower.tree)
     hit = back[:, 0] < reach
     if not hit.any():
         return None
-    gap = float(np.quantile(high[hit, 2], 0.1) - np.quantile(low[under[hit, 0], 2], 0.9))
+    gap = float(np.quantile(upper.points[hit, 2], 0.1) - np.quantile(lower.points[under[hit, 0], 2], 0.9))
     return max(covered, float(hit.mean())), covered, gap
 
 
@@ -339,7 +370,7 @@ def _beside(scene: _Scene, holding: set[tuple[int, int]], gravity_known: bool) -
     for at, a in enumerate(things):
         for b in things[at + 1 :]:
             mean = 0.5 * (scene.bodies[a].size + scene.bodies[b].size)
-            near = _clamp(2.0 * mean, s.near_m, unit)
+            near = _clamp(2.0 * min(scene.bodies[a].size, scene.bodies[b].size), s.near_m, unit)
             if (a, b) in holding or scene.box_gap[a, b] > near:
                 continue
             gap = scene.gap(a, b)

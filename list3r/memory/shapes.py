@@ -72,6 +72,8 @@ class ChunkShapes:
     """Grid of each instance. Shape (N,)."""
     grain: float
     """Edge of the finest cells, chunk units."""
+    unit: float
+    """What a metre is in chunk units."""
     center: Array
     """Middle of the trimmed extents. Shape (N, 3)."""
     size: Array
@@ -146,6 +148,7 @@ def chunk_shapes(
         cell_owner=owners[order],
         level=level,
         grain=grain,
+        unit=unit,
         center=center,
         size=size,
         cell_count=count,
