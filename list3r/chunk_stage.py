@@ -17,8 +17,8 @@ from list3r.frames.base import BadFrame, Camera, Frame, FrameSource
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.library import build_library
-from list3r.instances.settings import InstanceSettings
 from list3r.instances.overlays import draw_debug
+from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.records import ChunkResult, Keyframe, LocalLibrary, OverlapSamples
 from list3r.reconstruction.base import Reconstruction, Reconstructor

@@ -122,9 +122,13 @@ class SceneMemory:
 
         return merge_graph(self.store)
 
-    def export(self, format: str, path: str | Path) -> None:
-        """Write the memory in a format: json, usd, ply, glb, tum, plan. Raises `OptionError` and `ExportError`."""
-        export_memory(self.store, format, path)
+    def export(self, format: str, path: str | Path) -> tuple[Path, ...]:
+        """Write the memory in a format: json, usd, ply, glb, tum, plan. Raises `OptionError` and `ExportError`.
+
+        Returns the files written: `path`, and more beside it where parts of the memory could not be joined.
+        """
+        with self.store.snapshot():
+            return export_memory(self.store, format, path)
 
     def close(self) -> None:
         """Close the file."""

@@ -60,7 +60,7 @@ def _remove_unfinished(walk: Path) -> None:
     """Take away what an interrupted demo left: only files and folders that the simulation writes."""
     import shutil
 
-    for name in ("rgb", "depth"):
+    for name in ("rgb", "depth", "ids"):
         shutil.rmtree(walk / name, ignore_errors=True)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "truth.json"):
         (walk / name).unlink(missing_ok=True)

@@ -28,12 +28,12 @@ def export(
     Example: list3r export house.l3r --to usd --out house.usda
     """
     with open_memory(memory) as scene:
-        scene.export(to, out)
-    size = out.stat().st_size
+        written = scene.export(to, out)
+    sizes = {str(path): path.stat().st_size for path in written}
     if json:
-        print_json({"format": to, "path": str(out), "bytes": size})
+        print_json({"format": to, "path": str(out), "bytes": sizes[str(out)], "files": sizes})
     else:
-        print(f"{out}  {size / 1e6:.2f} MB")
+        print("\n".join(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
 
 
 def verify(memory: MemoryArgument, json: JsonOption = False) -> None:

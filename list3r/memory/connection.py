@@ -125,6 +125,19 @@ class Connection:
                 self._database.execute("ROLLBACK")
             raise MemoryFileError(_explain(self.path, error)) from error
 
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All that is read inside belongs to one state of the memory, whatever a writer commits meanwhile."""
+        if self._database.in_transaction:
+            yield
+            return
+        self._database.execute("BEGIN")
+        try:
+            yield
+        finally:
+            if self._database.in_transaction:
+                self._database.execute("COMMIT")
+
     def get_value(self, key: str, default: Any = None) -> Any:
         """A value of the key-value table, decoded from JSON.
 
