@@ -46,6 +46,12 @@ def pack(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((shifted[:, 0] << (2 * _BITS)) | (shifted[:, 1] << _BITS) | shifted[:, 2])
 
 
+def unpack(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Grid coordinates of keys, the inverse of `pack`. Shape (N,) -> (N, 3)."""
+    low = (1 << _BITS) - 1
+    return np.stack([keys >> (2 * _BITS), (keys >> _BITS) & low, keys & low], axis=1) - _OFFSET
+
+
 def key_shift(offset: tuple[int, int, int]) -> int:
     """What to add to a key to get that of a neighbouring cell."""
     return (offset[0] << (2 * _BITS)) + (offset[1] << _BITS) + offset[2]

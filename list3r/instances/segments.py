@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.cloud import Cloud
+from list3r.instances.clutter import split_crowds
 from list3r.instances.planes import find_planes, plane_tolerance
 from list3r.instances.settings import SegmentSettings
 from list3r.instances.sheets import find_sheets
@@ -52,6 +53,7 @@ def segment_cloud(
     labels = assign_surfaces(scene, surfaces)
     labels = connect_rest(scene, surfaces, labels)
     labels = attach_parts(scene, surfaces, labels)
+    labels = split_crowds(scene, surfaces, labels)
     labels = adopt_fragments(scene, surfaces, labels)
     labels = drop_junk(scene, surfaces, labels)
     labels, sheets = find_sheets(scene, surfaces, labels)
