@@ -20,8 +20,10 @@ from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.mapping import add_chunk
+from list3r.memory.codec import to_json
+from list3r.memory.connection import remove_memory
 from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
-from list3r.memory.records import Session
+from list3r.memory.records import ChunkResult
 from list3r.memory.store import Store
 from list3r.workers import OrderedPool, default_workers
 
@@ -89,7 +91,7 @@ def build(
     count = min(workers or default_workers(), len(spans))
     pool = OrderedPool(process_chunk, count)
     try:
-        with _open_target(Path(memory), resume=resume, force=force) as target:
+        with _open_target(Path(memory), info, settings, resume=resume, force=force) as target:
             session = _session(target.store, info, settings)
             done = {c.index for c in target.store.chunks(session)}
             tasks = [
@@ -107,18 +109,18 @@ def _add_all(
     target: _Target,
     session: int,
     tasks: list[ChunkTask],
-    pool: OrderedPool,
+    pool: OrderedPool[ChunkTask, ChunkResult],
     info: SourceInfo,
     progress: Progress | None,
 ) -> None:
     bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
-    for task, result in zip(tasks, pool.map(tasks), strict=True):
+    for span, result in zip((t.span for t in tasks), pool.map(tasks), strict=True):
         bad.update(index for index, _ in result.bad_frames)
         check_bad_share(len(bad), info.frame_count)
         add_chunk(target.store, session, result)
         target.keep()
         if progress is not None:
-            progress(task.span.stop, info.frame_count)
+            progress(span.stop, info.frame_count)
 
 
 def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:
@@ -171,12 +173,12 @@ class _Target:
     ) -> None:
         self.store.close()
         if kind is not None and self._fresh:
-            self.store.path.unlink(missing_ok=True)
+            remove_memory(self.store.path)
             if self._replaced is not None:
                 self._replaced.rename(self.store.path)
 
 
-def _open_target(path: Path, *, resume: bool, force: bool) -> _Target:
+def _open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume: bool, force: bool) -> _Target:
     if path.is_dir():
         raise MemoryFileError(f"{path} is a folder; name a file for the memory, such as {path / 'memory.l3r'}")
     if path.exists() and path.stat().st_size == 0:
@@ -184,6 +186,8 @@ def _open_target(path: Path, *, resume: bool, force: bool) -> _Target:
     if not path.exists():
         return _Target(Store.create(path), fresh=True)
     if resume and not force:
+        with Store.open(path) as store:
+            _check_same(store, info, settings)
         return _Target(Store.open(path, writable=True), fresh=False)
     if not force:
         raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
@@ -195,10 +199,8 @@ def _open_target(path: Path, *, resume: bool, force: bool) -> _Target:
 
 def _session(store: Store, info: SourceInfo, settings: BuildSettings) -> int:
     """The session to write to: a new one, or the one that a build before left unfinished."""
-    wanted = json.loads(json.dumps(asdict(settings)))
     sessions = store.sessions()
     if sessions:
-        _check_same(sessions[0], info, wanted, store)
         return sessions[0].session_id
     with store.transaction():
         store.set_value("created_by", f"list3r {__version__}")
@@ -206,21 +208,24 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings) -> int:
         store.set_value("scale_source", "sensor depth" if info.has_depth else "none")
         store.set_value("gravity", "unknown")
         store.set_value("poses", settings.poses)
-        return store.add_session(str(Path(info.path).resolve()), info.fingerprint, wanted, info.frame_count)
+        return store.add_session(str(Path(info.path).resolve()), info.fingerprint, asdict(settings), info.frame_count)
 
 
-def _check_same(session: Session, info: SourceInfo, wanted: dict[str, object], store: Store) -> None:
-    if session.fingerprint != info.fingerprint:
-        raise OptionError(
-            f"{store.path} was begun from {session.source} with other frames or camera options; "
-            "give the same source and options to --resume, or --force to begin anew"
-        )
-    different = sorted(k for k in wanted if session.settings.get(k) != wanted[k])
-    if different:
-        raise OptionError(
-            f"{store.path} was begun with other settings ({', '.join(different)}); "
-            "give the same ones to --resume, or --force to begin anew"
-        )
+def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None:
+    """Raise `OptionError` when a memory was begun from another source or with other settings."""
+    for session in store.sessions():
+        if session.fingerprint != info.fingerprint:
+            raise OptionError(
+                f"{store.path} was begun from {session.source} with other frames or camera options; "
+                "give the same source and options to --resume, or --force to begin anew"
+            )
+        wanted = json.loads(to_json(asdict(settings)))
+        different = sorted(k for k in wanted if session.settings.get(k) != wanted[k])
+        if different:
+            raise OptionError(
+                f"{store.path} was begun with other settings ({', '.join(different)}); "
+                "give the same ones to --resume, or --force to begin anew"
+            )
 
 
 def _finish(

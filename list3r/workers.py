@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 from list3r.memory.errors import List3rError
 
@@ -31,7 +31,7 @@ def default_workers() -> int:
     return max(1, min(cores, DEFAULT_LIMIT))
 
 
-class OrderedPool:
+class OrderedPool(Generic[Task, Result]):
     """Runs one function over tasks in processes; results come in the order of the tasks.
 
     The processes are started afresh (spawned), so that they share neither locks nor half-used threads with the caller.

@@ -130,7 +130,7 @@ CASES = {
     "newer schema": ("list {p}/newer.l3r", "schema version 99"),
     "torn file": ("list {p}/torn.l3r", "torn.l3r"),
     "unknown id": ("show {p}/room.l3r 77", "no instance 77"),
-    "id that is no number": ("show {p}/room.l3r mug", "mug"),
+    "id that is no number": ("show {p}/room.l3r mug", "ID.*integer"),
     "nearest to an unknown id": ("query nearest {p}/room.l3r --id 77", "no instance 77"),
     "nearest to nothing": ("query nearest {p}/room.l3r", "--point|--id"),
     "nearest to half a point": ("query nearest {p}/room.l3r --point 1,2", "--point.*three numbers"),

@@ -26,8 +26,8 @@ app = typer.Typer(
 for module in (build_commands, memory_commands, query_commands, file_commands, evaluation_commands):
     module.register(app)
 
-_USAGE_ERROR = typer.BadParameter.__mro__[1]
-_COMMAND_ERROR = typer.BadParameter.__mro__[2]
+_USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
+_COMMAND_ERROR: type[Exception] = typer.BadParameter.__mro__[2]
 
 
 @app.callback(invoke_without_command=True)

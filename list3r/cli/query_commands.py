@@ -42,10 +42,18 @@ def nearest(
 
     Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
     """
-    filters = {"k": k, "max_distance": max_distance, "min_confidence": min_confidence, "structure": structure}
+    filters: dict[str, Any] = {
+        "k": k,
+        "max_distance": max_distance,
+        "min_confidence": min_confidence,
+        "structure": structure,
+    }
     with open_memory(memory) as scene:
+        from list3r.memory.errors import OptionError
         from list3r.queries.nearest import nearest as find
 
+        if words is None and point is None and id is None:
+            raise OptionError("say what to be near to: --point x,y,z, --id ID, or words such as mug")
         origin = None if point is None else parse_point(point, "--point")
         matches = find(scene.store, words=words, point=origin, instance_id=id, **filters)
         _print_matches(matches, scene.units, json)

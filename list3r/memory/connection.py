@@ -42,7 +42,7 @@ class Connection:
         try:
             return cls._connect(path, writable=True, fresh=True)
         except BaseException:
-            path.unlink(missing_ok=True)
+            remove_memory(path)
             raise
 
     @classmethod
@@ -86,7 +86,7 @@ class Connection:
                 _migrate(database, version, fresh)
         except sqlite3.DatabaseError as error:
             _release(database, lock)
-            raise MemoryFileError(f"{path} cannot be opened: {error}; try `list3r verify {path}`") from error
+            raise MemoryFileError(_explain(path, error)) from error
         except BaseException:
             _release(database, lock)
             raise
@@ -158,10 +158,16 @@ class Connection:
             raise MemoryFileError(_explain(self.path, error)) from error
 
 
+def remove_memory(path: Path) -> None:
+    """Delete a memory file and the write-ahead log beside it."""
+    for part in (path, Path(f"{path}-wal"), Path(f"{path}-shm")):
+        part.unlink(missing_ok=True)
+
+
 def _explain(path: Path, error: sqlite3.Error) -> str:
     text = str(error)
-    if "full" in text:
-        return f"the disk is full: {path} could not grow; free some space and go on with --resume"
+    if "full" in text or "disk I/O" in text:
+        return f"{path} could not be written, the disk is full or failing ({text}); free some space and go on"
     if "readonly" in text:
         return f"{path} is read-only; make it writable or copy it"
     if "locked" in text:
