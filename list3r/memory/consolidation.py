@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from weakref import WeakKeyDictionary
@@ -18,7 +19,7 @@ from list3r.memory.identities import Identities, assign_ids
 from list3r.memory.merging import Key, MergeSettings, PairScores, merge_nodes, pair_scores
 from list3r.memory.planes import place_planes
 from list3r.memory.records import ChunkRow, Instance, MergeDecision, Observation, Relation
-from list3r.memory.relations import RelationSettings, relations
+from list3r.memory.relations import Measured, RelationSettings, relations
 from list3r.memory.store import Store
 from list3r.memory.structure import StructureSettings, classify_structure, flagged_only
 from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, world_unit
@@ -149,6 +150,11 @@ def _at(summaries: Mapping[int, ChunkSummary], key: Key) -> int:
 # ---------------------------------------------------------------------------------------------- deriving
 
 
+_derived: WeakKeyDictionary[Store, dict[tuple[object, ...], Thing]] = WeakKeyDictionary()
+_measured: WeakKeyDictionary[Store, dict[tuple[object, ...], object]] = WeakKeyDictionary()
+_stamps = itertools.count(1)
+
+
 def _things(
     store: Store,
     groups: Sequence[Sequence[Key]],
@@ -159,19 +165,30 @@ def _things(
     s: ConsolidationSettings,
 ) -> list[Thing]:
     rows = {c.chunk_id: c for c in chunks}
+    placed = {c.chunk_id: _rounded(c.S_world_chunk, world_unit([c], summaries)) for c in chunks}
+    checks = store.chunk_checksums()
     upright = _gravity_known(store)
     first = min(c.component for c in chunks)
+    before: dict[tuple[object, ...], Thing] = _derived.get(store, {})
+    known: dict[tuple[object, ...], Thing] = {}
     out = []
     for group, instance_id, seen in zip(groups, ids.of_group, evidence, strict=True):
         if instance_id is None:
             continue
-        members = [
-            Member(summaries[k[0]].shapes, _at(summaries, k), rows[k[0]].S_world_chunk, rows[k[0]].image_size)
-            for k in group
-        ]
         component = rows[group[0][0]].component
         up = upright and component == first
-        out.append(derive_thing(instance_id, members, component, seen.agreement, upright=up, settings=s.derive))
+        poses = tuple((checks[k], placed[k].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
+        key: tuple[object, ...] = (instance_id, component, up, seen.agreement, tuple(group), poses)
+        if key not in before:
+            members = [
+                Member(summaries[k[0]].shapes, _at(summaries, k), placed[k[0]], rows[k[0]].image_size) for k in group
+            ]
+            thing = derive_thing(instance_id, members, component, seen.agreement, upright=up, settings=s.derive)
+            known[key] = replace(thing, body=replace(thing.body, stamp=next(_stamps)))
+        else:
+            known[key] = before[key]
+        out.append(known[key])
+    _derived[store] = known
     return sorted(out, key=lambda t: t.body.id)
 
 
@@ -209,10 +226,12 @@ def _relations(
     first = min(c.component for c in chunks)
     unit = world_unit(chunks, summaries)
     out: list[Relation] = []
+    cache = Measured(_measured.get(store, {}))
     for component in sorted({c.component for c in chunks}):
         bodies = [t.body for t in things if t.body.component == component]
         vertical = _gravity_known(store) and component == first
-        out += relations(bodies, gravity_known=vertical, unit=unit, settings=s.relations)
+        out += relations(bodies, gravity_known=vertical, unit=unit, settings=s.relations, measured=cache)
+    _measured[store] = cache.used
     return out
 
 

@@ -27,7 +27,9 @@ class DeriveSettings:
     flat: float = 0.15
     """Thickness over the second longest extent of what is flat."""
     confirmed: float = 0.25
-    """Share of the members, where there are at least four whole views, that must have a surface at a point."""
+    """Share of the members that must have a surface at a point of a small thing of at least four whole views."""
+    small_m: float = 0.5
+    """Diagonal of a small thing; of a larger one each chunk sees another part."""
     border_px: float = 3.0
 
 
@@ -111,7 +113,8 @@ def _confirmed(
     """
     whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
     need = int(np.ceil(s.confirmed * whole.sum()))
-    if whole.sum() < 4 or whole.mean() < 0.7 or need < 2:
+    size = float(np.median([m.shapes.size[m.at] / m.shapes.unit for m in members]))
+    if whole.sum() < 4 or whole.mean() < 0.7 or need < 2 or size > s.small_m:
         return np.arange(len(points))
     grain = 2.0 * members[0].shapes.grain * float(members[0].S_world_chunk.scale)
     cells = np.floor((points - points.min(axis=0)) / grain).astype(np.int64) + 1

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,10 @@ class GravitySettings:
     """Share of all support points that may lie under the floor."""
     floor_camera_height_m: float = 0.8
     """A level surface that the cameras come nearer to than this is a table, not the floor."""
+    settled_deg: float = 0.4
+    """An estimate that differs by less from the one before is not worth moving the world for."""
+    settled_m: float = 0.02
+    """The same for the height of the floor."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +164,11 @@ def floor_height(
 def estimate_gravity(store: Store, settings: GravitySettings | None = None) -> Gravity:
     """Up in the frame in which the store's chunks lie now, from the first component (see `ChunkRow.component`).
 
-    Call it while the chunks are placed by the pose graph alone; `world_from_graph` then gives what stands them upright.
+    Call it inside a transaction, while the chunks are placed by the pose graph alone; `world_from_graph` then gives
+    what stands them upright. An estimate that still agrees with the one before within `settled_deg` gives way to
+    that one, so that the world does not tremble with every chunk.
     """
+    s = settings or GravitySettings()
     chunks = store.chunks()
     if not chunks:
         return Gravity("unknown", np.array([0.0, 0.0, 1.0]), np.inf, 0.0, 0.0, None, "the memory is empty")
@@ -168,7 +176,24 @@ def estimate_gravity(store: Store, settings: GravitySettings | None = None) -> G
     summaries = chunk_summaries(store)
     inside = [c for c in chunks if c.component == component]
     planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in inside])
-    return gravity_from_planes(planes, cameras_of(store, inside), world_unit(inside, summaries), settings)
+    unit = world_unit(inside, summaries)
+    found = gravity_from_planes(planes, cameras_of(store, inside), unit, s)
+    settled = _settled(found, store.get_value("gravity_estimate"), unit, s)
+    if settled is found and found.status != "unknown":
+        store.set_value("gravity_estimate", {"up": found.up.tolist(), "floor_height": found.floor_height})
+    return settled
+
+
+def _settled(found: Gravity, before: dict[str, Any] | None, unit: float, s: GravitySettings) -> Gravity:
+    """The estimate before where it holds still, else the one found now."""
+    if found.status == "unknown" or before is None or (before["floor_height"] is None) != (found.floor_height is None):
+        return found
+    up = np.array(before["up"])
+    turned = float(np.degrees(np.arccos(np.clip(up @ found.up, -1.0, 1.0))))
+    risen = 0.0 if found.floor_height is None else abs(found.floor_height - before["floor_height"])
+    if turned > s.settled_deg or risen > s.settled_m * unit:
+        return found
+    return replace(found, up=up, floor_height=before["floor_height"])
 
 
 def world_from_graph(gravity: Gravity) -> Sim3:

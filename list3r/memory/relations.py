@@ -8,8 +8,10 @@ wherever `next_to` holds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
@@ -17,6 +19,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from list3r.memory.bodies import Body, neighbours_of
 from list3r.memory.geometry import Array
 from list3r.memory.records import Relation
+
+T = TypeVar("T")
 
 INVERSE = {
     "on": "supports",
@@ -59,16 +63,39 @@ class RelationSettings:
     attached_m: float = 0.05
 
 
+class Measured:
+    """What was measured between pairs of bodies before, by their stamps: a run computes only what is new."""
+
+    def __init__(self, known: dict[tuple[object, ...], object] | None = None) -> None:
+        self._known = known or {}
+        self.used: dict[tuple[object, ...], object] = {}
+
+    def get(self, what: str, a: Body, b: Body, compute: Callable[[], T]) -> T:
+        """The measure `what` of a and b, computed if it is new."""
+        if not (a.stamp and b.stamp):
+            return compute()
+        key = (what, a.stamp, b.stamp, a.structure, b.structure)
+        if key not in self.used:
+            self.used[key] = self._known[key] if key in self._known else compute()
+        return cast(T, self.used[key])
+
+
 def relations(
-    bodies: Sequence[Body], *, gravity_known: bool, unit: float = 1.0, settings: RelationSettings | None = None
+    bodies: Sequence[Body],
+    *,
+    gravity_known: bool,
+    unit: float = 1.0,
+    settings: RelationSettings | None = None,
+    measured: Measured | None = None,
 ) -> list[Relation]:
     """All relations among bodies, in the order of (subject, predicate, object).
 
     `unit` is what a metre is in world units (1 for a metric memory). Bodies of different components have none.
+    `measured` holds what a run before found for the same bodies, unit and settings.
     """
     s = settings or RelationSettings()
     bodies = sorted(bodies, key=lambda b: b.id)
-    scene = _Scene(bodies, unit, s)
+    scene = _Scene(bodies, unit, s, measured or Measured())
     out: list[Relation] = []
     holding: set[tuple[int, int]] = set()
     if gravity_known:
@@ -86,17 +113,21 @@ def relations(
 
 _Found = tuple[int, int, float, float]
 """Subject and object by position, confidence, margin."""
+_Held = tuple[int, float, float]
+"""Object by position, confidence, margin."""
+_Sure = tuple[float, float]
+"""Confidence, margin."""
 
 
 class _Scene:
     """Bodies with what is derived from them once."""
 
-    def __init__(self, bodies: Sequence[Body], unit: float, settings: RelationSettings) -> None:
+    def __init__(self, bodies: Sequence[Body], unit: float, settings: RelationSettings, measured: Measured) -> None:
         self.bodies = bodies
+        self._measured = measured
         self.unit = unit
         self.s = settings
         self._trees: dict[int, cKDTree] = {}
-        self._gaps: dict[tuple[int, int], float] = {}
         self._plans: dict[int, _Plan] = {}
         low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
         high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
@@ -105,6 +136,8 @@ class _Scene:
         component = np.array([b.component for b in bodies])
         self.box_gap[component[:, None] != component[None]] = np.inf
         self.low, self.high = low, high
+        self.size = np.array([b.size for b in bodies])
+        self.thing = np.array([b.structure is None for b in bodies], dtype=bool)
 
     def tree(self, n: int) -> cKDTree:
         """KD-tree of a body's points."""
@@ -112,13 +145,13 @@ class _Scene:
             self._trees[n] = cKDTree(self.bodies[n].points)
         return self._trees[n]
 
+    def measure(self, what: str, a: int, b: int, compute: Callable[[_Scene, int, int], T]) -> T:
+        """A measure of two bodies, from memory where it is known."""
+        return self._measured.get(what, self.bodies[a], self.bodies[b], lambda: compute(self, a, b))
+
     def gap(self, a: int, b: int) -> float:
         """Distance between surfaces: of the nearest support points."""
-        key = (min(a, b), max(a, b))
-        if key not in self._gaps:
-            small, large = sorted(key, key=lambda n: (len(self.bodies[n].points), n))
-            self._gaps[key] = float(neighbours_of(self.plan(small).points, self.tree(large))[0].min())
-        return self._gaps[key]
+        return self.measure("gap", min(a, b), max(a, b), _gap)
 
     def plan(self, n: int) -> _Plan:
         """A body as it is seen from above."""
@@ -128,11 +161,10 @@ class _Scene:
             self._plans[n] = _Plan(sample, cKDTree(sample[:, :2]), _spacing(sample))
         return self._plans[n]
 
-    def footprints_meet(self, a: int, b: int, slack: float) -> bool:
-        """Whether the axis-aligned footprints of two bodies come within `slack` of each other."""
-        low = np.maximum(self.low[a, :2], self.low[b, :2])
-        high = np.minimum(self.high[a, :2], self.high[b, :2])
-        return bool((low <= high + slack).all())
+
+def _gap(scene: _Scene, a: int, b: int) -> float:
+    small, large = sorted((a, b), key=lambda n: (len(scene.bodies[n].points), n))
+    return float(neighbours_of(scene.plan(small).points, scene.tree(large))[0].min())
 
 
 _SAMPLE = 200
@@ -148,13 +180,13 @@ class _Plan:
 
 def _both(bodies: Sequence[Body], a: int, predicate: str, b: int, confidence: float, margin: float) -> list[Relation]:
     x, y = bodies[a].id, bodies[b].id
-    c, m = round(float(np.clip(confidence, 0, 1)), 4), round(float(margin), 5)
+    c, m = round(min(max(confidence, 0.0), 1.0), 4), round(margin, 5)
     return [Relation(x, predicate, y, c, m), Relation(y, INVERSE[predicate], x, c, m)]
 
 
 def _sure(margin: float, noise: float) -> float:
     """How likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
-    return float(1.0 / (1.0 + np.exp(-1.7 * margin / max(noise, 1e-12))))
+    return 1.0 / (1.0 + math.exp(-min(1.7 * margin / max(noise, 1e-12), 700.0)))
 
 
 # ---------------------------------------------------------------------------------------------- on
@@ -163,24 +195,23 @@ def _sure(margin: float, noise: float) -> float:
 def _supports(scene: _Scene, taken: set[int]) -> list[_Found]:
     """Each thing on at most one other: the one whose surface it touches best."""
     out = []
-    holds = [n for n, b in enumerate(scene.bodies) if b.structure not in ("wall", "ceiling")]
+    holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.bodies], dtype=bool)
     for a, body in enumerate(scene.bodies):
         if a in taken or body.structure is not None:
             continue
-        best: _Found | None = None
+        best: _Held | None = None
         reach = _contact(scene, a) + 0.05 * scene.unit
         middle = body.points[:, :2].mean(axis=0)
-        for b in holds:
-            if a == b or scene.box_gap[a, b] > reach or scene.low[b, 2] > scene.low[a, 2] + reach:
-                continue
-            aside = np.maximum(scene.low[b, :2] - middle, middle - scene.high[b, :2]).max()
-            if aside > 0.25 * scene.unit:
-                continue
-            found = _stands_on(scene, a, b)
-            if found is not None and (best is None or found[2] > best[2]):
-                best = found
+        aside = np.maximum(scene.low[:, :2] - middle, middle - scene.high[:, :2]).max(axis=1)
+        near = holds & (scene.box_gap[a] <= reach) & (scene.low[:, 2] <= scene.low[a, 2] + reach)
+        near &= aside <= 0.25 * scene.unit
+        near[a] = False
+        for b in np.flatnonzero(near).tolist():
+            found = scene.measure("on", a, b, _stands_on)
+            if found is not None and (best is None or found[0] > best[1]):
+                best = (b, *found)
         if best is not None:
-            out.append(best)
+            out.append((a, *best))
     on = {a: b for a, b, _, _ in out}
     base = [float(np.prod(b.box.size[:2])) for b in scene.bodies]
     return [f for f in out if not (on.get(f[1]) == f[0] and (base[f[0]], f[0]) > (base[f[1]], f[1]))]
@@ -191,7 +222,7 @@ def _contact(scene: _Scene, a: int) -> float:
     return scene.s.contact_m * scene.unit + scene.s.contact_per_height * min(height, scene.unit)
 
 
-def _stands_on(scene: _Scene, a: int, b: int) -> _Found | None:
+def _stands_on(scene: _Scene, a: int, b: int) -> _Sure | None:
     """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
     subject, other = scene.bodies[a], scene.bodies[b]
     z = subject.points[:, 2]
@@ -222,7 +253,7 @@ def _stands_on(scene: _Scene, a: int, b: int) -> _Found | None:
     noise = scene.s.noise_m * scene.unit
     below = float((other.points[:, 2] <= float(np.median(z))).mean()) if other.structure is None else 1.0
     confidence = _sure(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, close)
-    return a, b, confidence, margin
+    return confidence, margin
 
 
 def _steady(subject: Body, close: Array) -> float:
@@ -265,14 +296,14 @@ def _containments(scene: _Scene) -> list[_Found]:
             if np.prod(body.box.size) <= 0.7 * np.prod(scene.bodies[b].box.size)
         ]
         for _, b in sorted(holders):
-            found = _enclosed(scene, a, b)
+            found = scene.measure("in", a, b, _enclosed)
             if found is not None:
-                out.append(found)
+                out.append((a, b, *found))
                 break
     return out
 
 
-def _enclosed(scene: _Scene, a: int, b: int) -> _Found | None:
+def _enclosed(scene: _Scene, a: int, b: int) -> _Sure | None:
     """Whether b's box holds a and b has sides round a: a shelf or a box does, a seat or a table top does not."""
     subject, holder = scene.bodies[a], scene.bodies[b]
     local = (subject.points - holder.box.center) @ holder.box.rotation
@@ -292,7 +323,7 @@ def _enclosed(scene: _Scene, a: int, b: int) -> _Found | None:
     if share < scene.s.enclosed or floor < 3:
         return None
     margin = (share - scene.s.enclosed) * float(np.min(subject.box.size[:2]))
-    return a, b, inside * min(1.0, 0.5 + share / 2), margin
+    return inside * min(1.0, 0.5 + share / 2), margin
 
 
 # ---------------------------------------------------------------------------------------------- above, below, under
@@ -302,34 +333,33 @@ def _overhead(scene: _Scene, holding: set[tuple[int, int]]) -> list[Relation]:
     """above and below for things apart in height, under for what stands beneath a surface of another."""
     s, unit = scene.s, scene.unit
     out: list[Relation] = []
-    for a, upper in enumerate(scene.bodies):
-        for b, lower in enumerate(scene.bodies):
-            if a == b or (a, b) in holding or upper.structure is not None or lower.structure is not None:
-                continue
-            if scene.high[a, 2] <= scene.high[b, 2] or scene.low[a, 2] - scene.high[b, 2] > s.above_m * unit:
-                continue
-            if not np.isfinite(scene.box_gap[a, b]) or not scene.footprints_meet(a, b, 0.0):
-                continue
-            found = _over(scene.plan(a), scene.plan(b), unit)
-            if found is None:
-                continue
-            share, covered, gap = found
-            noise = s.noise_m * unit
-            if gap < 2.0 * noise or gap > s.above_m * unit:
-                continue
-            sure = _sure(gap - 2.0 * noise, noise) * min(1.0, 0.5 + share / 2)
-            if covered >= s.overhead and scene.low[a, 2] < scene.high[b, 2]:
-                out.append(Relation(lower.id, "under", upper.id, round(sure, 4), round(gap, 5)))
-            elif share >= s.overhead and scene.low[a, 2] >= scene.low[b, 2]:
-                out += _both(scene.bodies, a, "above", b, sure, gap)
+    low, high = scene.low, scene.high
+    meet = np.all(low[:, None, :2] <= high[None, :, :2], axis=2)
+    pairs = meet & meet.T & np.isfinite(scene.box_gap) & (high[:, None, 2] > high[None, :, 2])
+    pairs &= (low[:, None, 2] - high[None, :, 2] <= s.above_m * unit) & scene.thing[:, None] & scene.thing[None]
+    noise = s.noise_m * unit
+    for a, b in np.argwhere(pairs).tolist():
+        found = None if (a, b) in holding else scene.measure("over", a, b, _over)
+        if found is None:
+            continue
+        share, covered, gap = found
+        if gap < 2.0 * noise or gap > s.above_m * unit:
+            continue
+        sure = _sure(gap - 2.0 * noise, noise) * min(1.0, 0.5 + share / 2)
+        if covered >= s.overhead and low[a, 2] < high[b, 2]:
+            upper, lower = scene.bodies[a].id, scene.bodies[b].id
+            out.append(Relation(lower, "under", upper, round(sure, 4), round(gap, 5)))
+        elif share >= s.overhead and low[a, 2] >= low[b, 2]:
+            out += _both(scene.bodies, a, "above", b, sure, gap)
     return out
 
 
-def _over(upper: _Plan, lower: _Plan, unit: float) -> tuple[float, float, float] | None:
-    """How far one thing is over another: (share of the smaller footprint where it is, share of the lower one's points
+def _over(scene: _Scene, a: int, b: int) -> tuple[float, float, float] | None:
+    """How far a is over b: (share of the smaller footprint where it is, share of the lower one's points
     that it covers, clearance there), None where it is nowhere.
     """
-    reach = max(0.03 * unit, 1.5 * max(upper.spacing, lower.spacing))
+    upper, lower = scene.plan(a), scene.plan(b)
+    reach = max(0.03 * scene.unit, 1.5 * max(upper.spacing, lower.spacing))
     covered = float((neighbours_of(lower.points[:, :2], upper.tree)[0][:, 0] < reach).mean())
     back, under = neighbours_of(upper.points[:, :2], lower.tree)
     hit = back[:, 0] < reach
@@ -364,27 +394,22 @@ def _attached(scene: _Scene, held: set[int]) -> list[Relation]:
 def _beside(scene: _Scene, holding: set[tuple[int, int]], gravity_known: bool) -> list[Relation]:
     """next_to and near, from the gap between surfaces relative to the sizes of the two."""
     s, unit = scene.s, scene.unit
-    things = [n for n, b in enumerate(scene.bodies) if b.structure is None]
     noise = s.noise_m * unit
+    reach = np.clip(2.0 * np.minimum(scene.size[:, None], scene.size[None]), s.near_m[0] * unit, s.near_m[1] * unit)
+    mean = 0.5 * (scene.size[:, None] + scene.size[None])
+    close = np.clip(0.5 * mean, s.next_to_m[0] * unit, s.next_to_m[1] * unit)
+    pairs = np.triu(scene.thing[:, None] & scene.thing[None] & (scene.box_gap <= reach), 1)
     out: list[Relation] = []
-    for at, a in enumerate(things):
-        for b in things[at + 1 :]:
-            mean = 0.5 * (scene.bodies[a].size + scene.bodies[b].size)
-            near = _clamp(2.0 * min(scene.bodies[a].size, scene.bodies[b].size), s.near_m, unit)
-            if (a, b) in holding or scene.box_gap[a, b] > near:
-                continue
-            gap = scene.gap(a, b)
-            if gap > near:
-                continue
-            out += _both(scene.bodies, a, "near", b, _sure(near - gap, noise), near - gap)
-            beside = _clamp(0.5 * mean, s.next_to_m, unit)
-            if gap <= beside and (not gravity_known or _side_by_side(scene, a, b)):
-                out += _both(scene.bodies, a, "next_to", b, _sure(beside - gap, noise), beside - gap)
+    for a, b in np.argwhere(pairs).tolist():
+        if (a, b) in holding:
+            continue
+        gap, near, beside = scene.gap(a, b), float(reach[a, b]), float(close[a, b])
+        if gap > near:
+            continue
+        out += _both(scene.bodies, a, "near", b, _sure(near - gap, noise), near - gap)
+        if gap <= beside and (not gravity_known or _side_by_side(scene, a, b)):
+            out += _both(scene.bodies, a, "next_to", b, _sure(beside - gap, noise), beside - gap)
     return out
-
-
-def _clamp(value: float, bounds: tuple[float, float], unit: float) -> float:
-    return min(max(value, bounds[0] * unit), bounds[1] * unit)
 
 
 def _side_by_side(scene: _Scene, a: int, b: int) -> bool:
