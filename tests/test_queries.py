@@ -1,0 +1,214 @@
+"""Queries: what they find, and what they refuse in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError
+from list3r.memory.store import Store
+from list3r.memory.vectors import VectorIndex
+from list3r.queries.nearest import nearest
+from list3r.queries.relations import relations
+from list3r.queries.similar import similar
+from list3r.queries.within import within
+
+FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
+
+
+@pytest.fixture
+def store(make_memory: Callable[..., Path]) -> Iterator[Store]:
+    with Store.open(make_memory(), writable=True) as opened:
+        yield opened
+
+
+def ids(matches: list[Any]) -> list[int]:
+    return [m.instance.id for m in matches]
+
+
+def test_nearest_to_a_point_is_ordered_by_surfaces_and_gives_both_distances(store: Store) -> None:
+    found = nearest(store, point=(1.8, 0.1, 1.0), k=4)
+    assert ids(found) == [MUG, TABLE, TWIN, CHAIR]
+    assert np.isclose(found[0].distance_m or 0, 1.0 - 0.82, atol=0.02)
+    assert np.isclose(found[0].center_distance_m or 0, 1.0 - 0.77)
+    assert all(a.distance_m <= b.distance_m for a, b in pairwise(found))  # type: ignore[operator]
+    assert "surface" in found[0].reason
+
+
+def test_nearest_agrees_with_brute_force(store: Store) -> None:
+    rng = np.random.default_rng(0)
+    for point in rng.uniform([0, -2, 0], [4, 2, 2], (20, 3)):
+        brute = {
+            i.id: float(np.linalg.norm(store.support(i.id).points - point, axis=1).min()) for i in store.instances()
+        }
+        found = nearest(store, point=point, k=6, structure=True)
+        assert len(found) == 6
+        for m in found:
+            assert np.isclose(m.distance_m or 0, brute[m.instance.id], atol=1e-6)
+
+
+def test_nearest_to_an_instance_leaves_itself_out_and_takes_aliases(store: Store) -> None:
+    assert ids(nearest(store, instance_id=MUG, k=2)) == [TABLE, TWIN]
+    with store.transaction():
+        store.drop_instance(TWIN, alias_of=MUG)
+    assert ids(nearest(store, instance_id=TWIN, k=1)) == [TABLE]
+
+
+def test_structure_answers_only_when_asked_for(store: Store) -> None:
+    assert WALL not in ids(nearest(store, point=(3.9, 0, 1), k=9))
+    assert ids(nearest(store, point=(3.9, 0, 1), k=1, structure=True)) == [WALL]
+
+
+def test_filters_narrow_the_answer(store: Store) -> None:
+    assert ids(nearest(store, point=(1.8, 0.1, 1.0), k=9, max_distance=0.2)) == [MUG]
+    assert nearest(store, point=(1.8, 0.1, 1.0), min_confidence=0.95) == []
+    assert nearest(store, point=(1.8, 0.1, 1.0), state="removed") == []
+    assert len(nearest(store, point=(1.8, 0.1, 1.0), state="present")) == 4
+
+
+def test_words_find_labels_and_descriptions(store: Store) -> None:
+    assert ids(nearest(store, words="mug")) == [MUG, TWIN]
+    assert ids(nearest(store, words="the cups")) == [MUG, TWIN]
+    assert nearest(store, words="elephant") == []
+    assert nearest(store, words="mug")[0].distance_m is None
+    assert ids(nearest(store, words="wall")) == [] and ids(nearest(store, words="walls", structure=True)) == [WALL]
+    assert ids(nearest(store, words="mug", point=(2.2, -0.1, 0.8), k=1)) == [TWIN]
+
+
+def test_more_words_found_beat_fewer(store: Store) -> None:
+    import dataclasses
+
+    with store.transaction():
+        store.put_instances(
+            [
+                dataclasses.replace(store.instance(MUG), label="mug", description="small white cylinder, 9 cm"),
+                dataclasses.replace(store.instance(TWIN), description="small red cylinder, 9 cm"),
+            ]
+        )
+    assert ids(nearest(store, words="white mug")) == [MUG]
+    assert ids(nearest(store, words="small cylinder")) == [MUG, TWIN]
+    assert ids(nearest(store, words="red thing")) == [TWIN]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"point": (0, 0)},
+        {"point": (0, 0, float("nan"))},
+        {"point": "here"},
+        {"point": (0, 0, 0), "instance_id": 2},
+        {"point": (0, 0, 0), "k": 0},
+        {"point": (0, 0, 0), "max_distance": -1.0},
+        {"point": (0, 0, 0), "max_distance": float("inf")},
+        {"point": (0, 0, 0), "min_confidence": 2.0},
+        {"point": (0, 0, 0), "state": "gone"},
+        {"words": "   "},
+        {"words": "the"},
+        {"words": "mug", "max_distance": 1.0},
+    ],
+)
+def test_nearest_refuses_nonsense_in_one_line(store: Store, arguments: dict[str, Any]) -> None:
+    with pytest.raises(OptionError) as caught:
+        nearest(store, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_ids_are_told(store: Store) -> None:
+    for ask in (
+        lambda: nearest(store, instance_id=77),
+        lambda: similar(store, instance_id=77),
+        lambda: relations(store, subject=77),
+    ):
+        with pytest.raises(UnknownIdError, match="77"):
+            ask()
+
+
+def test_within_a_sphere_and_a_box(store: Store) -> None:
+    assert set(ids(within(store, center=(1.8, 0.1, 0.77), radius=0.12))) == {MUG, TABLE}
+    found = within(store, lower=(1.5, -0.5, 0.73), upper=(2.5, 0.5, 0.9))
+    assert {MUG, TWIN} <= set(ids(found))
+    assert found[0].score > 0.8
+    assert WALL in ids(within(store, center=(4, 0, 1), radius=0.3, structure=True))
+    assert within(store, center=(40, 0, 1), radius=0.3) == []
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        {},
+        {"center": (0, 0, 0)},
+        {"radius": 1.0},
+        {"lower": (0, 0, 0)},
+        {"lower": (1, 0, 0), "upper": (0, 1, 1)},
+        {"lower": (0, 0, 0), "upper": (1, 1, 1), "radius": 1.0},
+        {"center": (0, 0, 0), "radius": -1.0},
+        {"center": (0, 0), "radius": 1.0},
+    ],
+)
+def test_within_refuses_nonsense(store: Store, region: dict[str, Any]) -> None:
+    with pytest.raises(OptionError):
+        within(store, **region)
+
+
+def test_relations_are_filtered_and_checked(store: Store) -> None:
+    assert {(r.subject, r.object) for r in relations(store, predicate="on", object=TABLE)} == {
+        (MUG, TABLE),
+        (TWIN, TABLE),
+    }
+    assert relations(store, subject=CHAIR, min_confidence=0.9) == []
+    found = relations(store)
+    assert [r.confidence for r in found] == sorted((r.confidence for r in found), reverse=True)
+    with pytest.raises(OptionError, match="choose one of: on"):
+        relations(store, predicate="upon")
+
+
+def test_similar_is_the_exact_cosine_order(store: Store) -> None:
+    space = store.embedding_spaces()[0]
+    known, vectors = store.embeddings(space)
+    cosine = vectors @ vectors[list(known).index(MUG)]
+    expected = [int(known[n]) for n in np.argsort(-cosine, kind="stable") if known[n] in (TABLE, TWIN, CHAIR)]
+    found = similar(store, instance_id=MUG, k=3)
+    assert ids(found) == expected
+    assert np.isclose(found[0].score, cosine[list(known).index(expected[0])], atol=1e-4)
+    by_vector = similar(store, vector=vectors[list(known).index(MUG)], space=space, k=1)
+    assert ids(by_vector) == [MUG] and np.isclose(by_vector[0].score, 1.0, atol=1e-5)
+
+
+def test_spaces_do_not_mix(store: Store) -> None:
+    with pytest.raises(SpaceMismatchError):
+        similar(store, vector=np.ones(16), space="clip@2/512")
+    with pytest.raises(SpaceMismatchError):
+        similar(store, vector=np.ones(512), space="test@1/16")
+    with pytest.raises(OptionError):
+        similar(store, vector=np.ones(16))
+    with pytest.raises(OptionError):
+        similar(store)
+    with pytest.raises(OptionError):
+        similar(store, vector=np.zeros(16), space="test@1/16")
+    with store.transaction():
+        store.put_embeddings("clip@2/4", [MUG], np.ones((1, 4), np.float32))
+    with pytest.raises(OptionError, match="several"):
+        VectorIndex.of(store)
+
+
+def test_queries_work_on_an_empty_memory(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "empty.l3r") as empty:
+        assert nearest(empty, point=(0, 0, 0)) == []
+        assert nearest(empty, words="mug") == []
+        assert within(empty, center=(0, 0, 0), radius=1.0) == []
+        assert relations(empty) == []
+        with pytest.raises(SpaceMismatchError, match="none"):
+            similar(empty, vector=np.ones(3), space="test@1/3")
+        with pytest.raises(OptionError, match="no embeddings"):
+            VectorIndex.of(empty)
+
+
+def test_queries_read_while_another_process_could_write(make_memory: Callable[..., Path]) -> None:
+    with Store.open(make_memory()) as reader:
+        assert ids(nearest(reader, point=(1.8, 0.1, 1.0), k=1)) == [MUG]
