@@ -13,7 +13,15 @@ from list3r.instances.planes import find_planes, plane_tolerance
 from list3r.instances.settings import SegmentSettings
 from list3r.instances.sheets import find_sheets
 from list3r.instances.surfaces import Labels, Scene, Surface, assign_surfaces, choose_surfaces, estimate_up
-from list3r.instances.things import adopt_fragments, attach_parts, connect_rest, drop_junk, least_voxels
+from list3r.instances.things import (
+    adopt_fragments,
+    adopt_islands,
+    attach_parts,
+    connect_rest,
+    drop_junk,
+    drop_slivers,
+    least_voxels,
+)
 
 
 @dataclass(frozen=True)
@@ -52,9 +60,11 @@ def segment_cloud(
     surfaces = choose_surfaces(scene, planes)
     labels = assign_surfaces(scene, surfaces)
     labels = connect_rest(scene, surfaces, labels)
+    labels = adopt_islands(scene, surfaces, labels)
     labels = attach_parts(scene, surfaces, labels)
     labels = split_crowds(scene, surfaces, labels)
     labels = adopt_fragments(scene, surfaces, labels)
+    labels = drop_slivers(scene, surfaces, labels)
     labels = drop_junk(scene, surfaces, labels)
     labels, sheets = find_sheets(scene, surfaces, labels)
     return _describe(scene, surfaces, labels, set(sheets))

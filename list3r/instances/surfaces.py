@@ -129,14 +129,14 @@ def _lies_on(scene: Scene, plane: Plane, other: Surface) -> bool:
     """True where a small level plane is less than 4 cm above a larger one, over it or at its edge of view."""
     points = scene.cloud.points[plane.members]
     height = float(np.median(other.plane.height(points)))
-    if not 0.0 < height < 0.04 * scene.unit or plane.area > other.plane.area:
+    if not 0.0 < height < 0.04 * scene.unit or other.plane.area < max(1.5 * plane.area, 0.12 * scene.unit**2):
         return False
     near = cv2.dilate(other.plane.footprint, np.ones((5, 5), np.uint8))
-    hull = _hull(near)
+    hull = hull_of(near)
     return float(np.mean(other.plane.raster.look_up(hull, points) > 0)) > 0.3
 
 
-def _hull(mask: NDArray[np.generic]) -> NDArray[np.uint8]:
+def hull_of(mask: NDArray[np.generic]) -> NDArray[np.uint8]:
     corners = cv2.convexHull(np.argwhere(mask > 0)[:, ::-1].astype(np.int32))
     return np.asarray(cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, (1.0,)), np.uint8)
 

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from list3r.instances.cloud import Cloud, neighbour_pairs
-from list3r.instances.surfaces import Labels, Scene, Surface
+from list3r.instances.surfaces import Labels, Scene, Surface, hull_of
 
 
 def connect_rest(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
@@ -115,6 +115,43 @@ def _carries(scene: Scene, surface: Surface, points: NDArray[np.float32], height
     return bool(under.mean() > 0.7 and np.quantile(height, 0.98) > -0.15 * scene.unit)
 
 
+def adopt_islands(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Give surfaces the flat pieces of them that are seen on their own: through slats, between legs.
+
+    A piece counts when nearly all of it is within tolerance of the plane and inside the hull of the footprint; what
+    bounds the room goes on beyond its hull.
+    """
+    out = labels.copy()
+    hulls = [hull_of(surface.plane.footprint) for surface in surfaces]
+    for mine in members_of(labels, len(surfaces)).values():
+        points, reading = scene.cloud.points[mine], scene.cloud.reading[mine]
+        for number, surface in enumerate(surfaces):
+            away = np.abs(surface.plane.height(points))
+            if surface.sheet or np.mean(away < scene.tolerance[mine] + reading) < 0.85:
+                continue
+            inside = surface.plane.raster.look_up(hulls[number], points) > 0
+            if surface.structure or inside.mean() > 0.7:
+                out[mine] = number + 1
+                break
+    return out
+
+
+def drop_slivers(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Give thin strips along a surface (edges of boards, plinths, mouldings) to the surface, or drop them."""
+    contact = contacts(scene.cloud, labels)
+    out = labels.copy()
+    for part, mine in members_of(labels, len(surfaces)).items():
+        spread = scene.cloud.points[mine] - scene.cloud.points[mine].mean(axis=0)
+        axes = np.linalg.eigh(spread.T @ spread)[1]
+        size = np.ptp(np.quantile(spread @ axes, [0.03, 0.97], axis=0), axis=0)
+        if size[1] > 0.06 * scene.unit or size[2] < 5.0 * size[1] or size[2] < 0.25 * scene.unit:
+            continue
+        touching = [contact.get((number + 1, part), 0) for number in range(len(surfaces))]
+        best = int(np.argmax(touching)) if touching else 0
+        out[mine] = best + 1 if touching and touching[best] > 0.5 * len(mine) else 0
+    return out
+
+
 def _is_back(scene: Scene, surface: Surface, points: NDArray[np.float32], height: NDArray[np.float32]) -> bool:
     """True for what rises from a seat over its whole width: a back, not a thing put there."""
     plane = surface.plane
@@ -176,21 +213,28 @@ def _rests_alone(scene: Scene, surfaces: list[Surface], mine: NDArray[np.int64])
     """True for a component that is large enough to be a thing and stands on a surface."""
     if len(mine) < least_voxels(scene):
         return False
-    points = scene.cloud.points[mine]
-    for surface in surfaces:
-        if surface.level:
-            height = surface.plane.height(points)
-            over = surface.plane.raster.look_up(surface.plane.footprint, points) > 0
-            if over.mean() > 0.5 and -0.01 * scene.unit < np.quantile(height, 0.05) < 0.03 * scene.unit:
-                return True
-    return False
+    return any(surface.level and _on(scene, surface, scene.cloud.points[mine]) for surface in surfaces)
+
+
+def _on(scene: Scene, surface: Surface, points: NDArray[np.float32]) -> bool:
+    """True for points that stand on a level surface."""
+    low = float(np.quantile(surface.plane.height(points), 0.05))
+    over = surface.plane.raster.look_up(surface.plane.footprint, points) > 0
+    return bool(over.mean() > 0.5 and -0.01 * scene.unit < low < 0.03 * scene.unit)
 
 
 def drop_junk(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
-    """Labels without components that are too small for a thing, or no larger than the noise of their depth."""
+    """Labels without components that are too small for a thing, or no larger than the noise of their depth.
+
+    Off tables and the like, on the floor or in the air, small components are mostly parts of something hidden, so
+    there a thing must show eight times the surface.
+    """
     out = labels.copy()
+    furniture = [s for s in surfaces if s.level and not s.structure]
     for mine in members_of(labels, len(surfaces)).values():
-        spread = np.linalg.norm(scene.cloud.points[mine].std(axis=0))
-        if len(mine) < least_voxels(scene) or spread < 2.5 * np.median(scene.cloud.reading[mine]):
+        points = scene.cloud.points[mine]
+        spread = np.linalg.norm(points.std(axis=0))
+        least = least_voxels(scene) * (1 if any(_on(scene, s, points) for s in furniture) else 8)
+        if len(mine) < least or spread < 2.5 * np.median(scene.cloud.reading[mine]):
             out[mine] = 0
     return out

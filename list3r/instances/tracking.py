@@ -13,6 +13,7 @@ from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.features import mean_feature
 from list3r.instances.joining import join_candidates, warp_labels
+from list3r.instances.separation import cannot_link_pairs
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.support import collect_supports
 from list3r.instances.views import ChunkViews, chunk_views
@@ -264,13 +265,3 @@ def _joined_feature(
     rows = [p.features[j == number] for p, j in zip(proposals, joined, strict=True)]
     score = [p.score[j == number] for p, j in zip(proposals, joined, strict=True)]
     return mean_feature(np.concatenate(rows), np.concatenate(score))
-
-
-def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: float) -> NDArray[np.int32]:
-    """Pairs seen side by side in at least `frames` frames, both well visible. Shape (P, 2)."""
-    visible = [dict(zip(i.track.frames.tolist(), i.track.visible_fraction.tolist(), strict=True)) for i in instances]
-    well = [{f for f, share in v.items() if share > 0.3} for v in visible]
-    pairs = [
-        (a, b) for a in range(len(instances)) for b in range(a + 1, len(instances)) if len(well[a] & well[b]) >= frames
-    ]
-    return np.array(pairs, np.int32).reshape(-1, 2)

@@ -1,0 +1,74 @@
+"""Cannot-link evidence: pairs that are two things because one frame shows both (paper 3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from list3r.memory.records import LocalInstance
+
+WELL_VISIBLE = 0.3
+"""Share of an instance's support that must be seen for its mask to count."""
+TOUCHING_M = 0.03
+"""Things nearer than this may be pieces of one, unless a surface parts them."""
+PIECE_M = 0.25
+"""Instances smaller than this in every direction are small things."""
+ROOM_M = 0.6
+"""Pieces of one piece of furniture are seldom farther apart than this."""
+
+
+def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: float) -> NDArray[np.int32]:
+    """Pairs of local ids seen side by side in at least `frames` frames and not possibly pieces of one. Shape (P, 2).
+
+    An over-segmented thing looks just like two things side by side. So a pair only counts when a surface parts it
+    (one stands on the other), when both are small and apart, or when they are far apart and not in one plane.
+    """
+    well = [_well_visible(instance) for instance in instances]
+    trees = [cKDTree(instance.support.points) for instance in instances]
+    pairs = [
+        (a, b)
+        for a in range(len(instances))
+        for b in range(a + 1, len(instances))
+        if len(well[a] & well[b]) >= frames and _two_things(instances[a], instances[b], (trees[a], trees[b]), unit)
+    ]
+    return np.array(pairs, np.int32).reshape(-1, 2)
+
+
+def _well_visible(instance: LocalInstance) -> set[int]:
+    rows = instance.track.visible_fraction > WELL_VISIBLE
+    return set(instance.track.frames[rows].tolist())
+
+
+def _two_things(a: LocalInstance, b: LocalInstance, trees: tuple[cKDTree, cKDTree], unit: float) -> bool:
+    if a.plane is not None and b.plane is not None and (_on_plane(a, b, unit) or _on_plane(b, a, unit)):
+        return False
+    gap = _gap(a, trees[1]) / unit
+    if gap < TOUCHING_M:
+        return _stands_on(a, b, unit) or _stands_on(b, a, unit)
+    return (_small(a, unit) and _small(b, unit)) or gap > ROOM_M or a.structure or b.structure
+
+
+def _gap(a: LocalInstance, tree: cKDTree) -> float:
+    distance, _ = tree.query(a.support.points[::3])
+    return float(np.quantile(distance, 0.02))
+
+
+def _small(instance: LocalInstance, unit: float) -> bool:
+    return bool(np.ptp(instance.support.points, axis=0).max() < PIECE_M * unit)
+
+
+def _on_plane(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
+    """True where the flat a lies in the plane of b."""
+    assert b.plane is not None
+    return bool(np.median(np.abs(a.support.points @ b.plane[:3] + b.plane[3])) < 0.05 * unit)
+
+
+def _stands_on(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
+    """True where a is all on the open side of the flat b and rises well from it."""
+    if b.plane is None:
+        return False
+    height = a.support.points @ b.plane[:3] + b.plane[3]
+    return bool(np.quantile(height, 0.05) > -0.01 * unit and np.quantile(height, 0.9) > 0.03 * unit)
