@@ -9,6 +9,7 @@ from typing import Any
 
 from list3r.cli.build_commands import report_lines, run_build
 from list3r.cli.common import open_memory, print_table
+from list3r.cli.evaluation_commands import score_rows
 from list3r.memory.errors import OptionError
 from list3r.scene_memory import SceneMemory
 
@@ -105,7 +106,9 @@ def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
     S_truth_scene = alignment_of(truth, estimate, with_scale=False)
     scene = evaluate_scene(read_scene(out / "rooms.json"), read_scene(walk / "truth.json"), S_truth_scene)
     _say(quiet, "\n7. against the known truth")
-    _say(quiet, json.dumps({"trajectory": errors.as_dict(), "scene": scene}, indent=1))
+    if not quiet:
+        print(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
+        print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
     return {"trajectory": errors.as_dict(), "scene": scene}
 
 

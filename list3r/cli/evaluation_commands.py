@@ -78,11 +78,15 @@ def score_rows(scores: dict[str, Any]) -> list[list[object]]:
     rows: list[list[object]] = []
     for threshold in ("0.25", "0.50"):
         entry = scores[f"instances_{threshold}"]
-        more = f"{entry['duplicates']} duplicates, {entry['merged']} merged"
-        rows.append([f"instances, IoU {threshold}", entry["recall"], entry["precision"], more])
-    relations = scores["relations"]
-    rows.append(["relations of matched", relations["recall"], relations["precision"], ""])
+        more = f"{entry['duplicates']} duplicates, {entry['merged_pairs']} merged pairs"
+        rows.append([f"things at IoU {threshold}", _share(entry["recall"]), _share(entry["precision"]), more])
+    for name, entry in scores["relations"]["by_predicate"].items():
+        rows.append([f"{name}, of matched things", _share(entry["recall"]), _share(entry["precision"]), ""])
     return rows
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _is_memory(path: Path) -> bool:

@@ -1,0 +1,74 @@
+"""What the benchmarks print of the machine and of a process they measured."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores in use, memory, Python."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    cores = len(os.sched_getaffinity(0))
+    return {"processor": model, "cores": cores, "python": platform.python_version(), "system": platform.platform()}
+
+
+def run_list3r(*arguments: str) -> tuple[dict[str, Any], dict[str, float]]:
+    """Run the program with --json; its answer, its wall seconds and the peak memory of all its processes."""
+    started = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "list3r", *arguments, "--json"], stdout=subprocess.PIPE, text=True
+    )
+    peak = _watch(process)
+    out = process.stdout.read() if process.stdout else ""
+    if process.wait() != 0:
+        raise SystemExit(f"list3r {' '.join(arguments)} ended with status {process.returncode}")
+    return json.loads(out), {"wall_s": round(time.monotonic() - started, 2), "peak_mb": round(peak / 1e6, 1)}
+
+
+def _watch(process: subprocess.Popen[str]) -> float:
+    """Peak of the summed set sizes of a process and its descendants, bytes, looked at ten times a second."""
+    peak = 0.0
+    while process.poll() is None:
+        peak = max(peak, sum(_resident(pid) for pid in [process.pid, *_descendants(process.pid)]))
+        time.sleep(0.1)
+    return peak
+
+
+def _descendants(pid: int) -> list[int]:
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*"):
+        try:
+            children = [int(word) for word in (task / "children").read_text().split()]
+        except OSError:
+            continue
+        for child in children:
+            found += [child, *_descendants(child)]
+    return found
+
+
+def _resident(pid: int) -> float:
+    """Proportional set size, bytes: pages shared by several processes count once over all of them."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return sum(float(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:"))
+
+
+def write_json(path: Path | None, result: dict[str, Any]) -> None:
+    """Write a result beside the machine it was measured on."""
+    if path is not None:
+        path.write_text(json.dumps({"machine": machine(), **result}, indent=2) + "\n", encoding="utf-8")
