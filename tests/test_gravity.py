@@ -41,12 +41,14 @@ def room(noise_deg: float = 1.0, seed: int = 0, table: float = 1.0, floor: float
     points = rng.uniform([-2, -2, 0], [2, 2, 2], (2000, 3))
     keep = areas > 0
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    return Planes(turned[keep], centers[keep], areas[keep], points)
+    return Planes(turned[keep], centers[keep], areas[keep], points, np.full(len(points), -1))
 
 
 def seen_from(S_graph_world: Sim3, planes: Planes) -> Planes:
     turned = planes.normal @ S_graph_world.rotation.T
-    return Planes(turned, S_graph_world.apply(planes.center), planes.area, S_graph_world.apply(planes.points))
+    return Planes(
+        turned, S_graph_world.apply(planes.center), planes.area, S_graph_world.apply(planes.points), planes.owner
+    )
 
 
 def error_deg(gravity: Gravity, up: Array) -> float:

@@ -31,6 +31,7 @@ class DeriveSettings:
     small_m: float = 0.5
     """Diagonal of a small thing; of a larger one each chunk sees another part."""
     border_px: float = 3.0
+    """A box that comes this near to the border of what is seen is cut by it."""
 
 
 @dataclass(frozen=True)
@@ -160,13 +161,11 @@ def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:
     best: tuple[float, int, int] | None = None
     box: Array = np.zeros(4)
     for m in members:
-        height, width = m.image_size
         b = m.shapes.boxes_xyxy[m.at].astype(np.float64)
         if len(b) == 0:
             continue
-        cut = (
-            (b[:, :2] <= s.border_px).any(axis=1) | (b[:, 2] >= width - s.border_px) | (b[:, 3] >= height - s.border_px)
-        )
+        seen = m.shapes.seen
+        cut = (b[:, :2] <= seen[:2] + s.border_px).any(axis=1) | (b[:, 2:] >= seen[2:] - s.border_px).any(axis=1)
         score = m.shapes.areas_px[m.at] * np.where(cut, 0.25, 1.0) * (0.2 + 0.8 * m.shapes.visible_fraction[m.at])
         n = int(np.argmax(score))
         rank = (-float(score[n]), m.shapes.session_id, int(m.shapes.frames[m.at][n]))

@@ -154,7 +154,8 @@ def floor_height(
     heights = planes.center[floor] @ up
     lowest = heights < heights.min() + 0.08 * unit
     height = float(np.average(heights[lowest], weights=planes.area[floor][lowest]))
-    below = float((planes.points @ up < height - 0.06 * unit).mean())
+    others = ~np.isin(planes.owner, np.flatnonzero(floor)[lowest])
+    below = float((planes.points[others] @ up < height - 0.06 * unit).mean()) if others.any() else 0.0
     camera = float(np.quantile(camera_centers @ up, 0.05)) - height
     if below > s.floor_below or camera < s.floor_camera_height_m * unit:
         return None

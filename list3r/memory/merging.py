@@ -28,6 +28,10 @@ class MergeSettings:
     """Of a smaller one inside a larger one, for a partial view."""
     min_truncated: float = 0.5
     """Share of its frames in which the image's border must cut a partial view."""
+    max_part_color: float = 22.0
+    """Between the median colours of a part and of the whole, CIE L*a*b* with lightness at half weight."""
+    min_part_size: float = 0.3
+    """Of a part that the border does not cut, over the size of the whole."""
     min_cosine: float = 0.0
     """Of the features; spaces without calibration only tell opposites apart."""
     max_center_offset: float = 0.45
@@ -145,6 +149,7 @@ class _Table:
     feature: NDArray[np.float32]
     tolerance: Array
     unit: Array
+    lab: Array
 
     @staticmethod
     def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> _Table:
@@ -172,6 +177,7 @@ class _Table:
             np.concatenate(features) if features else np.zeros((0, 1), np.float32),
             np.concatenate(tolerance) if tolerance else np.zeros(0),
             np.concatenate(unit) if unit else np.zeros(0),
+            np.concatenate([c.lab for c in chunks]) if chunks else np.zeros((0, 3)),
         )
 
     def coplanar(self, a: Ints, b: Ints, angle_deg: float) -> NDArray[np.bool_]:
@@ -202,7 +208,10 @@ def _edges(
     same |= one_mask & alike & (high >= 0.2) & ~one_structure
     same &= across | (low >= s.min_containment)
     cut = np.where(p.i_on_j >= p.j_on_i, t.truncated[a], t.truncated[b])
-    part = (high >= s.part_containment) & ((cut >= s.min_truncated) | coplanar) & ~one_structure & across
+    size = np.minimum(t.size[a], t.size[b]) / np.maximum(np.maximum(t.size[a], t.size[b]), 1e-12)
+    color = np.linalg.norm((t.lab[a] - t.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
+    part = (high >= s.part_containment) & (color <= s.max_part_color) & ~one_structure & across
+    part &= (cut >= s.min_truncated) | (coplanar & (size >= s.min_part_size))
     piece = both_structure & coplanar & (high >= 0.05)
     base = np.sqrt(low * high)
     score = np.where(same, 0.5 + 0.5 * base, np.where(part, 0.3 + 0.2 * high, 0.2 + 0.2 * high))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from list3r.memory.chunk_verbs import LocalNode
@@ -24,16 +25,20 @@ class Planes:
     """Area of the convex hull of the support in the plane, square units. Shape (P,)."""
     points: Array
     """A sample of all support points, of what is flat and what is not. Shape (N, 3)."""
+    owner: NDArray[np.int64]
+    """Plane of each point, -1 for points of what is not flat. Shape (N,)."""
 
 
 def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
     """The flat local instances of one chunk, and at most about `sample` points of each local instance; its frame."""
-    normals, centers, areas, points = [], [], [], []
+    normals: list[Array] = []
+    centers, areas, points, owner = [], [], [], []
     for node in nodes:
         p = node.support.points.astype(np.float64)
         if len(p) == 0:
             continue
         points.append(p[:: max(1, len(p) // sample)])
+        owner.append(np.full(len(points[-1]), -1 if node.plane is None else len(normals)))
         if node.plane is None:
             continue
         normal = node.plane[:3] / max(float(np.linalg.norm(node.plane[:3])), 1e-12)
@@ -45,18 +50,21 @@ def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
         np.array(centers).reshape(-1, 3),
         np.array(areas, dtype=np.float64),
         np.concatenate(points) if points else np.zeros((0, 3)),
+        np.concatenate(owner) if owner else np.zeros(0, np.int64),
     )
 
 
 def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
     """The planes of several chunks in one frame: each with its `S_graph_chunk`."""
     if not parts:
-        return Planes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))
+        return Planes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+    start = np.cumsum([0, *(len(p.area) for p, _ in parts)])
     return Planes(
         np.concatenate([p.normal @ S.rotation.T for p, S in parts]),
         np.concatenate([S.apply(p.center) for p, S in parts]),
         np.concatenate([p.area * float(S.scale) ** 2 for p, S in parts]),
         np.concatenate([S.apply(p.points) for p, S in parts]),
+        np.concatenate([np.where(p.owner < 0, -1, p.owner + n) for (p, _), n in zip(parts, start, strict=False)]),
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.chunk_verbs import LocalNode
+from list3r.memory.describe import lab_from_rgb
 from list3r.memory.geometry import Array, Sim3
 
 Ints = NDArray[np.int64]
@@ -47,7 +48,10 @@ class ShapeSettings:
     max_points: int = 250
     """Representative points of one instance, one from each occupied cell."""
     border_px: float = 3.0
-    """A box that comes this near to the border of the image is cut by it."""
+    """A box that comes this near to the border of what is seen is cut by it."""
+    blind: float = 0.1
+    """Up to this share of the image's width and height may be blind at each border, where depth does not cover colour;
+    what is seen ends where no box of the chunk goes further."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,11 @@ class ChunkShapes:
     plane: Array
     """(n, d), NaN for what is not flat. Shape (N, 4)."""
     truncated: Array
-    """Share of its frames in which the image's border cuts it, by mask area, in [0, 1]. Shape (N,)."""
+    """Share of its frames in which the border of what is seen cuts it, by mask area, in [0, 1]. Shape (N,)."""
+    lab: Array
+    """Median colour, CIE L*a*b*. Shape (N, 3)."""
+    seen: Array
+    """Part of the image in which anything is seen, xyxy, px, see `seen_xyxy`. Shape (4,)."""
     structure: NDArray[np.bool_]
     """Shape (N,)."""
     stability: Array
@@ -117,6 +125,7 @@ def chunk_shapes(
     nodes = sorted(nodes, key=lambda n: n.local_id)
     grain = 0.5 * s.tolerance_m * unit
     points, rgb, owner, cells, cell_owner = [], [], [], [], []
+    seen = seen_xyxy([n.boxes_xyxy for n in nodes], image_size, s.blind)
     level = np.zeros(len(nodes), np.int64)
     count = np.zeros(len(nodes), np.int64)
     center, size = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
@@ -153,7 +162,11 @@ def chunk_shapes(
         size=size,
         cell_count=count,
         plane=np.array([np.full(4, np.nan) if n.plane is None else n.plane for n in nodes]).reshape(-1, 4),
-        truncated=np.array([_truncated(n, image_size, s.border_px) for n in nodes]),
+        truncated=np.array([_truncated(n, seen, s.border_px) for n in nodes]),
+        lab=np.array(
+            [np.median(lab_from_rgb(n.support.rgb[:: max(1, len(n.support.rgb) // 200)]), axis=0) for n in nodes]
+        ).reshape(-1, 3),
+        seen=seen,
         structure=np.array([n.structure for n in nodes], bool),
         stability=np.array([n.stability for n in nodes]),
         feature=np.array([n.feature for n in nodes], np.float32) if nodes else np.zeros((0, 0), np.float32),
@@ -204,10 +217,24 @@ def _key(cells: Ints, level: int) -> Ints:
     return np.asarray(level << 3 * _BITS | c[:, 0] << 2 * _BITS | c[:, 1] << _BITS | c[:, 2], dtype=np.int64)
 
 
-def _truncated(node: LocalNode, image_size: tuple[int, int], border: float) -> float:
+def seen_xyxy(boxes: Sequence[NDArray[np.float32]], image_size: tuple[int, int], blind: float) -> Array:
+    """The part of the image in which anything is seen: its borders, or further in by at most the share `blind` where
+    no box reaches them. Boxes xyxy of shape (V, 4) each, (height, width) -> (4,).
+    """
     height, width = image_size
+    image = np.array([0.0, 0.0, width - 1.0, height - 1.0])
+    reached = [b for b in boxes if len(b)]
+    if not reached:
+        return image
+    every = np.concatenate(reached).astype(np.float64)
+    found = np.concatenate([every[:, :2].min(axis=0), every[:, 2:].max(axis=0)])
+    inset = blind * np.array([width, height, width, height])
+    return np.asarray(np.where(np.abs(found - image) <= inset, found, image))
+
+
+def _truncated(node: LocalNode, seen: Array, border: float) -> float:
     b = node.boxes_xyxy
-    cut = (b[:, 0] <= border) | (b[:, 1] <= border) | (b[:, 2] >= width - border) | (b[:, 3] >= height - border)
+    cut = (b[:, :2] <= seen[:2] + border).any(axis=1) | (b[:, 2:] >= seen[2:] - border).any(axis=1)
     weight = node.areas_px.astype(np.float64)
     return float(weight[cut].sum() / max(float(weight.sum()), 1.0))
 
