@@ -112,6 +112,16 @@ def test_a_picture_hangs_on_the_wall() -> None:
     assert (3, "attached_to", 8) in facts([wall, picture])
 
 
+def test_a_table_whose_legs_were_not_seen_stands_on_the_floor_and_a_shelf_on_the_wall_does_not() -> None:
+    floor, wall = body(1, FLOOR, structure="floor"), body(8, WALL, structure="wall", view=-1.5)
+    table = body(2, Piece("table", (0, 0, 0.5), (1.4, 0.8, 0.44), points=3000))
+    shelf = body(3, Piece("shelf", (0, 1.9, 0.5), (0.8, 0.2, 0.5), points=900))
+    lamp = body(4, Piece("lamp", (1.0, 0, 1.8), (0.3, 0.3, 0.3), points=500))
+    found = facts([floor, wall, table, shelf, lamp])
+    assert {(s, o) for s, p, o in found if p == "on"} == {(2, 1)}
+    assert (3, "attached_to", 8) in found
+
+
 def test_neighbours_are_next_to_each_other_and_near() -> None:
     found = facts([body(2, CHAIR), moved(body(3, CHAIR), (0.7, 0, 0)), moved(body(4, CHAIR), (4.0, 0, 0))])
     assert {(2, "next_to", 3), (3, "next_to", 2), (2, "near", 3), (3, "near", 2)} <= found

@@ -31,8 +31,10 @@ class GravitySettings:
     """Level surface that must have been seen."""
     floor_area_m2: float = 0.25
     """Smallest visible patch that can be the floor."""
-    floor_below: float = 0.02
-    """Share of all support points that may lie under the floor."""
+    floor_below: float = 0.03
+    """Share of all other support points that may lie under the floor."""
+    floor_depth_m: float = 0.1
+    """What lies this much under it is under the floor: depth noise at the far end of a room is as large."""
     floor_camera_height_m: float = 0.8
     """A level surface that the cameras come nearer to than this is a table, not the floor."""
     settled_deg: float = 0.4
@@ -155,7 +157,7 @@ def floor_height(
     lowest = heights < heights.min() + 0.08 * unit
     height = float(np.average(heights[lowest], weights=planes.area[floor][lowest]))
     others = ~np.isin(planes.owner, np.flatnonzero(floor)[lowest])
-    below = float((planes.points[others] @ up < height - 0.06 * unit).mean()) if others.any() else 0.0
+    below = float((planes.points[others] @ up < height - s.floor_depth_m * unit).mean()) if others.any() else 0.0
     camera = float(np.quantile(camera_centers @ up, 0.05)) - height
     if below > s.floor_below or camera < s.floor_camera_height_m * unit:
         return None

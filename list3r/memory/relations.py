@@ -46,6 +46,11 @@ class RelationSettings:
     """A thing may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
     contact_per_height: float = 0.12
     """More of it for tall things, whose thin legs are seldom seen."""
+    hidden_feet: float = 0.6
+    """A thing that stands on nothing and touches no wall stands on the floor if its lowest visible point is nearer to
+    it than this share of its longest edge: legs under a table are often not seen."""
+    hidden_feet_m: float = 0.8
+    """And nearer than this."""
     least_base: float = 0.25
     """Least area of the surface under a thing over the thing's own footprint: a floor does not stand on table legs."""
     enclosed: float = 0.7
@@ -101,6 +106,7 @@ def relations(
     if gravity_known:
         inside = _containments(scene)
         supported = _supports(scene, {a for a, _, _, _ in inside})
+        supported += _on_hidden_feet(scene, {a for a, _, _, _ in (*inside, *supported)})
         for predicate, found in (("in", inside), ("on", supported)):
             for a, b, confidence, margin in found:
                 holding |= {(a, b), (b, a)}
@@ -215,6 +221,41 @@ def _supports(scene: _Scene, taken: set[int]) -> list[_Found]:
     on = {a: b for a, b, _, _ in out}
     base = [float(np.prod(b.box.size[:2])) for b in scene.bodies]
     return [f for f in out if not (on.get(f[1]) == f[0] and (base[f[0]], f[0]) > (base[f[1]], f[1]))]
+
+
+def _on_hidden_feet(scene: _Scene, held: set[int]) -> list[_Found]:
+    """Things that must stand on the floor, for nothing else holds them, though their feet were not seen."""
+    s = scene.s
+    out = []
+    floors = [n for n, b in enumerate(scene.bodies) if b.structure == "floor"]
+    for a, body in enumerate(scene.bodies):
+        if a in held or body.structure is not None or _hangs(scene, a) is not None:
+            continue
+        z = body.points[:, 2]
+        limit = min(s.hidden_feet * body.size, s.hidden_feet_m * scene.unit)
+        gaps = []
+        for b in floors:
+            aside = np.maximum(scene.low[b, :2] - body.box.center[:2], body.box.center[:2] - scene.high[b, :2]).max()
+            if np.isfinite(scene.box_gap[a, b]) and aside <= 0.25 * scene.unit:
+                near = neighbours_of(body.box.center[None, :2], scene.plan(b).tree, min(12, len(scene.plan(b).points)))[
+                    1
+                ]
+                gaps.append((float(np.quantile(z, 0.01) - np.median(scene.plan(b).points[near[0], 2])), b))
+        if gaps and 0.0 <= min(gaps)[0] < limit:
+            gap, b = min(gaps)
+            out.append((a, b, 0.8 * (1.0 - 0.5 * gap / limit), limit - gap))
+    return out
+
+
+def _hangs(scene: _Scene, a: int) -> tuple[float, int] | None:
+    """The wall that a thing touches: (gap, position), the nearest one."""
+    limit = scene.s.attached_m * scene.unit
+    walls = [
+        (scene.gap(a, b), b)
+        for b, other in enumerate(scene.bodies)
+        if other.structure in ("wall", "plane") and scene.box_gap[a, b] < limit
+    ]
+    return min(walls) if walls and min(walls)[0] < limit else None
 
 
 def _contact(scene: _Scene, a: int) -> float:
@@ -379,13 +420,9 @@ def _attached(scene: _Scene, held: set[int]) -> list[Relation]:
     for a, body in enumerate(scene.bodies):
         if a in held or body.structure is not None:
             continue
-        walls = [
-            (scene.gap(a, b), b)
-            for b, other in enumerate(scene.bodies)
-            if other.structure in ("wall", "plane") and scene.box_gap[a, b] < limit
-        ]
-        if walls and min(walls)[0] < limit:
-            gap, b = min(walls)
+        touched = _hangs(scene, a)
+        if touched is not None:
+            gap, b = touched
             c = round(_sure(limit - gap, scene.s.noise_m * scene.unit), 4)
             out.append(Relation(body.id, "attached_to", scene.bodies[b].id, c, round(limit - gap, 5)))
     return out

@@ -18,7 +18,9 @@ class StructureSettings:
     level_deg: float = 15.0
     """A surface this near to level or upright counts as that."""
     thickness_m: float = 0.12
-    """A thing thicker than this is not a surface."""
+    """A thing thicker than this is not a surface,"""
+    thickness: float = 0.04
+    """nor one thicker than this share of its second longest edge: depth noise grows with the room."""
     floor_band_m: float = 0.12
     """Level surfaces this near to the floor are floor."""
     min_area_m2: float = 0.25
@@ -65,7 +67,7 @@ def _classify(
     along = body.points @ body.normal
     thickness = float(np.ptp(np.quantile(along, [0.1, 0.9])))
     edges = np.sort(body.box.size)
-    if thickness > s.thickness_m * unit or edges[1] * edges[2] < s.min_area_m2 * unit**2:
+    if thickness > max(s.thickness_m * unit, s.thickness * edges[1]) or edges[1] * edges[2] < s.min_area_m2 * unit**2:
         return None
     height = float(np.median(body.points[:, 2]))
     if abs(body.normal[2]) > np.cos(np.radians(s.level_deg)):
