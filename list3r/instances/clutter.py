@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -18,6 +19,10 @@ WALL_GAP_M = 0.15
 """A component that lies mostly within this of a wall may be several things before the wall."""
 MIN_CROWD_M = 0.3
 """Smaller components are left whole."""
+COLOR_STEP = 8.0
+"""Colour difference (Lab, lightness halved) of neighbouring voxels that parts."""
+COLOR_JOIN = 12.0
+"""Mean colour difference up to which flat neighbours are one."""
 HOLLOW_PER_M = 9.0
 """Change of the normal over distance from which a hollow parts: 15 degrees over 3 cm."""
 
@@ -58,7 +63,9 @@ def _split(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.int64]:
     if len(core) < least_voxels(scene):
         return np.ones(len(mine), np.int64)
     left, right = neighbour_pairs(cloud.keys[mine[core]], 1)
+    color = lab_of(cloud.rgb[mine])
     alike = np.sum(normals[core[left]] * normals[core[right]], axis=1) > 0.8
+    alike &= np.linalg.norm(color[core[left]] - color[core[right]], axis=1) < COLOR_STEP
     left, right = left[alike], right[alike]
     graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(len(core), len(core)))
     _, component = connected_components(graph, directed=False)
@@ -70,7 +77,7 @@ def _split(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.int64]:
     parts = np.zeros(len(mine), np.int64)
     _, nearest = cKDTree(cloud.points[mine[seeds]]).query(cloud.points[mine])
     parts[:] = number[nearest]
-    return _rejoin(scene, mine, parts)
+    return _rejoin(scene, mine, parts, color)
 
 
 def _hollow(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -95,16 +102,27 @@ def _hollow(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(bend / np.maximum(count, 1.0) < -0.5 * HOLLOW_PER_M / scene.unit)
 
 
-def _rejoin(scene: Scene, mine: NDArray[np.int64], parts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Parts that meet convexly or go on flatly along most of their border made one again, numbered from 1."""
+def lab_of(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Half lightness, a and b of colours in [0, 255]. Shape (N, 3)."""
+    lab = cv2.cvtColor(np.ascontiguousarray(rgb[None]) / np.float32(255.0), cv2.COLOR_RGB2Lab)[0]
+    return np.asarray(lab * np.array([0.5, 1.0, 1.0], np.float32), np.float32)
+
+
+def _means(parts: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float64]:
+    total = np.stack([np.bincount(parts, values[:, k]) for k in range(values.shape[1])], axis=1)
+    return np.asarray(total / np.maximum(np.bincount(parts), 1)[:, None])
+
+
+def _rejoin(
+    scene: Scene, mine: NDArray[np.int64], parts: NDArray[np.int64], color: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """Parts that meet convexly, or go on flatly in like colour, made one again, numbered from 1."""
     cloud = scene.cloud
     left, right = neighbour_pairs(cloud.keys[mine], 2)
     cross = parts[left] != parts[right]
     left, right = left[cross], right[cross]
     count = int(parts.max()) + 1
-    mean = np.stack([np.bincount(parts, cloud.points[mine, k], minlength=count) for k in range(3)], axis=1)
-    facing = np.stack([np.bincount(parts, cloud.normals[mine, k], minlength=count) for k in range(3)], axis=1)
-    mean /= np.maximum(np.bincount(parts, minlength=count), 1)[:, None]
+    mean, facing, tone = (_means(parts, v) for v in (cloud.points[mine], cloud.normals[mine], color))
     facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
     low, high = np.minimum(parts[left], parts[right]), np.maximum(parts[left], parts[right])
     pairs, contact = np.unique(np.stack([low, high], axis=1), axis=0, return_counts=True)
@@ -115,7 +133,8 @@ def _rejoin(scene: Scene, mine: NDArray[np.int64], parts: NDArray[np.int64]) -> 
         convex = float((facing[b] - facing[a]) @ d)
         across = float(facing[a] @ facing[b])
         step = abs(float(d @ (facing[a] + facing[b]))) / 2.0
-        meets = touching > 20 and ((across < 0.9 and convex > 0.25) or (across >= 0.9 and step < 0.08))
+        alike = float(np.linalg.norm(tone[a] - tone[b])) < COLOR_JOIN
+        meets = touching > 20 and ((across < 0.9 and convex > 0.25) or (across >= 0.9 and step < 0.08 and alike))
         if meets:
             parent[parent == parent[b]] = parent[a]
     return np.asarray(np.unique(parent[parts], return_inverse=True)[1] + 1)

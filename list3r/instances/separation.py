@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -16,6 +17,8 @@ TOUCHING_M = 0.03
 """Things nearer than this may be pieces of one, unless a surface parts them."""
 PIECE_M = 0.25
 """Instances smaller than this in every direction are small things."""
+COLOR_DIFFERENCE = 12.0
+"""From this on two flat things in one plane are a sheet and what it lies on."""
 ROOM_M = 0.6
 """Pieces of one piece of furniture are seldom farther apart than this."""
 
@@ -24,7 +27,7 @@ def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: flo
     """Pairs of local ids seen side by side in at least `frames` frames and not possibly pieces of one. Shape (P, 2).
 
     An over-segmented thing looks just like two things side by side. So a pair only counts when a surface parts it
-    (one stands on the other), when both are small and apart, or when they are far apart and not in one plane.
+    (one stands on the other), when they lie in one plane and differ in colour, when both are small and apart, or when they are far apart and not in one plane.
     """
     well = [_well_visible(instance) for instance in instances]
     trees = [cKDTree(instance.support.points) for instance in instances]
@@ -44,11 +47,18 @@ def _well_visible(instance: LocalInstance) -> set[int]:
 
 def _two_things(a: LocalInstance, b: LocalInstance, trees: tuple[cKDTree, cKDTree], unit: float) -> bool:
     if a.plane is not None and b.plane is not None and (_on_plane(a, b, unit) or _on_plane(b, a, unit)):
-        return False
+        return _color_difference(a, b) > COLOR_DIFFERENCE
     gap = _gap(a, trees[1]) / unit
     if gap < TOUCHING_M:
         return _stands_on(a, b, unit) or _stands_on(b, a, unit)
     return (_small(a, unit) and _small(b, unit)) or gap > ROOM_M or a.structure or b.structure
+
+
+def _color_difference(a: LocalInstance, b: LocalInstance) -> float:
+    """Distance of the median colours in Lab, lightness halved."""
+    rgb = np.stack([np.median(i.support.rgb, axis=0) for i in (a, b)]).astype(np.float32)
+    lab = cv2.cvtColor(rgb[None] / np.float32(255.0), cv2.COLOR_RGB2Lab)[0]
+    return float(np.linalg.norm((lab[0] - lab[1]) * np.array([0.5, 1.0, 1.0])))
 
 
 def _gap(a: LocalInstance, tree: cKDTree) -> float:

@@ -85,18 +85,37 @@ def choose_surfaces(scene: Scene, planes: list[Plane]) -> list[Surface]:
 def merge_coplanar(scene: Scene, planes: list[Plane]) -> list[Plane]:
     """Pieces of one wide surface joined: level with each other within tolerance and bend, and side by side."""
     out: list[Plane] = []
+    bounds = [_share_behind(scene, p) < 0.02 and not _mounted(scene, p, planes) for p in planes]
+    bounding = {id(p) for p, flag in zip(planes, bounds, strict=True) if flag}
     for plane in sorted(planes, key=lambda p: -p.area):
         for number, big in enumerate(out):
-            if _same_surface(scene, big, plane):
+            both = id(plane) in bounding and id(big) in bounding
+            if _same_surface(scene, big, plane, both):
                 members = np.union1d(big.members, plane.members)
                 out[number] = _repaint(scene, replace(big, members=members, area=big.area + plane.area))
+                if id(big) in bounding:
+                    bounding.add(id(out[number]))
                 break
         else:
             out.append(plane)
     return out
 
 
-def _same_surface(scene: Scene, big: Plane, small: Plane) -> bool:
+def _mounted(scene: Scene, plane: Plane, planes: list[Plane]) -> bool:
+    """True for what hangs on a wall: a plane less than 15 cm before a parallel one that goes on behind it."""
+    points = scene.cloud.points[plane.members]
+    least = 1.5 * float(np.median(scene.tolerance[plane.members]))
+    for other in planes:
+        if other.area < 0.5 * plane.area or other.normal @ plane.normal < 0.96:
+            continue
+        if least < float(np.median(other.height(points))) < 0.15 * scene.unit:
+            if np.mean(other.raster.look_up(hull_of(other.footprint), points) > 0) > 0.3:
+                return True
+    return False
+
+
+def _same_surface(scene: Scene, big: Plane, small: Plane, bounding: bool) -> bool:
+    """True for two pieces of one surface; `bounding` says that both bound the room, so that gaps do not matter."""
     if big.normal @ small.normal < 0.97:
         return False
     points = scene.cloud.points[small.members]
@@ -108,7 +127,7 @@ def _same_surface(scene: Scene, big: Plane, small: Plane) -> bool:
         return False
     small_level = scene.level(big) and big.area < 0.35 * scene.unit**2
     reach = 2.0 * big.raster.cell if small_level else 0.25 * float(small.extent()[0])
-    if _share_behind(scene, big) < 0.02 and _share_behind(scene, small) < 0.02:
+    if bounding:
         return True
     rc = np.argwhere(big.footprint > 0)
     local = (points - big.raster.origin) @ big.raster.axes.T / big.raster.cell

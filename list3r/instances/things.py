@@ -12,6 +12,9 @@ from scipy.spatial import cKDTree
 from list3r.instances.cloud import Cloud, neighbour_pairs
 from list3r.instances.surfaces import Labels, Scene, Surface, hull_of
 
+SEAT_AREA_M2 = 0.35
+"""Level surfaces up to this may be parts (seat, lid, step) of a thing that is larger than they are."""
+
 
 def connect_rest(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
     """Connected components of the voxels that belong to no surface, numbered after the surfaces.
@@ -80,7 +83,7 @@ def attach_parts(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
         if not surface.level or surface.structure or surface.sheet:
             continue
         for part, mine in parts.items():
-            if parent[part] != part:
+            if parent[part] != part or part in parent[: len(surfaces) + 1]:
                 continue
             points = cloud.points[mine]
             height = surface.plane.height(points)
@@ -92,7 +95,14 @@ def attach_parts(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
                     _is_back(scene, surface, points, height) or _spans(scene, surface, height, touching)
                 )
             if joined:
-                parent[part] = number + 1
+                small = surface.plane.area < SEAT_AREA_M2 * scene.unit**2 and len(mine) > len(surface.plane.members)
+                own = number + 1
+                parent[part], parent[own] = (part, part) if small and parent[own] == own else (own, parent[own])
+    for label in range(len(parent)):
+        root = label
+        while parent[root] != root:
+            root = int(parent[root])
+        parent[label] = root
     return np.asarray(parent[labels], dtype=np.int32)
 
 
@@ -155,7 +165,7 @@ def drop_slivers(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
 def _is_back(scene: Scene, surface: Surface, points: NDArray[np.float32], height: NDArray[np.float32]) -> bool:
     """True for what rises from a seat over its whole width: a back, not a thing put there."""
     plane = surface.plane
-    if plane.area > 0.35 * scene.unit**2:
+    if plane.area > SEAT_AREA_M2 * scene.unit**2:
         return False
     local = (points - plane.raster.origin) @ plane.raster.axes.T
     spread = cv2.minAreaRect(local.astype(np.float32))[1]
@@ -165,7 +175,7 @@ def _is_back(scene: Scene, surface: Surface, points: NDArray[np.float32], height
 def _spans(scene: Scene, surface: Surface, height: NDArray[np.float32], touching: int) -> bool:
     """True for a thing that goes on above and below a seat and touches it along a good part of its edge."""
     plane = surface.plane
-    if plane.area > 0.35 * scene.unit**2:
+    if plane.area > SEAT_AREA_M2 * scene.unit**2:
         return False
     away = 0.04 * scene.unit
     edge = 2.0 * float(plane.extent().sum()) / scene.cloud.voxel
