@@ -28,7 +28,8 @@ def main() -> None:
     names = {"rgb": [], "depth": []}
     for k, (time, T_world_cam) in enumerate(zip(times, poses, strict=True)):
         picture = renderer.render(T_world_cam)
-        Image.fromarray(picture.color).save(folder / f"rgb/{k:04d}.png")
+        color = np.round(picture.color).astype(np.uint8)
+        Image.fromarray(color).save(folder / f"rgb/{k:04d}.png")
         millimetres = np.round(picture.depth * 1000).astype(np.uint16)  # 0 where depth is unknown
         Image.fromarray(millimetres).save(folder / f"depth/{k:04d}.png")
         for kind, lines in names.items():
