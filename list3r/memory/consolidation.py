@@ -12,7 +12,7 @@ import numpy as np
 from list3r.memory.bodies import Body
 from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing
 from list3r.memory.describe import describe, median_rgb
-from list3r.memory.evidence import Evidence, EvidenceSettings, weigh
+from list3r.memory.evidence import Evidence, EvidenceSettings, contested, weigh
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import floor_height
 from list3r.memory.identities import Identities, assign_ids
@@ -169,6 +169,8 @@ def _things(
     checks = store.chunk_checksums()
     upright = _gravity_known(store)
     first = min(c.component for c in chunks)
+    shapes = {k: v.shapes for k, v in summaries.items()}
+    dropped = contested(groups, shapes, placed, world_unit(chunks, summaries), s.evidence)
     before: dict[tuple[object, ...], Thing] = _derived.get(store, {})
     known: dict[tuple[object, ...], Thing] = {}
     out = []
@@ -177,12 +179,11 @@ def _things(
             continue
         component = rows[group[0][0]].component
         up = upright and component == first
+        members = [Member(shapes[k], _at(summaries, (k, n)), placed[k], dropped[k]) for k, n in group]
         poses = tuple((checks[k], placed[k].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
-        key: tuple[object, ...] = (instance_id, component, up, seen.agreement, tuple(group), poses)
+        cuts = b"".join(np.packbits(m.dropped[m.shapes.owner == m.at]).tobytes() for m in members)
+        key: tuple[object, ...] = (instance_id, component, up, seen.agreement, tuple(group), poses, cuts)
         if key not in before:
-            members = [
-                Member(summaries[k[0]].shapes, _at(summaries, k), placed[k[0]], rows[k[0]].image_size) for k in group
-            ]
             thing = derive_thing(instance_id, members, component, seen.agreement, upright=up, settings=s.derive)
             known[key] = replace(thing, body=replace(thing.body, stamp=next(_stamps)))
         else:

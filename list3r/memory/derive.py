@@ -42,7 +42,13 @@ class Member:
     at: int
     """Position in the chunk's shapes."""
     S_world_chunk: Sim3
-    image_size: tuple[int, int]
+    dropped: NDArray[np.bool_]
+    """Points of the chunk's shapes that belong to something else. Shape (R,)."""
+
+    @property
+    def own(self) -> NDArray[np.bool_]:
+        """The points of the chunk's shapes that are its surface. Shape (R,)."""
+        return np.asarray((self.shapes.owner == self.at) & ~self.dropped)
 
 
 @dataclass(frozen=True)
@@ -71,11 +77,11 @@ def derive_thing(
     `agreement` is the share of the chunks that saw its place and found it; `upright` says that z is up.
     """
     s = settings
-    points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[m.shapes.owner == m.at]) for m in members])
-    rgb = np.concatenate([m.shapes.rgb[m.shapes.owner == m.at] for m in members])
+    points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[m.own]) for m in members])
+    rgb = np.concatenate([m.shapes.rgb[m.own] for m in members])
     if len(points) == 0:
         points, rgb = members[0].S_world_chunk.apply(np.zeros((1, 3))), np.zeros((1, 3), np.uint8)
-    owner = np.repeat(np.arange(len(members)), [int((m.shapes.owner == m.at).sum()) for m in members])
+    owner = np.repeat(np.arange(len(members)), [int(m.own.sum()) for m in members])
     step = -(-len(points) // s.max_points)
     points, rgb, owner = points[::step], rgb[::step], owner[::step]
     keep = _confirmed(points, owner, members, s)

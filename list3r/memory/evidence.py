@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from list3r.memory.geometry import Sim3
 from list3r.memory.merging import Key, PairScores
 from list3r.memory.shapes import ChunkShapes
 
@@ -21,6 +23,10 @@ class EvidenceSettings:
     """Share of its surface that another chunk gives to one other thing, to speak against it."""
     min_agreement: float = 0.4
     """Share of the chunks that saw its place and found it too."""
+    claim_m: float = 0.1
+    """Edge of the cells in which the claims of things to a place are counted."""
+    claims: int = 4
+    """A bit that one chunk alone gives to a thing, and this many to another, is not part of it."""
 
 
 @dataclass(frozen=True)
@@ -80,3 +86,37 @@ def weigh(
         ranked = tuple(sorted(votes, key=lambda g: (-votes[g], g)))
         out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked))
     return out
+
+
+def contested(
+    groups: Sequence[Sequence[Key]],
+    chunks: Mapping[int, ChunkShapes],
+    S_world_chunk: Mapping[int, Sim3],
+    unit: float,
+    settings: EvidenceSettings,
+) -> dict[int, NDArray[np.bool_]]:
+    """The points of each chunk that it alone gives to a thing, while several chunks give their place to another one.
+
+    Only things that at least three chunks found lose points so: a chair's back that one chunk took for table.
+    """
+    names = sorted(chunks)
+    group = [np.full(len(chunks[k].local_id), -1, np.int64) for k in names]
+    large = np.array([len({k for k, _ in g}) >= 3 for g in groups], dtype=bool)
+    for n, members in enumerate(groups):
+        for chunk_id, local_id in members:
+            group[names.index(chunk_id)][int(np.searchsorted(chunks[chunk_id].local_id, local_id))] = n
+    points = np.concatenate([S_world_chunk[k].apply(chunks[k].points) for k in names])
+    owner = np.concatenate([g[chunks[k].owner] for g, k in zip(group, names, strict=True)])
+    chunk = np.concatenate([np.full(len(chunks[k].points), n) for n, k in enumerate(names)])
+    drop = np.zeros(len(points), dtype=bool)
+    if len(points):
+        cell = np.floor(points / (settings.claim_m * unit)).astype(np.int64)
+        _, place = np.unique(cell @ np.array([73856093, 19349663, 83492791]), return_inverse=True)
+        claim, at = np.unique(place * len(groups) + owner, return_inverse=True)
+        pairs = np.unique(at * len(names) + chunk)
+        count = np.bincount(pairs // len(names), minlength=len(claim))
+        most = np.zeros(int(place.max()) + 1, np.int64)
+        np.maximum.at(most, claim // len(groups), count)
+        drop = large[owner] & (count[at] == 1) & (most[place] >= settings.claims)
+    split = np.cumsum([len(chunks[k].points) for k in names])[:-1]
+    return dict(zip(names, np.split(drop, split), strict=True))
