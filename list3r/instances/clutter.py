@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.instances.cloud import neighbour_pairs, pack, unpack
+from list3r.instances.cloud import Float, neighbour_pairs, pack, unpack
 from list3r.instances.surfaces import Labels, Scene, Surface
 from list3r.instances.things import least_voxels, members_of
 
@@ -19,6 +19,10 @@ WALL_GAP_M = 0.15
 """A component that lies mostly within this of a wall may be several things before the wall."""
 MIN_CROWD_M = 0.3
 """Smaller components are left whole."""
+COLOR_LENGTH_M = 0.003
+"""Distance that one unit of colour difference counts for when parts grow."""
+REGROW_M = 0.06
+"""How far a part grows."""
 COLOR_STEP = 8.0
 """Colour difference (Lab, lightness halved) of neighbouring voxels that parts."""
 COLOR_JOIN = 12.0
@@ -74,10 +78,30 @@ def _split(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.int64]:
     if not large.any():
         return np.ones(len(mine), np.int64)
     seeds, number = core[large], np.unique(component[large], return_inverse=True)[1] + 1
+    return _rejoin(scene, mine, _regrow(scene, mine, seeds, number, color), color)
+
+
+def _regrow(
+    scene: Scene, mine: NDArray[np.int64], seeds: NDArray[np.int64], number: NDArray[np.int64], color: Float
+) -> NDArray[np.int64]:
+    """Part of each voxel: that of the seed nearest in place and colour; what is near none makes parts of its own."""
+    cloud = scene.cloud
+    place = np.concatenate([cloud.points[mine], color * np.float32(COLOR_LENGTH_M * scene.unit)], axis=1)
+    distance, nearest = cKDTree(place[seeds]).query(place, distance_upper_bound=REGROW_M * scene.unit)
+    found = np.isfinite(distance)
     parts = np.zeros(len(mine), np.int64)
-    _, nearest = cKDTree(cloud.points[mine[seeds]]).query(cloud.points[mine])
-    parts[:] = number[nearest]
-    return _rejoin(scene, mine, parts, color)
+    parts[found] = number[nearest[found]]
+    left = np.flatnonzero(~found)
+    i, j = neighbour_pairs(cloud.keys[mine[left]], 2)
+    graph = coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(len(left), len(left)))
+    _, component = connected_components(graph, directed=False)
+    large = np.bincount(component, minlength=1)[component] >= 2 * least_voxels(scene)
+    parts[left[large]] = number.max() + 1 + component[large] if len(left) else 0
+    small = np.flatnonzero(parts == 0)
+    if len(small):
+        known = np.flatnonzero(parts)
+        parts[small] = parts[known[cKDTree(cloud.points[mine[known]]).query(cloud.points[mine[small]])[1]]]
+    return np.unique(parts, return_inverse=True)[1] + 1
 
 
 def _hollow(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.bool_]:

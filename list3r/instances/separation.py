@@ -27,7 +27,8 @@ def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: flo
     """Pairs of local ids seen side by side in at least `frames` frames and not possibly pieces of one. Shape (P, 2).
 
     An over-segmented thing looks just like two things side by side. So a pair only counts when a surface parts it
-    (one stands on the other), when they lie in one plane and differ in colour, when both are small and apart, or when they are far apart and not in one plane.
+    (one stands on the other), when they lie in one plane and differ in colour, when both are small and apart, or
+    when they are far apart and not in one plane.
     """
     well = [_well_visible(instance) for instance in instances]
     trees = [cKDTree(instance.support.points) for instance in instances]
@@ -48,7 +49,7 @@ def _well_visible(instance: LocalInstance) -> set[int]:
 def _two_things(a: LocalInstance, b: LocalInstance, trees: tuple[cKDTree, cKDTree], unit: float) -> bool:
     if a.plane is not None and b.plane is not None and (_on_plane(a, b, unit) or _on_plane(b, a, unit)):
         return _color_difference(a, b) > COLOR_DIFFERENCE
-    gap = _gap(a, trees[1]) / unit
+    gap = _gap(a, b, trees[1], 1.1 * ROOM_M * unit) / unit
     if gap < TOUCHING_M:
         return _stands_on(a, b, unit) or _stands_on(b, a, unit)
     return (_small(a, unit) and _small(b, unit)) or gap > ROOM_M or a.structure or b.structure
@@ -61,9 +62,13 @@ def _color_difference(a: LocalInstance, b: LocalInstance) -> float:
     return float(np.linalg.norm((lab[0] - lab[1]) * np.array([0.5, 1.0, 1.0])))
 
 
-def _gap(a: LocalInstance, tree: cKDTree) -> float:
-    distance, _ = tree.query(a.support.points[::3])
-    return float(np.quantile(distance, 0.02))
+def _gap(a: LocalInstance, b: LocalInstance, tree: cKDTree, far: float) -> float:
+    """About the smallest distance of a from b, at most `far`."""
+    p, q = a.support.points, b.support.points
+    if np.linalg.norm(np.maximum(np.maximum(p.min(axis=0) - q.max(axis=0), q.min(axis=0) - p.max(axis=0)), 0.0)) > far:
+        return far
+    distance, _ = tree.query(p[:: max(1, len(p) // 300)], distance_upper_bound=far)
+    return float(np.quantile(np.minimum(distance, far), 0.02))
 
 
 def _small(instance: LocalInstance, unit: float) -> bool:

@@ -204,7 +204,7 @@ def adopt_fragments(scene: Scene, surfaces: list[Surface], labels: Labels) -> La
     free = np.flatnonzero(labels > taken)
     reach = 0.04 * scene.unit
     for part, mine in sorted(parts.items(), key=lambda item: (len(item[1]), item[0])):
-        if _rests_alone(scene, surfaces, mine):
+        if 2 * len(mine) > max(size[taken + 1 :]) or _rests_alone(scene, surfaces, mine):
             continue
         low, high = points[mine].min(axis=0) - reach, points[mine].max(axis=0) + reach
         near = free[((points[free] >= low) & (points[free] <= high)).all(axis=1) & (parent[labels[free]] != part)]
