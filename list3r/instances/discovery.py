@@ -59,7 +59,7 @@ class GeometricDiscoverer:
             index = cloud.index[views.anchors.index(position)]
         else:
             index = _nearest_voxels(views.view(position), cloud)
-        return np.where(index >= 0, cut.labels[index], 0).astype(np.int32)
+        return np.asarray(np.append(cut.labels, 0)[index], np.int32)
 
 
 def _nearest_voxels(view: View, cloud: Cloud) -> NDArray[np.int32]:

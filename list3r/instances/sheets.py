@@ -44,6 +44,8 @@ def find_sheets(scene: Scene, surfaces: list[Surface], labels: Labels) -> tuple[
             continue
         if surface.plane.area < MIN_SURFACE_AREA_M2 * scene.unit**2:
             continue
+        if np.count_nonzero(out == number + 1) < 0.5 * len(surface.plane.members):
+            continue
         top = _look_down(scene, surfaces, out, number)
         pieces = _pieces(scene, top)
         mine = pieces.ravel()[top.cell]
