@@ -9,11 +9,11 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from list3r.memory.bodies import Body
+from list3r.memory.bodies import Body, aabb_gap
 from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing
-from list3r.memory.describe import describe, median_rgb
+from list3r.memory.describe import describe
 from list3r.memory.evidence import Evidence, EvidenceSettings, contested, weigh
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Array, Sim3
 from list3r.memory.gravity import floor_height
 from list3r.memory.identities import Identities, assign_ids
 from list3r.memory.merging import Key, MergeSettings, PairScores, merge_nodes, pair_scores
@@ -91,7 +91,18 @@ def consolidate(
 # ---------------------------------------------------------------------------------------------- merging
 
 
-_scores: WeakKeyDictionary[Store, dict[tuple[int, int], tuple[bytes, PairScores]]] = WeakKeyDictionary()
+@dataclass(frozen=True)
+class _Scored:
+    """Scores of a pair of chunks, and what they were computed from."""
+
+    exact: bytes
+    rounded: bytes
+    scores: PairScores
+
+
+_scored: WeakKeyDictionary[Store, dict[tuple[int, int], _Scored]] = WeakKeyDictionary()
+_FAR_M = 0.5
+"""Chunks whose points lie further apart than this share no thing."""
 
 
 def _partition(
@@ -121,21 +132,41 @@ def _known_pairs(
     """Scores of all pairs of chunks of one component. Each is computed at the pose rounded to about a millimetre: it
     is a function of what the store holds, and it need not be computed again while a graph settles.
     """
-    known = _scores.setdefault(store, {})
-    checks = store.chunk_checksums()
+    known = _scored.setdefault(store, {})
+    checks = {k: crc.to_bytes(4, "big") for k, crc in store.chunk_checksums().items()}
+    slack = 0.5 * _FAR_M * world_unit(chunks, summaries)
+    extent = {c.chunk_id: _extent(summaries[c.chunk_id], c.S_world_chunk, slack) for c in chunks}
+    pose = {c.chunk_id: c.S_world_chunk.as_matrix().tobytes() for c in chunks}
     out = {}
     for n, u in enumerate(chunks):
         for v in chunks[n:]:
-            if u.component != v.component:
-                continue
-            unit = summaries[u.chunk_id].unit
-            S_u_v = _rounded(u.S_world_chunk.inverse() @ v.S_world_chunk, unit) if u is not v else Sim3.identity()
-            stamp = np.append(S_u_v.as_matrix(), [checks[u.chunk_id], checks[v.chunk_id]]).tobytes()
             pair = (u.chunk_id, v.chunk_id)
-            if pair not in known or known[pair][0] != stamp:
-                known[pair] = (stamp, pair_scores(summaries[u.chunk_id].shapes, summaries[v.chunk_id].shapes, S_u_v))
-            out[pair] = known[pair][1]
+            if u.component != v.component or aabb_gap(extent[pair[0]], extent[pair[1]]) > 0.0:
+                continue
+            before, crcs = known.get(pair), checks[pair[0]] + checks[pair[1]]
+            exact = pose[pair[0]] + pose[pair[1]] + crcs
+            if before is None or before.exact != exact:
+                known[pair] = _score(summaries[pair[0]], summaries[pair[1]], u, v, exact, crcs, before)
+            out[pair] = known[pair].scores
     return out
+
+
+def _score(
+    a: ChunkSummary, b: ChunkSummary, u: ChunkRow, v: ChunkRow, exact: bytes, checks: bytes, before: _Scored | None
+) -> _Scored:
+    S_u_v = _rounded(u.S_world_chunk.inverse() @ v.S_world_chunk, a.unit) if u is not v else Sim3.identity()
+    rounded = S_u_v.as_matrix().tobytes() + checks
+    if before is not None and before.rounded == rounded:
+        return replace(before, exact=exact)
+    return _Scored(exact, rounded, pair_scores(a.shapes, b.shapes, S_u_v))
+
+
+def _extent(summary: ChunkSummary, S_world_chunk: Sim3, slack: float) -> Array:
+    """Axis-aligned box of a chunk's points in the world, grown. Shape (2, 3)."""
+    if len(summary.shapes.points) == 0:
+        return np.array([[np.inf] * 3, [-np.inf] * 3])
+    p = S_world_chunk.apply(summary.shapes.points)
+    return np.stack([p.min(axis=0) - slack, p.max(axis=0) + slack])
 
 
 def _rounded(transform: Sim3, unit: float) -> Sim3:
@@ -276,7 +307,7 @@ def _record(
     body: Body = thing.body
     seen = [times[f] for f in thing.frames if f in times] or [0.0]
     local = (body.points - body.box.center) @ body.box.rotation
-    words, color = describe(local, body.rgb, body.box.size, unit, metric=metric, structure=body.structure)
+    words = describe(local, thing.color_name, body.box.size, unit, metric=metric, structure=body.structure)
     return Instance(
         id=body.id,
         label=label,
@@ -290,8 +321,8 @@ def _record(
         last_seen_s=max(seen),
         state="present",
         structure=body.structure,
-        color_rgb=median_rgb(body.rgb),
-        color_name=color,
+        color_rgb=thing.color_rgb,
+        color_name=thing.color_name,
         component=body.component,
         best_view=thing.best_view,
     )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.bodies import Body, fit_box, without_strays
+from list3r.memory.describe import color_name, median_rgb
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import BestView
 from list3r.memory.shapes import ChunkShapes
@@ -61,6 +62,9 @@ class Thing:
     frames: tuple[tuple[int, int], ...]
     """(session id, Frame.index) of every frame in which it is seen, in order."""
     best_view: BestView | None
+    color_rgb: tuple[int, int, int]
+    """Median colour."""
+    color_name: str
 
 
 def derive_thing(
@@ -105,7 +109,7 @@ def derive_thing(
         confidence=_confidence(len(frames), stability, members, agreement, s),
     )
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
-    return Thing(body, unit_feature, tuple(frames), _best_view(members, s))
+    return Thing(body, unit_feature, tuple(frames), _best_view(members, s), median_rgb(rgb), color_name(rgb))
 
 
 def _aabb(points: Array, trim: float) -> Array:

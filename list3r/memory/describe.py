@@ -57,7 +57,7 @@ def color_name(rgb: NDArray[np.uint8]) -> str:
     """
     if len(rgb) == 0:
         return "grey"
-    lab = lab_from_rgb(rgb)
+    lab = lab_from_rgb(rgb[:: -(-len(rgb) // 300)])
     hues = np.array([_hue(name) for name, _ in _TERMS])
     votes = _nearest(lab)
     winner = _winner(hues[votes])
@@ -115,22 +115,19 @@ def shape_word(points: Array, size: Array) -> str:
     return "box"
 
 
-def describe(
-    points: Array, rgb: NDArray[np.uint8], size: Array, unit: float, *, metric: bool, structure: str | None
-) -> tuple[str, str]:
-    """(description, colour name) of a thing.
+def describe(points: Array, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
+    """Description of a thing: "small white cylinder, 9 cm".
 
     `points` (N, 3) are in the axes of its box and `size` (3,) are the box's full edge lengths, world units; `unit` is
     what a metre is about, also where the memory is not metric, and then no centimetres are told.
     """
-    color = color_name(rgb)
     longest = float(np.max(size))
     if structure is not None:
         what = {"plane": "flat surface"}.get(structure, structure)
-        return _with_size(f"{color} {what}", longest, metric), color
+        return _with_size(f"{color} {what}", longest, metric)
     metres = longest / unit
     scale = "tiny" if metres < 0.06 else "small" if metres < 0.3 else "medium" if metres < 0.8 else "large"
-    return _with_size(f"{scale} {color} {shape_word(points, size)}", longest, metric), color
+    return _with_size(f"{scale} {color} {shape_word(points, size)}", longest, metric)
 
 
 def _with_size(words: str, longest: float, metric: bool) -> str:

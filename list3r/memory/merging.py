@@ -79,7 +79,7 @@ class _Edge:
 
 
 def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3) -> PairScores:
-    """Compare all local instances of two chunks; pairs that nowhere meet, in space or in shared frames, are left out.
+    """Compare all local instances of two chunks; pairs whose surfaces nowhere meet are left out.
 
     Pass the same chunk twice, with the identity, for the pairs within a chunk (i < j).
     """
@@ -89,7 +89,7 @@ def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3) -> PairScores:
     if u.chunk_id == v.chunk_id:
         meet = np.triu(meet, 1)
     shared, iou = _shared_frames(u, v)
-    i, j = np.nonzero(meet | ((shared > 0) & (u.chunk_id != v.chunk_id)))
+    i, j = np.nonzero(meet)
     return PairScores(i, j, i_on_j[i, j], j_on_i[i, j], shared[i, j], iou[i, j])
 
 
