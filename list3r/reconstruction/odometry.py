@@ -43,12 +43,18 @@ class OdometrySettings:
     """Least correlation of brightness with the model's, where either has any."""
     most_looseness_m: float = 0.02
     """Largest standard deviation of the worst determined motion, at the median depth: guards against bare walls."""
+    doubt: float = 0.85
+    """A frame whose inliers fall below this share of the usual is searched for as well."""
+    forget: float = 0.98
+    """What remains of the usual share of inliers from one frame to the next that has less."""
     most_speed_m_per_s: float = 3.0
     most_turn_deg_per_s: float = 360.0
     gap_s: float = 0.15
     """Frames further apart than this are searched for; a prediction of their motion means little."""
     most_gap_s: float = 1.5
     """Frames further apart than this are searched for by features only."""
+    short_segment: int = 5
+    """Frames after which a new segment stands on its own."""
     search_keyframes: int = 6
     """Most keyframes whose features are compared in a search."""
     sweep_samples: int = 800
@@ -77,6 +83,8 @@ class Segment:
     """By position in the chunk."""
     keyframes: list[int] = field(default_factory=list)
     """Positions."""
+    usual_inliers: float = 0.0
+    """Share of inliers that the last frames had."""
 
 
 class Tracker:
@@ -120,11 +128,20 @@ class Tracker:
     def _step(self, position: int) -> None:
         if not self._usable(position):
             return
-        found = self._follow(self.segments[-1], position) if self.segments else None
-        if found is None:
-            self.segments.append(Segment(SurfelModel(self.settings.fusion, self.settings.noise)))
-            found = np.eye(4)
-        self._accept(self.segments[-1], position, found)
+        for segment in self._open_segments():
+            found = self._follow(segment, position)
+            if found is not None:
+                self._accept(segment, position, found)
+                return
+        self.segments.append(Segment(SurfelModel(self.settings.fusion, self.settings.noise)))
+        self._accept(self.segments[-1], position, np.eye(4))
+
+    def _open_segments(self) -> list[Segment]:
+        """The last segment, and the longest one while the last may be no more than a few spoilt frames."""
+        last = self.segments[-1:]
+        longest = max(self.segments, key=lambda s: len(s.T_segment_cam), default=None)
+        short = bool(last) and len(last[0].T_segment_cam) < self.settings.short_segment
+        return [*last, longest] if short and longest is not None and longest is not last[0] else last
 
     def _accept(self, segment: Segment, position: int, T_segment_cam: Pose) -> None:
         segment.model.fuse(self.view(position), T_segment_cam)
@@ -145,15 +162,26 @@ class Tracker:
         """The frame's pose in the segment, or None when nothing trustworthy is found."""
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
+        found: list[Registration | None] = []
         if gap_s <= self.settings.gap_s:
             for T in (self._predict(segment, last, gap_s), segment.T_segment_cam[last]):
-                found = self._place(segment, position, T)
-                if found is not None and self._possible(segment, last, found.T_model_cam, gap_s):
-                    return found.T_model_cam
-        found = self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s)
-        if found is None or not self._possible(segment, last, found.T_model_cam, gap_s):
+                found.append(self._place(segment, position, T))
+                if self._possible(segment, last, found[-1], gap_s) and not self._doubtful(segment, found[-1]):
+                    break
+            else:
+                found.append(self._search(segment, position, nearby=True))
+        else:
+            found.append(self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s))
+        possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
+        if not possible:
             return None
-        return found.T_model_cam
+        best = max(possible, key=lambda f: f.overlap * f.inliers)
+        segment.usual_inliers = max(best.inliers, self.settings.forget * segment.usual_inliers)
+        return best.T_model_cam
+
+    def _doubtful(self, segment: Segment, found: Registration | None) -> bool:
+        """Whether much less agrees than did in the frames before, as in a false minimum."""
+        return found is None or found.inliers < self.settings.doubt * segment.usual_inliers
 
     def _predict(self, segment: Segment, last: int, gap_s: float) -> Pose:
         """Constant velocity from the last two frames."""
@@ -191,8 +219,10 @@ class Tracker:
             and found.looseness_m(float(np.median(view.depth[view.depth > 0]))) <= s.most_looseness_m
         )
 
-    def _possible(self, segment: Segment, last: int, T: Pose, gap_s: float) -> bool:
-        step = np.linalg.inv(segment.T_segment_cam[last]) @ T
+    def _possible(self, segment: Segment, last: int, found: Registration | None, gap_s: float) -> bool:
+        if found is None:
+            return False
+        step = np.linalg.inv(segment.T_segment_cam[last]) @ found.T_model_cam
         gap_s = max(gap_s, 1.0 / 60.0)
         return bool(
             np.linalg.norm(step[:3, 3]) <= self.settings.most_speed_m_per_s * gap_s

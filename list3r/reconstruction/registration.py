@@ -34,6 +34,10 @@ class RegistrationSettings:
     """Least cosine between the normals of a pair."""
     photometric_weight: float = 2.0
     """Weight of a brightness residual against a depth residual of the same number of standard deviations."""
+    normal_noise: float = 0.05
+    """Standard deviation of a measured normal, radians; what such noise seems to determine does not count."""
+    gradient_noise: float = 2.0
+    """Brightness gradients below this determine nothing, grey levels per pixel."""
     least_pairs: int = 150
     converged: float = 3e-5
     """Largest component of the last step, metres and radians."""
@@ -77,7 +81,8 @@ class Registration:
     """Correlation of model and view brightness over the inliers; NaN without texture or brightness."""
     pairs: int
     information: NDArray[np.float64]
-    """Of the left-hand tangent (translation, rotation) in model coordinates. Shape (6, 6)."""
+    """What is known of the left-hand tangent (translation, rotation) in model coordinates beyond what noise in
+    normals and gradients feigns. Shape (6, 6)."""
 
     def looseness_m(self, lever_m: float) -> float:
         """Standard deviation of the motion that the pairs determine worst, metres at `lever_m` from the camera."""
@@ -86,7 +91,8 @@ class Registration:
         shift[:3, 3:] = skew(T[:3, 3])  # rotate about the camera instead of the model's origin
         scale = np.diag([1.0, 1.0, 1.0, *[1.0 / lever_m] * 3])
         about_camera = scale @ shift.T @ self.information @ shift @ scale
-        return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(about_camera)[0], 1e-12)))
+        weakest = float(np.linalg.eigvalsh(about_camera)[0])
+        return 1.0 / float(np.sqrt(weakest)) if weakest > 0 else float("inf")
 
 
 def register(
@@ -122,6 +128,9 @@ def register(
         if halved == settings.gate_halvings and iteration > 2 and np.abs(step).max() < settings.converged:
             break
     assert pairs is not None
+    information = _solid_information(pairs, frame, T, settings, photometric)
+    if anchors is not None:
+        information += _anchored(anchors, T, view.camera.fx)[0]
     return Registration(
         T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
     )
@@ -210,12 +219,33 @@ def _geometric(pairs: _Pairs, huber: float) -> tuple[NDArray[np.float64], NDArra
     return _normal_equations(slope, pairs.residual, pairs.scale, huber)
 
 
+def _solid_information(
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], settings: RegistrationSettings, photometric: bool
+) -> NDArray[np.float64]:
+    """Information without the share that comes from noise alone.
+
+    A point-to-plane slope is A n with A = (I, [q]x). Noise of variance s in n adds s A A' on average, by which a bare
+    wall would seem to hold the camera; that much is taken off again.
+    """
+    weight = (pairs.inverse_sigma / np.float32(pairs.scale)) ** 2
+    weighted = weight[:, None] * pairs.moved
+    first, second = skew(weighted.sum(axis=0).astype(np.float64)), (weighted.T @ pairs.moved).astype(np.float64)
+    feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
+    information = _geometric(pairs, settings.huber)[0] - settings.normal_noise**2 * feigned
+    if photometric:
+        information += settings.photometric_weight * _photometric(pairs, frame, T, settings.gradient_noise)[0]
+    return information
+
+
 def _photometric(
-    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64]
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
     assert pairs.gray is not None
     value, dx, dy = _sample(frame, pairs.uv)
+    if least_gradient > 0:
+        strong = dx * dx + dy * dy > least_gradient**2
+        dx, dy = dx * strong, dy * strong
     error = value - pairs.gray
     error -= np.median(error)
     scale = 1.4826 * float(np.median(np.abs(error))) + 1.0

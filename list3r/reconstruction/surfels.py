@@ -82,9 +82,11 @@ class SurfelModel:
         alike = np.einsum("ij,ij->i", self.normals[element], normals) > self._settings.normal_agreement
         same = hit & (np.abs(behind) < limit) & alike
         self._average(element[same], points[same], normals[same], gray[same], weight[same])
-        self.weight[element[hit & (behind > limit)]] *= 0.5
+        through = element[hit & (behind > limit)]
+        self.weight[through] *= 0.5
         new = ~hit | (np.abs(behind) > limit)
-        self._drop()
+        if (self.weight[through] <= self._settings.drop_below).any():
+            self._drop()
         self._append(points[new], normals[new], gray[new], weight[new])
 
     def _average(self, index: NDArray[np.int64], points: Floats, normals: Floats, gray: Floats, weight: Floats) -> None:
@@ -99,9 +101,8 @@ class SurfelModel:
 
     def _drop(self) -> None:
         keep = self.weight > self._settings.drop_below
-        if not keep.all():
-            self.points, self.normals = self.points[keep], self.normals[keep]
-            self.gray, self.weight = self.gray[keep], self.weight[keep]
+        self.points, self.normals = self.points[keep], self.normals[keep]
+        self.gray, self.weight = self.gray[keep], self.weight[keep]
 
     def _append(self, points: Floats, normals: Floats, gray: Floats, weight: Floats) -> None:
         self.points = np.concatenate([self.points, points])

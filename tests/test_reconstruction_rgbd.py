@@ -1,0 +1,166 @@
+"""Reconstruction rgbd: known poses are recovered, and what cannot be followed is said to be lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.frames.base import Frame
+from list3r.frames.options import SourceOptions
+from list3r.frames.source import open_source
+from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.reconstruction.base import backproject
+from list3r.reconstruction.rgbd import RgbdReconstructor
+from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, render, walk
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    return walk(45)
+
+
+@pytest.fixture(scope="module")
+def frames(truth: np.ndarray) -> list[Frame]:
+    return frames_along(truth)
+
+
+def test_known_poses_are_recovered(frames: list[Frame], truth: np.ndarray) -> None:
+    result = RgbdReconstructor()(frames, CAMERA)
+    shift, turn = pose_errors(result.T_chunk_cam, truth)
+    assert result.posed.all()
+    assert shift.max() < 0.01
+    assert turn.max() < 0.5
+    assert np.allclose(result.T_chunk_cam[0], np.eye(4))
+    assert result.keyframes[0] == 0
+    assert np.all(np.diff(result.keyframes) > 0)
+
+
+def test_the_same_frames_give_the_same_result(frames: list[Frame]) -> None:
+    a, b = (RgbdReconstructor()(frames[:15], CAMERA) for _ in range(2))
+    assert np.array_equal(a.T_chunk_cam, b.T_chunk_cam)
+    assert np.array_equal(a.confidence, b.confidence)
+
+
+def test_given_poses_are_kept_and_bad_ones_are_not_used(frames: list[Frame], truth: np.ndarray) -> None:
+    given = list(frames[:10])
+    given[2] = replace(given[2], T_source_cam=None)
+    given[3] = replace(given[3], T_source_cam=np.full((4, 4), np.nan))
+    given[4] = replace(given[4], T_source_cam=np.diag([2.0, 2.0, 2.0, 1.0]))
+    result = RgbdReconstructor(poses="given")(given, CAMERA)
+    assert result.posed.tolist() == [True, True, False, False, False, *[True] * 5]
+    assert np.array_equal(result.T_chunk_cam[result.posed], truth[:10][result.posed])
+
+
+def test_covered_frames_are_lost_and_the_rest_goes_on(frames: list[Frame], truth: np.ndarray) -> None:
+    covered = [black(f) if 20 <= k < 26 else f for k, f in enumerate(frames)]
+    result = RgbdReconstructor()(covered, CAMERA)
+    assert np.flatnonzero(~result.posed).tolist() == list(range(20, 26))
+    shift, _ = pose_errors(result.T_chunk_cam[result.posed], truth[result.posed])
+    assert shift.max() < 0.01
+
+
+def test_frames_without_depth_are_lost(frames: list[Frame]) -> None:
+    some = [replace(f, depth=None) if k == 3 else f for k, f in enumerate(frames[:8])]
+    result = RgbdReconstructor()(some, CAMERA)
+    assert np.flatnonzero(~result.posed).tolist() == [3]
+    assert not result.depth[3].any()
+    assert not result.confidence[3].any()
+
+
+def test_a_cut_to_a_seen_place_is_attached_again(truth: np.ndarray) -> None:
+    poses = np.concatenate([walk(25), walk(20, start=2.0)])
+    result = RgbdReconstructor()(frames_along(poses), CAMERA)
+    shift, _ = pose_errors(result.T_chunk_cam, poses)
+    assert result.posed.all()
+    assert shift.max() < 0.02
+
+
+def test_a_cut_to_another_place_leaves_the_larger_part(frames: list[Frame], truth: np.ndarray) -> None:
+    other = frames_along(walk(15), seed=7, boxes=(((-0.5, -0.4, 1.2), (0.1, 0.3, 1.7)),))
+    cut = [*frames[:25], *(replace(f, index=25 + k, time_s=(25 + k) / 30) for k, f in enumerate(other))]
+    result = RgbdReconstructor()(cut, CAMERA)
+    assert result.posed.tolist() == [True] * 25 + [False] * 15
+    shift, _ = pose_errors(result.T_chunk_cam[:25], truth[:25])
+    assert shift.max() < 0.01
+
+
+def test_a_slow_video_is_followed() -> None:
+    poses = walk(10, speed=15.0)
+    result = RgbdReconstructor()(frames_along(poses, step_s=0.5), CAMERA)
+    shift, _ = pose_errors(result.T_chunk_cam, poses)
+    assert result.posed.all()
+    assert shift.max() < 0.02
+
+
+def test_a_bare_wall_does_not_tell_how_the_camera_moves() -> None:
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 2, 3] = 2.0
+    poses[:, 0, 3] = 0.05 * np.arange(6)
+    with pytest.raises(TrackingError, match="0 to 5"):
+        RgbdReconstructor()(frames_along(poses, contrast=0.0, boxes=()), CAMERA)
+
+
+def test_noise_is_not_followed() -> None:
+    rng = np.random.default_rng(0)
+    shape = (CAMERA.height, CAMERA.width)
+    noise = [
+        Frame(
+            k, k / 30, rng.integers(0, 255, (*shape, 3), np.uint8), rng.uniform(0.5, 4, shape).astype(np.float32), None
+        )
+        for k in range(4)
+    ]
+    with pytest.raises(TrackingError):
+        RgbdReconstructor()(noise, CAMERA)
+
+
+def test_what_is_missing_is_named(frames: list[Frame]) -> None:
+    with pytest.raises(TrackingError, match="no depth"):
+        RgbdReconstructor()([replace(f, depth=None) for f in frames[:3]], CAMERA)
+    with pytest.raises(TrackingError, match="--poses estimate"):
+        RgbdReconstructor(poses="given")([replace(f, T_source_cam=None) for f in frames[:3]], CAMERA)
+    with pytest.raises(OptionError, match="given or estimate"):
+        RgbdReconstructor(poses="guess")
+
+
+def test_confidence_falls_with_distance_angle_and_edges(frames: list[Frame]) -> None:
+    near, far = (render(_looking_at_wall(d, 0.0), boxes=(), noise=False) for d in (1.0, 3.0))
+    slanted = render(_looking_at_wall(1.0, 75.0), boxes=(), noise=False)
+    c_near, c_far, c_slanted = (
+        RgbdReconstructor(poses="given")([f], CAMERA).confidence[0].astype(float) for f in (near, far, slanted)
+    )
+    middle = (slice(110, 130), slice(150, 170))
+    assert c_near[middle].mean() > 0.9
+    assert c_far[middle].mean() < 0.5
+    assert c_slanted[middle].mean() < 0.7 * c_near[middle].mean()
+    result = RgbdReconstructor(poses="given")(frames[:1], CAMERA)
+    confidence, depth = result.confidence[0].astype(float), result.depth[0]
+    step = np.abs(np.diff(depth, axis=1)) > 0.3
+    assert np.all((confidence >= 0) & (confidence <= 1))
+    assert confidence[:, 1:][step].mean() < 0.1
+    assert backproject(depth, CAMERA).shape == (240, 320, 3)
+
+
+def _looking_at_wall(distance: float, turn_deg: float) -> np.ndarray:
+    """A camera before the wall at z = 3.2, turned about the vertical."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_exp(np.array([0.0, np.radians(turn_deg), 0.0]))
+    T[2, 3] = 3.2 - distance * max(np.cos(np.radians(turn_deg)), 0.3)
+    T[0, 3] = -distance * np.sin(np.radians(turn_deg))
+    return T
+
+
+@pytest.mark.data
+def test_a_second_of_the_kitchen(shared_data: Path) -> None:
+    source = open_source(shared_data / "redkitchen", SourceOptions())
+    frames = [f for f in source.read(200, 240) if isinstance(f, Frame)]
+    assert source.info.camera is not None
+    result = RgbdReconstructor()(frames, source.info.camera)
+    truth = np.stack([f.T_source_cam for f in frames if f.T_source_cam is not None])
+    a, b = result.T_chunk_cam[:, :3, 3], truth[:, :3, 3]
+    error = umeyama(a, b, with_scale=False).apply(a) - b
+    assert result.posed.all()
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.01
