@@ -1,0 +1,148 @@
+"""Every command on a small memory, for people and for machines."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import list3r
+from list3r.memory.store import Store
+from tests.conftest import write_small_room
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small room as a file."""
+    path = tmp_path_factory.mktemp("cli") / "room.l3r"
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+    return path
+
+
+def run(*arguments: str | Path) -> str:
+    command = [sys.executable, "-m", "list3r", *map(str, arguments)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def ask(*arguments: str | Path) -> Any:
+    return json.loads(run(*arguments, "--json"))
+
+
+COMMANDS = (
+    "inspect build demo info list show export verify doctor query.nearest query.within query.relations query.similar"
+    " eval.trajectory eval.instances"
+).split()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command: str) -> None:
+    text = run(*command.split("."), "--help")
+    assert f"Example: list3r {command.replace('.', ' ')}" in text
+
+
+def test_help_is_quick_and_loads_nothing_heavy() -> None:
+    code = "import sys; from list3r.cli.app import app; print([m for m in ('torch', 'open3d', 'cv2', 'numpy') if m in sys.modules])"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    )
+
+
+def test_info_names_scale_gravity_and_frames(room: Path) -> None:
+    report = ask("info", room)
+    assert (report["scale"], report["gravity"], report["frames"], report["things"]) == ("metric", "estimated", 20, 4)
+    assert "sensor depth" in run("info", room)
+    assert ask("info", room, "--loops")["edges"] == []
+
+
+def test_list_and_show(room: Path) -> None:
+    assert [i["id"] for i in ask("list", room)] == [2, 3, 4, 5]
+    assert [i["id"] for i in ask("list", room, "--structure")] == [1, 2, 3, 4, 5, 6]
+    assert ask("list", room, "--min-confidence", "0.95") == []
+    mug = ask("show", room, "3")
+    assert mug["description"] == "mug"
+    assert {(r["subject"], r["predicate"], r["object"]) for r in mug["relations"]} == {(3, "on", 2)}
+    assert re.search(r"mug \(3\) on table \(2\)", run("show", room, "3"))
+
+
+def test_nearest_gives_surface_and_centre_distances(room: Path) -> None:
+    first, second = ask("query", "nearest", room, "--point", "1.8,0.1,0.90", "-k", "2")
+    assert first["id"] == 3
+    assert first["distance"] == pytest.approx(0.08, abs=0.01)
+    assert first["center_distance"] == pytest.approx(0.13, abs=1e-6)
+    assert second["center_distance"] > first["center_distance"]
+    assert [m["id"] for m in ask("query", "nearest", room, "--id", "3", "-k", "2")] == [2, 4]
+    assert {m["id"] for m in ask("query", "nearest", room, "mug")} == {3, 4}
+    assert ask("query", "nearest", room, "elephant") == []
+    assert ask("query", "nearest", room, "--point", "9,9,9", "--max-distance", "1") == []
+
+
+def test_within_relations_and_similar(room: Path) -> None:
+    assert {m["id"] for m in ask("query", "within", room, "--point", "2,0,0.77", "--radius", "0.3")} >= {3, 4}
+    assert {m["id"] for m in ask("query", "within", room, "--box", "1.7,0,0.7,1.9,0.2,0.9")} >= {3}
+    answer = ask("query", "relations", room, "--predicate", "on", "--object", "2")
+    assert {r["subject"] for r in answer["relations"]} == {3, 4}
+    assert answer["gravity"] == "estimated"
+    assert len(ask("query", "similar", room, "--id", "3", "-k", "2")) == 2
+    for words in (
+        ("within", room, "--point", "2,0,0.77", "--radius", "0.3"),
+        ("relations", room),
+        ("similar", room, "--id", "3"),
+    ):
+        assert "mug" in run("query", *words)
+
+
+@pytest.mark.parametrize(
+    ("name", "suffix"),
+    [("json", "json"), ("usd", "usda"), ("ply", "ply"), ("glb", "glb"), ("tum", "txt"), ("plan", "png")],
+)
+def test_every_format_is_written(name: str, suffix: str, room: Path, tmp_path: Path) -> None:
+    report = ask("export", room, "--to", name, "--out", tmp_path / f"room.{suffix}")
+    assert report["bytes"] == (tmp_path / f"room.{suffix}").stat().st_size > 0
+
+
+def test_verify_and_doctor(room: Path) -> None:
+    assert ask("verify", room)["sound"] is True
+    assert {"numpy", "typer"} <= {row["part"] for row in ask("doctor")}
+
+
+def test_verify_ends_with_1_on_damage(room: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.l3r"
+    damaged.write_bytes(room.read_bytes())
+    with Store.open(damaged, writable=True) as store, store.transaction():
+        store._database.execute("UPDATE supports SET crc = crc + 1 WHERE local_id = 0")
+    command = [sys.executable, "-m", "list3r", "verify", str(damaged)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert "supports 1:0" in result.stdout
+
+
+def test_a_directory_of_read_only_memories_can_be_asked(room: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.l3r"
+    copy.write_bytes(room.read_bytes())
+    copy.chmod(0o444)
+    assert len(ask("list", copy)) == 4
+
+
+def test_the_face_for_python(room: Path) -> None:
+    with list3r.open(room) as memory:
+        assert memory.units == "m"
+        assert [m.instance.id for m in memory.nearest("mug", k=1)] == [3]
+        assert [m.instance.id for m in memory.nearest(3, k=1)] == [2]
+        assert memory.nearest([1.8, 0.1, 0.9], k=1)[0].instance.id == 3
+        assert {r.subject for r in memory.relations(object=2, predicate="on")} == {3, 4}
+        assert len(memory.similar(3, k=2)) == 2
+        assert memory.relation_graph().number_of_nodes() >= 4
+        assert memory.merge_graph().number_of_nodes() == 6
+        assert memory.support(3).points.shape == (400, 3)
+
+
+def test_the_version_is_the_package_s() -> None:
+    assert run("--version").strip() == f"list3r {list3r.__version__}"

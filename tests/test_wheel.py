@@ -1,0 +1,47 @@
+"""The wheel: what is in it, and that it runs where the tree is not."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel built from the tree."""
+    out = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return next(out.glob("*.whl"))
+
+
+def test_only_list3r_is_in_it(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.split("/")[0] for name in names} == {"list3r", "list3r-0.1.0.dist-info"}
+    assert "list3r/exporters/scene.schema.json" in names
+    assert not [name for name in names if "test" in name]
+
+
+def test_installed_elsewhere_it_runs_the_demo(wheel: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]
+    subprocess.run(install, check=True, capture_output=True, timeout=300)
+    assert {p.name for p in site.iterdir()} <= {"list3r", "list3r-0.1.0.dist-info", "bin"}
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    command = [sys.executable, "-m", "list3r", "demo", "--out", str(tmp_path / "demo"), "--frames", "60", "--json"]
+    result = subprocess.run(
+        command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False, timeout=300
+    )
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["build"]["posed"] == 60
+    assert all(Path(path).stat().st_size > 0 for path in report["exports"].values())
