@@ -83,6 +83,13 @@ def test_a_stack_stands_on_what_is_just_below() -> None:
     assert (5, "on", 2) in found and (3, "on", 5) in found and (3, "on", 2) not in found
 
 
+def test_a_mug_beside_a_magazine_is_on_the_table() -> None:
+    table, magazine = body(2, TABLE, *LEGS), body(6, MAGAZINE)
+    for dx in (-0.10, -0.12, -0.15):
+        mug = moved(body(3, MUG), (0.1 + dx, -0.35, 0.0))
+        assert (3, "on", 2) in facts([table, magazine, mug])
+
+
 def test_each_thing_is_on_at_most_one() -> None:
     subjects = [s for s, p, _ in facts(kitchen()) if p == "on"]
     assert len(subjects) == len(set(subjects))

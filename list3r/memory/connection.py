@@ -142,7 +142,8 @@ class Connection:
         """A value of the key-value table, decoded from JSON.
 
         Keys in use: `scale_kind`, `scale_source`, `gravity` (known, estimated, unknown), `T_world_graph` (4x4),
-        `feature_space`, `created_by`.
+        `gravity_estimate` (up and floor in the graph's frame, see `memory.gravity`), `feature_space`, `last_id`,
+        `created_by`.
         """
         row = self._database.execute("SELECT value FROM memory WHERE key = ?", (key,)).fetchone()
         return default if row is None else json.loads(row[0])

@@ -293,15 +293,17 @@ def _stands_on(scene: _Scene, a: int, b: int) -> _Sure | None:
         return None
     noise = scene.s.noise_m * scene.unit
     below = float((other.points[:, 2] <= float(np.median(z))).mean()) if other.structure is None else 1.0
-    confidence = _sure(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, close)
+    confidence = _sure(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, around)
     return confidence, margin
 
 
-def _steady(subject: Body, close: Array) -> float:
-    """1 where the surface is seen all round the thing's middle, less where only on one side of it."""
-    away = close[:, :2] - subject.points[:, :2].mean(axis=0)
-    sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 6).astype(int) % 6)
-    return 0.6 + 0.4 * min(1.0, len(sectors) / 3)
+def _steady(subject: Body, around: Array) -> float:
+    """1 where the surface is seen all round the thing's middle, less where only on one side of it: what lies beside
+    a thing on a table is as high as the table, to the noise, but does not go round it.
+    """
+    away = around[:, :2] - subject.points[:, :2].mean(axis=0)
+    sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 8).astype(int) % 8)
+    return 0.6 + 0.4 * min(1.0, len(sectors) / 7)
 
 
 def _spacing(points: Array) -> float:
