@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.instances.cloud import Float, neighbour_pairs, pack, unpack
+from list3r.instances.cloud import Float, component_numbers, linked_components, neighbour_pairs, pack, unpack
+from list3r.instances.features import lab_of
 from list3r.instances.surfaces import Labels, Scene, Surface
 from list3r.instances.things import least_voxels, members_of
 
@@ -71,9 +69,7 @@ def _split(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.int64]:
     alike = np.sum(normals[core[left]] * normals[core[right]], axis=1) > 0.8
     alike &= np.linalg.norm(color[core[left]] - color[core[right]], axis=1) < COLOR_STEP
     left, right = left[alike], right[alike]
-    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(len(core), len(core)))
-    _, component = connected_components(graph, directed=False)
-    size = np.bincount(component)
+    component, size = component_numbers(left, right, len(core))
     large = size[component] >= 2 * least_voxels(scene)
     if not large.any():
         return np.ones(len(mine), np.int64)
@@ -90,12 +86,10 @@ def _regrow(
     distance, nearest = cKDTree(place[seeds]).query(place, distance_upper_bound=REGROW_M * scene.unit)
     found = np.isfinite(distance)
     parts = np.zeros(len(mine), np.int64)
-    parts[found] = number[nearest[found]]
+    parts[found] = number[np.asarray(nearest)[found]]
     left = np.flatnonzero(~found)
-    i, j = neighbour_pairs(cloud.keys[mine[left]], 2)
-    graph = coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(len(left), len(left)))
-    _, component = connected_components(graph, directed=False)
-    large = np.bincount(component, minlength=1)[component] >= 2 * least_voxels(scene)
+    component, size = linked_components(cloud.keys[mine[left]], 2)
+    large = size[component] >= 2 * least_voxels(scene)
     parts[left[large]] = number.max() + 1 + component[large] if len(left) else 0
     small = np.flatnonzero(parts == 0)
     if len(small):
@@ -124,12 +118,6 @@ def _hollow(scene: Scene, mine: NDArray[np.int64]) -> NDArray[np.bool_]:
             bend += np.bincount(side, np.minimum(value, 0.0), minlength=len(mine))
             count += np.bincount(side, known, minlength=len(mine))
     return np.asarray(bend / np.maximum(count, 1.0) < -0.5 * HOLLOW_PER_M / scene.unit)
-
-
-def lab_of(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Half lightness, a and b of colours in [0, 255]. Shape (N, 3)."""
-    lab = cv2.cvtColor(np.ascontiguousarray(rgb[None]) / np.float32(255.0), cv2.COLOR_RGB2Lab)[0]
-    return np.asarray(lab * np.array([0.5, 1.0, 1.0], np.float32), np.float32)
 
 
 def _means(parts: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float64]:

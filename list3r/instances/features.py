@@ -79,3 +79,9 @@ def _bump(value: float, bins: int) -> NDArray[np.float64]:
     centres = np.linspace(0.0, 1.0, bins)
     out = np.exp(-0.5 * np.square((centres - np.clip(value, 0.0, 1.0)) * (bins - 1) / 1.3))
     return np.asarray(out / np.linalg.norm(out))
+
+
+def lab_of(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Half lightness, a and b of colours in [0, 255]. Shape (N, 3)."""
+    lab = cv2.cvtColor(np.ascontiguousarray(rgb[None]) / np.float32(255.0), cv2.COLOR_RGB2Lab)[0]
+    return np.asarray(lab * np.array([0.5, 1.0, 1.0], np.float32), np.float32)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from list3r.instances.features import lab_of
 from list3r.memory.records import LocalInstance
 
 WELL_VISIBLE = 0.3
@@ -57,9 +57,8 @@ def _two_things(a: LocalInstance, b: LocalInstance, trees: tuple[cKDTree, cKDTre
 
 def _color_difference(a: LocalInstance, b: LocalInstance) -> float:
     """Distance of the median colours in Lab, lightness halved."""
-    rgb = np.stack([np.median(i.support.rgb, axis=0) for i in (a, b)]).astype(np.float32)
-    lab = cv2.cvtColor(rgb[None] / np.float32(255.0), cv2.COLOR_RGB2Lab)[0]
-    return float(np.linalg.norm((lab[0] - lab[1]) * np.array([0.5, 1.0, 1.0])))
+    tone = lab_of(np.stack([np.median(i.support.rgb, axis=0) for i in (a, b)]).astype(np.float32))
+    return float(np.linalg.norm(tone[0] - tone[1]))
 
 
 def _gap(a: LocalInstance, b: LocalInstance, tree: cKDTree, far: float) -> float:

@@ -28,6 +28,8 @@ class ViewSettings:
     """Frames on either side that are fused into an anchor."""
     step: int = 2
     """Every how many of them."""
+    max_sigma_m: float = 0.05
+    """Depth noisier than this (5 m away with the default noise) shows no things and is left out."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
 
 

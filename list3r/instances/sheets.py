@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.instances.features import lab_of
 from list3r.instances.planes import Raster, plane_raster
 from list3r.instances.surfaces import Labels, Scene, Surface
 from list3r.instances.things import members_of
@@ -76,7 +77,7 @@ def _look_down(scene: Scene, surfaces: list[Surface], labels: Labels, number: in
     weight = np.exp(np.clip(height[voxels] / cloud.voxel, -3.0, 3.0))
     total = np.bincount(cell, weight, minlength=size)
     known = (total > 0).reshape(raster.shape)
-    lab = cv2.cvtColor(cloud.rgb[voxels][None] / np.float32(255.0), cv2.COLOR_RGB2Lab)[0] * np.float32([0.5, 1.0, 1.0])
+    lab = lab_of(cloud.rgb[voxels])
     channels = [np.bincount(cell, weight * v, minlength=size) for v in (*lab.T, height[voxels])]
     images = [(c / np.maximum(total, 1e-9)).reshape(raster.shape).astype(np.float32) for c in channels]
     return _Top(raster, known, np.stack(images[:3], axis=-1), images[3], voxels, cell)
@@ -84,16 +85,17 @@ def _look_down(scene: Scene, surfaces: list[Surface], labels: Labels, number: in
 
 def _pieces(scene: Scene, top: _Top) -> NDArray[np.int32]:
     """Flat things, numbered from 1, on the grid."""
-    color = np.stack([cv2.medianBlur(np.ascontiguousarray(top.color[..., k]), 3) for k in range(3)], axis=-1)
+    channels = [cv2.medianBlur(np.ascontiguousarray(top.color[..., k]), 3) for k in range(3)]
+    color = np.stack(channels, axis=-1).astype(np.float32)
     away, ground = _away_from_ground(color, top, scene)
-    height = cv2.blur(np.where(top.known, top.height, 0.0), (3, 3))
+    height = np.asarray(cv2.blur(np.where(top.known, top.height, 0.0), (3, 3)), np.float32)
     noise = 1.4826 * float(np.median(np.abs(height[ground]))) if ground.any() else 0.0
     raised = top.known & (_less_ground(height, ground, top, scene) > max(4.0 * noise, 0.004 * scene.unit))
-    mask = (away | raised).astype(np.uint8)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) & top.known
+    square = np.ones((3, 3), np.uint8)
+    opened = cv2.morphologyEx((away | raised).astype(np.uint8), cv2.MORPH_OPEN, square)
+    mask = (np.asarray(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, square)) > 0) & top.known
     least = int(scene.settings.flat_area_m2 / (top.raster.cell / scene.unit) ** 2)
-    regions = merge_regions(color, mask > 0, least)
+    regions = merge_regions(color, mask, least)
     return _accept(regions, least)
 
 

@@ -9,10 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.cloud import Cloud
-from list3r.instances.planes import Plane
+from list3r.instances.planes import Plane, footprint_of
 from list3r.instances.settings import SegmentSettings
 
 Labels = NDArray[np.int32]
+
+
+MIN_FILL = 0.15
+"""Share of its rectangle that a surface of several pieces must fill to be one surface."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,10 @@ def merge_coplanar(scene: Scene, planes: list[Plane]) -> list[Plane]:
             both = id(plane) in bounding and id(big) in bounding
             if _same_surface(scene, big, plane, both):
                 members = np.union1d(big.members, plane.members)
-                out[number] = _repaint(scene, replace(big, members=members, area=big.area + plane.area))
+                joined = _repaint(scene, replace(big, members=members, area=big.area + plane.area))
+                if joined.area < MIN_FILL * float(np.prod(joined.extent())):
+                    continue
+                out[number] = joined
                 if id(big) in bounding:
                     bounding.add(id(out[number]))
                 break
@@ -138,8 +145,6 @@ def _same_surface(scene: Scene, big: Plane, small: Plane, bounding: bool) -> boo
 
 def _repaint(scene: Scene, plane: Plane) -> Plane:
     """The plane with raster and footprint of all its members."""
-    from list3r.instances.planes import footprint_of
-
     raster, footprint = footprint_of(plane.equation, scene.cloud.points[plane.members], plane.raster.cell, scene.unit)
     return replace(plane, raster=raster, footprint=footprint)
 
@@ -150,12 +155,12 @@ def _lies_on(scene: Scene, plane: Plane, other: Surface) -> bool:
     height = float(np.median(other.plane.height(points)))
     if not 0.0 < height < 0.04 * scene.unit or other.plane.area < max(1.5 * plane.area, 0.12 * scene.unit**2):
         return False
-    near = cv2.dilate(other.plane.footprint, np.ones((5, 5), np.uint8))
-    hull = hull_of(near)
+    hull = hull_of(_dilated(other.plane.footprint, 2))
     return float(np.mean(other.plane.raster.look_up(hull, points) > 0)) > 0.3
 
 
-def hull_of(mask: NDArray[np.generic]) -> NDArray[np.uint8]:
+def hull_of(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The convex hull of a mask, 1 inside. Shape (h, w) -> (h, w)."""
     corners = cv2.convexHull(np.argwhere(mask > 0)[:, ::-1].astype(np.int32))
     return np.asarray(cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, (1.0,)), np.uint8)
 

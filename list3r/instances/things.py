@@ -5,11 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.instances.cloud import Cloud, neighbour_pairs
+from list3r.instances.cloud import Cloud, linked_components, neighbour_pairs
 from list3r.instances.surfaces import Labels, Scene, Surface, hull_of
 
 SEAT_AREA_M2 = 0.35
@@ -45,10 +43,8 @@ def _skirt(scene: Scene, surfaces: list[Surface], labels: Labels) -> NDArray[np.
 
 
 def _components(scene: Scene, labels: Labels, rest: NDArray[np.int64], taken: int) -> Labels:
-    left, right = neighbour_pairs(scene.cloud.keys[rest], 2)
-    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(len(rest), len(rest)))
-    _, component = connected_components(graph, directed=False)
-    keep = np.bincount(component, minlength=1) >= 6
+    component, size = linked_components(scene.cloud.keys[rest], 2)
+    keep = size >= 6
     number = np.cumsum(keep)
     out = labels.copy()
     out[rest] = np.where(keep[component], taken + number[component], 0) if len(rest) else 0
@@ -63,7 +59,7 @@ def _grow_into(scene: Scene, labels: Labels, free: NDArray[np.int64], taken: int
         tree = cKDTree(scene.cloud.points[owners])
         distance, nearest = tree.query(scene.cloud.points[free], distance_upper_bound=2.2 * scene.cloud.voxel)
         found = np.isfinite(distance)
-        out[free[found]] = labels[owners[nearest[found]]]
+        out[free[found]] = labels[owners[np.asarray(nearest)[found]]]
     return out
 
 
@@ -211,7 +207,7 @@ def adopt_fragments(scene: Scene, surfaces: list[Surface], labels: Labels) -> La
         if not len(near):
             continue
         distance, which = cKDTree(points[near]).query(points[mine], distance_upper_bound=reach)
-        owner = np.bincount(parent[labels[near[which[np.isfinite(distance)]]]], minlength=1)
+        owner = np.bincount(parent[labels[near[np.asarray(which)[np.isfinite(distance)]]]], minlength=1)
         best = int(np.argmax(owner))
         if size[part] < 0.5 * size[best] and owner[best] > min(0.3 * len(mine), 25):
             parent[parent == part] = best
@@ -240,7 +236,8 @@ def drop_junk(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
     there a thing must show eight times the surface.
     """
     out = labels.copy()
-    furniture = [s for s in surfaces if s.level and not s.structure]
+    tops = [s for s in surfaces if s.level and not s.structure and not s.sheet]
+    furniture = [s for s in tops if s.plane.area > 2.0 * scene.settings.support_area_m2 * scene.unit**2]
     for mine in members_of(labels, len(surfaces)).values():
         points = scene.cloud.points[mine]
         spread = np.linalg.norm(points.std(axis=0))

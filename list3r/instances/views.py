@@ -105,13 +105,14 @@ class ChunkViews:
         edge = depth_edges(depth, sigma)
         confirmed = (depth > 0) & (agree >= np.maximum(deny, 1)) & ~(edge & (agree < 2 * deny + 3))
         alone = (agree + deny == 0) & ~edge & (depth > 0)
+        usable = sigma < self.settings.view.max_sigma_m * self.unit
         T = self.reconstruction.T_chunk_cam[position]
         camera_points = backproject(depth, self.camera)
         points = (camera_points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)).astype(np.float32)
         normals = normals_of(camera_points, depth, sigma) @ T[:3, :3].T.astype(np.float32)
         fused = np.maximum(sigma / np.sqrt(weight), 0.3 * sigma).astype(np.float32)
         rgb = small_color(self.frames[position].color, self.stride)
-        return View(position, T, self.camera, depth, fused, sigma, confirmed | alone, points, normals, rgb)
+        return View(position, T, self.camera, depth, fused, sigma, (confirmed | alone) & usable, points, normals, rgb)
 
 
 _LAST: list[tuple[weakref.ref[Reconstruction], InstanceSettings, ChunkViews]] = []
