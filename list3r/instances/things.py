@@ -229,6 +229,21 @@ def _on(scene: Scene, surface: Surface, points: NDArray[np.float32]) -> bool:
     return bool(over.mean() > 0.5 and -0.01 * scene.unit < low < 0.03 * scene.unit)
 
 
+def _scrap_under(scene: Scene, board: Surface, surfaces: list[Surface], points: NDArray[np.float32]) -> bool:
+    """True for a scrap of a chair or leg seen under a board: small, and not standing broadly on the floor."""
+    height = board.plane.height(points)
+    if np.quantile(height, 0.95) > -0.05 * scene.unit:
+        return False
+    wide = int(np.ceil(0.15 * scene.unit / board.plane.raster.cell))
+    reach = cv2.dilate(hull_of(board.plane.footprint), np.ones((2 * wide + 1, 2 * wide + 1), np.uint8))
+    if np.mean(board.plane.raster.look_up(np.asarray(reach, np.uint8), points) > 0) < 0.7:
+        return False
+    level = points - np.outer(height, board.plane.normal).astype(np.float32)
+    size = np.ptp(np.quantile(level, [0.03, 0.97], axis=0), axis=0)
+    stands = any(s.structure and s.level and _on(scene, s, points) for s in surfaces)
+    return bool(np.linalg.norm(size) < (0.12 if stands else 0.25) * scene.unit)
+
+
 def drop_junk(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
     """Labels without components that are too small for a thing, or no larger than the noise of their depth.
 
@@ -242,6 +257,7 @@ def drop_junk(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
         points = scene.cloud.points[mine]
         spread = np.linalg.norm(points.std(axis=0))
         least = least_voxels(scene) * (1 if any(_on(scene, s, points) for s in furniture) else 8)
-        if len(mine) < least or spread < 2.5 * np.median(scene.cloud.reading[mine]):
+        noisy = spread < 2.5 * np.median(scene.cloud.reading[mine])
+        if len(mine) < least or noisy or any(_scrap_under(scene, s, surfaces, points) for s in furniture):
             out[mine] = 0
     return out
