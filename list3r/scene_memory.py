@@ -15,6 +15,7 @@ from list3r.memory.records import Instance, Relation, Support
 from list3r.memory.store import Store
 from list3r.queries.match import Match
 from list3r.queries.nearest import nearest
+from list3r.queries.relations import relations
 from list3r.queries.similar import similar
 from list3r.queries.within import within
 
@@ -107,8 +108,8 @@ class SceneMemory:
     def relations(
         self, subject: int | None = None, predicate: str | None = None, object: int | None = None
     ) -> list[Relation]:
-        """Relations that match what is given."""
-        return self.store.relations(subject=subject, predicate=predicate, object=object)
+        """Relations that match what is given. Raises `OptionError` for a predicate that there is not."""
+        return relations(self.store, subject=subject, predicate=predicate, object=object)
 
     def relation_graph(self) -> networkx.MultiDiGraph:
         """Instances and relations as a graph."""

@@ -199,10 +199,7 @@ class ChunkVerbs(Connection):
             "SELECT chunk_id, session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy, cx,"
             f" cy, height, width, scale_kind FROM chunks {where} ORDER BY chunk_id"
         )
-        return [
-            ChunkRow(*r[:6], unpack_sim3(r[6]), (r[7], r[8], r[9], r[10]), (r[11], r[12]), r[13])
-            for r in self._rows(query, arguments)
-        ]
+        return [_chunk_row(row) for row in self._rows(query, arguments)]
 
     def place_chunks(self, poses: Mapping[int, Sim3], components: Mapping[int, int]) -> None:
         """Rewrite `S_world_chunk` and the component of chunks: all that a loop closure moves."""
@@ -268,18 +265,7 @@ class ChunkVerbs(Connection):
             "SELECT u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u,"
             " frame_v FROM edges ORDER BY u, v, kind, frame_u, frame_v"
         )
-        return [
-            Edge(
-                *r[:3],
-                unpack_sim3(r[3]),
-                *r[4:8],
-                accepted=bool(r[8]),
-                reason=r[9],
-                scores=json.loads(r[10]),
-                frames=None if r[11] < 0 else (r[11], r[12]),
-            )
-            for r in self._rows(query)
-        ]
+        return [_edge(row) for row in self._rows(query)]
 
     # ------------------------------------------------------------------ frames and keyframes
 
@@ -290,10 +276,7 @@ class ChunkVerbs(Connection):
             "SELECT session_id, frame_index, time_s, chunk_id, state, T_chunk_cam FROM frames"
             f" {where} ORDER BY session_id, frame_index"
         )
-        return [
-            FrameRow(*r[:5], raw_array(r[5], "<f8", (4, 4), f"the pose of frame {r[1]}"))
-            for r in self._rows(query, arguments)
-        ]
+        return [_frame_row(row) for row in self._rows(query, arguments)]
 
     def bad_frames(self) -> list[tuple[int, int, str]]:
         """(session id, Frame.index, reason) of the frames that could not be decoded."""
@@ -350,6 +333,39 @@ class ChunkVerbs(Connection):
 
 def _f8(values: NDArray[np.float64]) -> bytes:
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def _chunk_row(row: tuple[Any, ...]) -> ChunkRow:
+    chunk_id, session_id, index, first, last, component, pose, fx, fy, cx, cy, height, width, scale_kind = row
+    intrinsics, image_size = (fx, fy, cx, cy), (height, width)
+    S_world_chunk = unpack_sim3(pose)
+    return ChunkRow(
+        chunk_id, session_id, index, first, last, component, S_world_chunk, intrinsics, image_size, scale_kind
+    )
+
+
+def _edge(row: tuple[Any, ...]) -> Edge:
+    u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u, frame_v = row
+    return Edge(
+        u=u,
+        v=v,
+        kind=kind,
+        S_v_u=unpack_sim3(S_v_u),
+        confidence=confidence,
+        weight=weight,
+        inliers=inliers,
+        residual_m=residual_m,
+        accepted=bool(accepted),
+        reason=reason,
+        scores=json.loads(scores),
+        frames=None if frame_u < 0 else (frame_u, frame_v),
+    )
+
+
+def _frame_row(row: tuple[Any, ...]) -> FrameRow:
+    session_id, frame_index, time_s, chunk_id, state, pose = row
+    T_chunk_cam = raw_array(pose, "<f8", (4, 4), f"the pose of frame {frame_index}")
+    return FrameRow(session_id, frame_index, time_s, chunk_id, state, T_chunk_cam)
 
 
 def _keyframe_row(chunk_id: int, keyframe: Keyframe) -> tuple[object, ...]:
