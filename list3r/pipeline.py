@@ -14,6 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from threadpoolctl import threadpool_limits
+
 from list3r import __version__
 from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
 from list3r.frames.base import SourceInfo
@@ -99,7 +101,8 @@ def build(
                 for span in spans
                 if span.index not in done
             ]
-            _add_all(target, session, tasks, pool, info, progress)
+            with threadpool_limits(1):
+                _add_all(target, session, tasks, pool, info, progress)
             return _finish(target.store, session, info, spans, done, started)
     finally:
         pool.stop()
@@ -113,6 +116,7 @@ def _add_all(
     info: SourceInfo,
     progress: Progress | None,
 ) -> None:
+    """Add the chunks in order, with one thread, so that sums do not depend on the machine."""
     bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
     for span, result in zip((t.span for t in tasks), pool.map(tasks), strict=True):
         bad.update(index for index, _ in result.bad_frames)

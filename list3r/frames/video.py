@@ -104,7 +104,7 @@ class VideoSource:
             notes.append(f"frames are turned by {rotation} degrees counter-clockwise, as the file says")
         if not self._clock:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
-        missing = ["a video has no depth: --reconstruction with a model for colour video"]
+        missing = ["depth: this version builds from RGB-D folders (7-Scenes, TUM, Replica) only"]
         if self._rig.camera is None:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
         listing = [(self._path.name, self._path.stat().st_size)]

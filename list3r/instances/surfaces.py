@@ -186,7 +186,8 @@ def assign_surfaces(scene: Scene, surfaces: list[Surface]) -> Labels:
     """Surface + 1 of each voxel, 0 for none. Shape (N,).
 
     A voxel belongs to a surface when it is within tolerance of the footprint; sheets come before what they lie on.
-    Then boards take their edge, and walls what bending of depth has lifted off them.
+    Then boards take their edge, and walls, floors and fronts what is seen of them through gaps, and what bending of
+    depth has lifted off them.
     """
     cloud = scene.cloud
     labels = np.zeros(len(cloud.keys), np.int32)
@@ -204,17 +205,16 @@ def assign_surfaces(scene: Scene, surfaces: list[Surface]) -> Labels:
     for number, surface in enumerate(surfaces):
         plane = surface.plane
         height = plane.height(cloud.points)
-        if surface.level and not surface.sheet:
-            wide = int(np.ceil(0.025 * scene.unit / plane.raster.cell))
-            near = (height < scene.tolerance) & (height > -0.1 * scene.unit)
-        elif not surface.level:
-            wide = 2
-            alike = cloud.normals @ plane.normal.astype(np.float32)
+        alike = cloud.normals @ plane.normal.astype(np.float32)
+        if surface.structure or not surface.level:
+            reach = _dilated(hull_of(plane.footprint), 2)
             near = (np.abs(height) < scene.tolerance + cloud.reading) & ((alike > 0.9) | (alike == 0.0))
+        elif not surface.sheet:
+            reach = _dilated(plane.footprint, int(np.ceil(0.025 * scene.unit / plane.raster.cell)))
+            near = (height < scene.tolerance) & (height > -0.1 * scene.unit)
         else:
             continue
-        inside = plane.raster.look_up(_dilated(plane.footprint, wide), cloud.points) > 0
-        labels[(labels == 0) & inside & near] = number + 1
+        labels[(labels == 0) & (plane.raster.look_up(reach, cloud.points) > 0) & near] = number + 1
     return labels
 
 
