@@ -176,7 +176,7 @@ def is_structure(scene: Scene, plane: Plane) -> bool:
         return False
     if scene.level(plane):
         camera = float(np.median(plane.height(scene.camera_centers.astype(np.float32)))) / scene.unit
-        return area > 2.0 or (camera > 0.9 and area > 0.2)
+        return area > 2.0 or (camera > 0.9 and area > 0.2) or camera > 1.2
     wide = area > 0.3 and plane.extent()[0] > 1.2 * scene.unit
     ceiling = plane.normal @ scene.up < -0.94
     return bool((scene.upright(plane) or ceiling) and (area > scene.settings.big_plane_area_m2 or wide))
