@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -76,8 +76,6 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
         reconstruction = make_reconstructor(task.settings)(frames, camera)
     except TrackingError:
         return _without_geometry(task, frames, camera, bad, clock.seconds)
-    if task.settings.poses == "given":
-        reconstruction = _in_source_world(reconstruction, frames)
     clock.mark("reconstruction")
     library = build_library(frames, reconstruction, task.settings.instances)
     clock.mark("instances")
@@ -142,15 +140,6 @@ def _without_geometry(
     )
     library = LocalLibrary((), np.zeros((0, 2), np.int32), FEATURE_SPACE)
     return _result(task, frames, empty, library, nothing, bad, seconds, ())
-
-
-def _in_source_world(reconstruction: Reconstruction, frames: Sequence[Frame]) -> Reconstruction:
-    """With given poses the source's own world is every chunk's frame, so that chunks need no alignment."""
-    first = int(np.flatnonzero(reconstruction.posed)[0])
-    T_source_cam = frames[first].T_source_cam
-    assert T_source_cam is not None
-    T_source_chunk = T_source_cam @ np.linalg.inv(reconstruction.T_chunk_cam[first])
-    return replace(reconstruction, T_chunk_cam=T_source_chunk @ reconstruction.T_chunk_cam)
 
 
 def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
