@@ -19,7 +19,6 @@ from list3r.memory.codec import (
     raw_array,
     to_json,
     unpack,
-    unpack_sim3,
 )
 from list3r.memory.connection import Connection
 from list3r.memory.errors import MemoryFileError
@@ -35,6 +34,16 @@ from list3r.memory.records import (
     OverlapSamples,
     Session,
     Support,
+)
+from list3r.memory.rows import (
+    f8,
+    keyframe_row,
+    read_chunk_row,
+    read_edge,
+    read_frame_row,
+    read_keyframe,
+    read_track,
+    track_arrays,
 )
 
 
@@ -126,7 +135,7 @@ class ChunkVerbs(Connection):
         self._add_frames(session_id, chunk_id, result)
         self._database.executemany(
             "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)",
-            [_keyframe_row(chunk_id, keyframe) for keyframe in result.keyframes],
+            [keyframe_row(chunk_id, keyframe) for keyframe in result.keyframes],
         )
         for instance in result.library.instances:
             self._add_local_instance(chunk_id, instance)
@@ -149,19 +158,19 @@ class ChunkVerbs(Connection):
                 continue
             pose = result.T_chunk_cam[k] if posed else np.full((4, 4), np.nan)
             state = "posed" if posed else "lost"
-            rows.append((session_id, index, float(result.times_s[k]), chunk_id, state, _f8(pose), ""))
+            rows.append((session_id, index, float(result.times_s[k]), chunk_id, state, f8(pose), ""))
         for index, reason in result.bad_frames:
             if index not in known:
-                rows.append((session_id, index, float("nan"), chunk_id, "bad", _f8(np.full((4, 4), np.nan)), reason))
+                rows.append((session_id, index, float("nan"), chunk_id, "bad", f8(np.full((4, 4), np.nan)), reason))
         self._database.executemany(
             "INSERT OR REPLACE INTO frames VALUES (?, ?, ?, ?, ?, ?, ?)",
             [(*r[:2], 0.0 if np.isnan(r[2]) else r[2], *r[3:]) for r in rows],
         )
 
     def _add_local_instance(self, chunk_id: int, instance: LocalInstance) -> None:
-        track = pack(_track_arrays(instance.track))
+        track = pack(track_arrays(instance.track))
         feature = instance.feature.astype("<f4").tobytes()
-        plane = None if instance.plane is None else _f8(instance.plane)
+        plane = None if instance.plane is None else f8(instance.plane)
         self._database.execute(
             "INSERT INTO local_instances VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
             (
@@ -199,7 +208,7 @@ class ChunkVerbs(Connection):
             "SELECT chunk_id, session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy, cx,"
             f" cy, height, width, scale_kind FROM chunks {where} ORDER BY chunk_id"
         )
-        return [_chunk_row(row) for row in self._rows(query, arguments)]
+        return [read_chunk_row(row) for row in self._rows(query, arguments)]
 
     def place_chunks(self, poses: Mapping[int, Sim3], components: Mapping[int, int]) -> None:
         """Rewrite `S_world_chunk` and the component of chunks: all that a loop closure moves."""
@@ -265,7 +274,7 @@ class ChunkVerbs(Connection):
             "SELECT u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u,"
             " frame_v FROM edges ORDER BY u, v, kind, frame_u, frame_v"
         )
-        return [_edge(row) for row in self._rows(query)]
+        return [read_edge(row) for row in self._rows(query)]
 
     # ------------------------------------------------------------------ frames and keyframes
 
@@ -276,7 +285,7 @@ class ChunkVerbs(Connection):
             "SELECT session_id, frame_index, time_s, chunk_id, state, T_chunk_cam FROM frames"
             f" {where} ORDER BY session_id, frame_index"
         )
-        return [_frame_row(row) for row in self._rows(query, arguments)]
+        return [read_frame_row(row) for row in self._rows(query, arguments)]
 
     def bad_frames(self) -> list[tuple[int, int, str]]:
         """(session id, Frame.index, reason) of the frames that could not be decoded."""
@@ -295,7 +304,7 @@ class ChunkVerbs(Connection):
     def keyframes(self, chunk_id: int) -> list[Keyframe]:
         """The keyframes of a chunk in order."""
         query = "SELECT frame_index, descriptor, features, jpeg FROM keyframes WHERE chunk_id = ? ORDER BY frame_index"
-        return [_keyframe(chunk_id, *row) for row in self._rows(query, (chunk_id,))]
+        return [read_keyframe(chunk_id, *row) for row in self._rows(query, (chunk_id,))]
 
     def keyframe(self, chunk_id: int, frame_index: int) -> Keyframe:
         """One keyframe. Raises `MemoryFileError` when the memory has none there."""
@@ -303,7 +312,7 @@ class ChunkVerbs(Connection):
         rows = self._rows(query, (chunk_id, frame_index))
         if not rows:
             raise MemoryFileError(f"{self.path} has no keyframe {frame_index} in chunk {chunk_id}")
-        return _keyframe(chunk_id, *rows[0])
+        return read_keyframe(chunk_id, *rows[0])
 
     def keyframe_descriptors(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """All keyframes: (chunk id, Frame.index) of shape (K, 2) and descriptors of shape (K, D)."""
@@ -328,94 +337,7 @@ class ChunkVerbs(Connection):
         rows = self._rows("SELECT track FROM local_instances WHERE chunk_id = ? AND local_id = ?", (chunk_id, local_id))
         if not rows:
             raise MemoryFileError(f"{self.path} has no local instance {local_id} in chunk {chunk_id}")
-        return _track(unpack(rows[0][0], f"the masks of local instance {chunk_id}:{local_id}"))
-
-
-def _f8(values: NDArray[np.float64]) -> bytes:
-    return np.ascontiguousarray(values, dtype="<f8").tobytes()
-
-
-def _chunk_row(row: tuple[Any, ...]) -> ChunkRow:
-    chunk_id, session_id, index, first, last, component, pose, fx, fy, cx, cy, height, width, scale_kind = row
-    intrinsics, image_size = (fx, fy, cx, cy), (height, width)
-    S_world_chunk = unpack_sim3(pose)
-    return ChunkRow(
-        chunk_id, session_id, index, first, last, component, S_world_chunk, intrinsics, image_size, scale_kind
-    )
-
-
-def _edge(row: tuple[Any, ...]) -> Edge:
-    u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u, frame_v = row
-    return Edge(
-        u=u,
-        v=v,
-        kind=kind,
-        S_v_u=unpack_sim3(S_v_u),
-        confidence=confidence,
-        weight=weight,
-        inliers=inliers,
-        residual_m=residual_m,
-        accepted=bool(accepted),
-        reason=reason,
-        scores=json.loads(scores),
-        frames=None if frame_u < 0 else (frame_u, frame_v),
-    )
-
-
-def _frame_row(row: tuple[Any, ...]) -> FrameRow:
-    session_id, frame_index, time_s, chunk_id, state, pose = row
-    T_chunk_cam = raw_array(pose, "<f8", (4, 4), f"the pose of frame {frame_index}")
-    return FrameRow(session_id, frame_index, time_s, chunk_id, state, T_chunk_cam)
-
-
-def _keyframe_row(chunk_id: int, keyframe: Keyframe) -> tuple[object, ...]:
-    descriptor = keyframe.descriptor.astype("<f4").tobytes()
-    features = pack(
-        {
-            "T_chunk_cam": keyframe.T_chunk_cam,
-            "keypoints_xy": keyframe.keypoints_xy.astype(np.float32),
-            "keypoint_descriptors": keyframe.keypoint_descriptors,
-            "points_cam": keyframe.points_cam.astype(np.float32),
-            "depth_small": keyframe.depth_small.astype(np.float32),
-            "camera_small": np.asarray(keyframe.camera_small, dtype=np.float64),
-        }
-    )
-    crc = checksum(descriptor, features, keyframe.jpeg)
-    return chunk_id, keyframe.frame_index, descriptor, features, keyframe.jpeg, crc
-
-
-def _keyframe(chunk_id: int, frame_index: int, descriptor: bytes, features: bytes, jpeg: bytes) -> Keyframe:
-    arrays: dict[str, Any] = unpack(features, f"keyframe {frame_index} of chunk {chunk_id}")
-    fx, fy, cx, cy = (float(x) for x in arrays.pop("camera_small"))
-    return Keyframe(
-        frame_index=frame_index,
-        descriptor=np.frombuffer(descriptor, "<f4").astype(np.float32),
-        camera_small=(fx, fy, cx, cy),
-        jpeg=jpeg,
-        **arrays,
-    )
-
-
-def _track_arrays(track: MaskTrack) -> dict[str, NDArray[Any]]:
-    lengths = np.array([len(m) for m in track.masks], dtype=np.int32)
-    runs = np.concatenate(track.masks) if track.masks else np.zeros(0, np.uint32)
-    return {
-        "frames": track.frames,
-        "boxes_xyxy": track.boxes_xyxy.astype(np.float32),
-        "centers_xy": track.centers_xy.astype(np.float32),
-        "areas_px": track.areas_px.astype(np.int32),
-        "visible_fraction": track.visible_fraction.astype(np.float32),
-        "image_size": np.asarray(track.image_size, dtype=np.int32),
-        "lengths": lengths,
-        "runs": runs.astype(np.uint32),
-    }
-
-
-def _track(arrays: dict[str, NDArray[Any]]) -> MaskTrack:
-    masks = tuple(np.split(arrays["runs"], np.cumsum(arrays["lengths"])[:-1])) if len(arrays["lengths"]) else ()
-    height, width = (int(n) for n in arrays["image_size"])
-    kept = {k: v for k, v in arrays.items() if k not in ("runs", "lengths", "image_size")}
-    return MaskTrack(**kept, masks=masks, image_size=(height, width))
+        return read_track(unpack(rows[0][0], f"the masks of local instance {chunk_id}:{local_id}"))
 
 
 def _local_node(row: tuple[Any, ...]) -> LocalNode:
