@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from list3r.memory.bodies import Body, aabb_gap
+from list3r.memory.colors import Reference, color_words, main_color
 from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing
 from list3r.memory.describe import describe
 from list3r.memory.evidence import Evidence, EvidenceSettings, contested, weigh
@@ -22,7 +23,7 @@ from list3r.memory.records import ChunkRow, Instance, MergeDecision, Observation
 from list3r.memory.relations import Measured, RelationSettings, relations
 from list3r.memory.store import Store
 from list3r.memory.structure import StructureSettings, classify_structure, flagged_only
-from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, world_unit
+from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, light_of, world_unit
 
 
 @dataclass(frozen=True)
@@ -288,7 +289,8 @@ def _write(
     for old in [i.id for i in store.instances() if i.id not in kept]:
         store.drop_instance(old, dict(ids.aliases).get(old))
     labels = {i.id: i.label for i in store.instances()}
-    store.put_instances(_record(t, labels.get(t.body.id), times, unit, metric=metric) for t in things)
+    light = light_of(summaries)
+    store.put_instances(_record(t, labels.get(t.body.id), times, unit, light, metric=metric) for t in things)
     store.clear_observations()
     store.set_observations(
         Observation(n, *key) for group, n in zip(groups, ids.of_group, strict=True) if n is not None for key in group
@@ -302,12 +304,20 @@ def _write(
 
 
 def _record(
-    thing: Thing, label: str | None, times: Mapping[tuple[int, int], float], unit: float, *, metric: bool
+    thing: Thing,
+    label: str | None,
+    times: Mapping[tuple[int, int], float],
+    unit: float,
+    light: Reference,
+    *,
+    metric: bool,
 ) -> Instance:
     body: Body = thing.body
     seen = [times[f] for f in thing.frames if f in times] or [0.0]
     local = (body.points - body.box.center) @ body.box.rotation
-    words = describe(local, thing.color_name, body.box.size, unit, metric=metric, structure=body.structure)
+    name, rgb = main_color(thing.swatches, light)
+    color = color_words(thing.swatches, light)
+    words = describe(local, color, body.box.size, unit, metric=metric, structure=body.structure)
     return Instance(
         id=body.id,
         label=label,
@@ -321,8 +331,8 @@ def _record(
         last_seen_s=max(seen),
         state="present",
         structure=body.structure,
-        color_rgb=thing.color_rgb,
-        color_name=thing.color_name,
+        color_rgb=rgb,
+        color_name=name,
         component=body.component,
         best_view=thing.best_view,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.bodies import Body, fit_box, without_strays
-from list3r.memory.describe import color_name, median_rgb
+from list3r.memory.colors import Swatch, dominant_colors
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import BestView
 from list3r.memory.shapes import ChunkShapes
@@ -62,9 +62,8 @@ class Thing:
     frames: tuple[tuple[int, int], ...]
     """(session id, Frame.index) of every frame in which it is seen, in order."""
     best_view: BestView | None
-    color_rgb: tuple[int, int, int]
-    """Median colour."""
-    color_name: str
+    swatches: tuple[Swatch, ...]
+    """Its colours, the commonest first."""
 
 
 def derive_thing(
@@ -109,7 +108,7 @@ def derive_thing(
         confidence=_confidence(len(frames), stability, members, agreement, s),
     )
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
-    return Thing(body, unit_feature, tuple(frames), _best_view(members, s), median_rgb(rgb), color_name(rgb))
+    return Thing(body, unit_feature, tuple(frames), _best_view(members, s), dominant_colors(rgb))
 
 
 def _aabb(points: Array, trim: float) -> Array:

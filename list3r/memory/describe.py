@@ -3,116 +3,84 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from list3r.memory.colors import lab_from_rgb as lab_from_rgb
 from list3r.memory.geometry import Array
 
-_TERMS: tuple[tuple[str, tuple[float, float, float]], ...] = (
-    ("black", (10, 0, 0)),
-    ("dark grey", (33, 0, 0)),
-    ("grey", (57, 0, 0)),
-    ("light grey", (77, 0, 0)),
-    ("white", (94, 0, 0)),
-    ("red", (42, 58, 38)),
-    ("dark red", (25, 38, 22)),
-    ("pink", (72, 38, 4)),
-    ("orange", (66, 36, 62)),
-    ("brown", (36, 18, 26)),
-    ("tan", (64, 10, 28)),
-    ("beige", (83, 3, 18)),
-    ("yellow", (82, 4, 76)),
-    ("olive", (50, -6, 44)),
-    ("green", (50, -42, 34)),
-    ("dark green", (28, -24, 16)),
-    ("light green", (80, -32, 32)),
-    ("teal", (50, -28, -8)),
-    ("light blue", (76, -10, -24)),
-    ("blue", (40, 12, -52)),
-    ("dark blue", (20, 10, -32)),
-    ("purple", (38, 42, -40)),
-)
-"""Basic colour terms (Berlin and Kay) with shades, as CIE L*a*b* (D65) of what most people call so."""
-
-_CENTERS = np.array([lab for _, lab in _TERMS])
-_XYZ = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
-)
-_WHITE = np.array([0.95047, 1.0, 1.08883])
+_SMALL_M = 0.6
+"""Longest edge of what can be told to be round: of larger things too little is seen."""
+_SURFACE_M = 0.008
+"""Deviation of support points from the surface that they lie on."""
 
 
-def lab_from_rgb(rgb: NDArray[np.uint8]) -> Array:
-    """CIE L*a*b* (D65) of sRGB colours. Shape (..., 3) -> (..., 3)."""
-    c = np.asarray(rgb, dtype=np.float64) / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    t = linear @ _XYZ.T / _WHITE
-    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+def shape_word(points: Array, size: Array, unit: float = 1.0) -> str:
+    """What a thing is shaped like, from points (N, 3) in the axes of its box and its full edge lengths (3,).
 
-
-def color_name(rgb: NDArray[np.uint8]) -> str:
-    """The colour term that most of the points wear. `rgb` has shape (N, 3); "grey" for none.
-
-    Each point votes for its nearest term (lightness counts half: shading changes it most); the shade of the winning
-    hue comes from the median of its voters.
-    """
-    if len(rgb) == 0:
-        return "grey"
-    lab = lab_from_rgb(rgb[:: -(-len(rgb) // 300)])
-    hues = np.array([_hue(name) for name, _ in _TERMS])
-    votes = _nearest(lab)
-    winner = _winner(hues[votes])
-    own = np.median(lab[hues[votes] == winner], axis=0)
-    shades = np.flatnonzero(hues == winner)
-    return _TERMS[int(shades[_nearest(own[None], shades)[0]])][0]
-
-
-def _hue(name: str) -> str:
-    word: str = name.split()[-1]
-    return "grey" if word in ("black", "white") else word
-
-
-def _winner(hues: NDArray[np.str_]) -> str:
-    names, counts = np.unique(hues, return_counts=True)
-    return str(names[np.argmax(counts)])
-
-
-def _nearest(lab: Array, among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-    centers = _CENTERS if among is None else _CENTERS[among]
-    d = lab[:, None, :] - centers[None]
-    return np.asarray(np.argmin((d * np.array([0.5, 1.0, 1.0])) ** 2 @ np.ones(3), axis=1))
-
-
-def median_rgb(rgb: NDArray[np.uint8]) -> tuple[int, int, int]:
-    """Median colour of points, channel by channel. Shape (N, 3)."""
-    if len(rgb) == 0:
-        return (128, 128, 128)
-    r, g, b = (int(x) for x in np.median(rgb, axis=0))
-    return r, g, b
-
-
-def shape_word(points: Array, size: Array) -> str:
-    """sheet, slab, long, round or box-like, from points (N, 3) in the axes of their box and its full edge lengths (3,).
-
-    Round is told by the footprint: the points of a cylinder that is seen from one side or all round lie on a circle,
-    which a box of its extents leaves at the corners.
+    The third axis stands upright where gravity is known; `unit` is what a metre is. Flat things are a `sheet`, a
+    `panel` (upright and large) or a `slab`; a `table` is a level top with nothing but legs under it; `cylinder` and
+    `box` are said of what fits one and not the other; everything else is an `object`.
     """
     ordered = np.sort(np.maximum(size, 1e-9))
-    if ordered[0] < 0.12 * ordered[1]:
-        return "sheet"
+    if ordered[0] < max(0.12 * ordered[1], min(0.02 * unit, 0.3 * ordered[1])) and ordered[2] <= 5.0 * ordered[1]:
+        upright = int(np.argmin(size)) != 2
+        return "panel" if upright and ordered[1] > 0.5 * unit else "sheet"
     if ordered[2] > 3.0 * ordered[1]:
-        return "long thing"
+        return "bar"
     if ordered[0] < 0.3 * ordered[1]:
         return "slab"
-    width = size[:2]
-    if min(width) > 0.7 * max(width) and len(points) >= 40 and ordered[2] < 3.0 * min(width):
-        radial = np.linalg.norm(
-            (points[:, :2] - (points[:, :2].min(axis=0) + np.ptp(points[:, :2], axis=0) / 2)) / (width / 2), axis=1
-        )
-        corner = float((radial > 1.12).mean())
-        rim = float(((radial > 0.75) & (radial <= 1.12)).mean())
-        if corner < 0.06 and rim > 0.35:
-            return "cylinder"
-    return "box"
+    if _is_table(points, size, unit):
+        return "table"
+    if len(points) < 40:
+        return "object"
+    tolerance = max(_SURFACE_M * unit, 0.04 * float(ordered[1]))
+    round_share, square_share = _on_circle(points, size, tolerance), _on_faces(points, size, tolerance)
+    if ordered[2] < _SMALL_M * unit and round_share > max(0.6, square_share):
+        return "cylinder"
+    return "box" if square_share > 0.75 else "object"
+
+
+def _is_table(points: Array, size: Array, unit: float) -> bool:
+    """A level top that most of the points lie on, wide, and high over the lowest of them."""
+    if size[2] < 0.35 * unit or min(size[0], size[1]) < 0.35 * unit or len(points) < 40:
+        return False
+    top = points[:, 2] > float(np.quantile(points[:, 2], 0.95)) - 0.06 * unit
+    if top.mean() < 0.6:
+        return False
+    return bool((np.ptp(points[top][:, :2], axis=0) > 0.7 * size[:2]).all())
+
+
+def _sides(points: Array, size: Array) -> Array:
+    """The points below the top and above the bottom of a thing: those that tell its outline."""
+    level = points[:, 2] / max(float(size[2]), 1e-9)
+    return points[(level < 0.3) & (level > -0.45)]
+
+
+def _on_circle(points: Array, size: Array, tolerance: float) -> float:
+    """Share of the sides that lie on the circle that fits them best (Kasa's linear fit, once reweighted); 0 where the
+    circle is not the size of the thing.
+    """
+    sides = _sides(points, size)[:, :2]
+    if len(sides) < 20:
+        return 0.0
+    weight = np.ones(len(sides))
+    for _ in range(3):
+        left = np.column_stack([2.0 * sides, np.ones(len(sides))]) * weight[:, None]
+        x, y, c = np.linalg.lstsq(left, (sides**2).sum(axis=1) * weight, rcond=None)[0]
+        radius = float(np.sqrt(max(c + x * x + y * y, 0.0)))
+        off = np.abs(np.linalg.norm(sides - (x, y), axis=1) - radius)
+        weight = 1.0 / (1.0 + (off / tolerance) ** 2)
+    wide = float(np.max(size[:2]))
+    if not 0.7 * wide < 2.0 * radius < 1.25 * wide:
+        return 0.0
+    return float((off < tolerance).mean())
+
+
+def _on_faces(points: Array, size: Array, tolerance: float) -> float:
+    """Share of the sides that lie on the upright faces of the box."""
+    sides = _sides(points, size)[:, :2]
+    if len(sides) < 20:
+        return 0.0
+    return float((np.abs(np.abs(sides) - size[:2] / 2.0).min(axis=1) < tolerance).mean())
 
 
 def describe(points: Array, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
@@ -127,10 +95,11 @@ def describe(points: Array, color: str, size: Array, unit: float, *, metric: boo
         return _with_size(f"{color} {what}", longest, metric)
     metres = longest / unit
     scale = "tiny" if metres < 0.06 else "small" if metres < 0.3 else "medium" if metres < 0.8 else "large"
-    return _with_size(f"{scale} {color} {shape_word(points, size)}", longest, metric)
+    shape = shape_word(points, size, unit)
+    return _with_size(f"long {color} bar" if shape == "bar" else f"{scale} {color} {shape}", longest, metric)
 
 
 def _with_size(words: str, longest: float, metric: bool) -> str:
     if not metric:
         return words
-    return f"{words}, {longest * 100:.0f} cm" if longest < 1.0 else f"{words}, {longest:.1f} m"
+    return f"{words}, {longest * 100:.0f} cm" if longest < 0.995 else f"{words}, {longest:.1f} m"

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.planes import Planes, chunk_planes
 from list3r.memory.records import ChunkRow
@@ -17,6 +18,10 @@ from list3r.memory.store import Store
 
 ROOM_DEPTH_M = 2.0
 """How far things are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
+
+
+_COLORS = 1000
+"""Points of a chunk whose colours tell the light."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,8 @@ class ChunkSummary:
     """Pairs of local ids. Shape (P, 2)."""
     unit: float
     """What a metre is in chunk units: 1 for a metric chunk."""
+    lab: Array
+    """Colours of a sample of all its points, CIE L*a*b*. Shape (C, 3)."""
 
 
 _cache: WeakKeyDictionary[Store, dict[int, tuple[int, ChunkSummary]]] = WeakKeyDictionary()
@@ -51,7 +58,8 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
-    return ChunkSummary(shapes, planes, store.cannot_links(chunk.chunk_id), unit)
+    lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
+    return ChunkSummary(shapes, planes, store.cannot_links(chunk.chunk_id), unit, lab)
 
 
 def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
@@ -66,6 +74,11 @@ def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
     """What a metre is about in world units: 1 for a metric memory, else told by the distances of things."""
     units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in chunks]
     return float(np.median(units)) if units else 1.0
+
+
+def light_of(summaries: Mapping[int, ChunkSummary]) -> Reference:
+    """The light of a memory, from the colours of all its chunks."""
+    return scene_reference(np.concatenate([s.lab for s in summaries.values()] or [np.zeros((0, 3))]))
 
 
 def cameras_of(store: Store, chunks: Sequence[ChunkRow]) -> Sim3:
