@@ -48,6 +48,11 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
     assert f"Example: list3r {command.replace('.', ' ')}" in text
 
 
+def test_the_readme_names_every_command() -> None:
+    text = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    assert [c for c in COMMANDS if not re.search(rf"`[^`]*\b{c.replace('.', ' ')}\b", text)] == []
+
+
 def test_help_is_quick_and_loads_nothing_heavy() -> None:
     code = "import sys; from list3r.cli.app import app; print([m for m in ('torch', 'open3d', 'cv2', 'numpy') if m in sys.modules])"
     assert (
