@@ -187,3 +187,51 @@ def test_parts_of_different_frames_of_reference_have_no_relations() -> None:
 
 def test_no_bodies_no_relations() -> None:
     assert relations([], gravity_known=True) == []
+
+
+def shell(id: int, radius: float, height: float, arc: tuple[float, float], noise: float = 0.003) -> Body:
+    """The wall of an open basket between two azimuths, as it is seen from one side, and its bottom."""
+    rng = np.random.default_rng(id)
+    angle, z = rng.uniform(*arc, 600), rng.uniform(0, height, 600)
+    wall = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    flat = rng.uniform(-radius, radius, (200, 2)) * 0.6
+    points = np.concatenate([wall, np.column_stack([flat, np.zeros(200)])]) + rng.normal(0, noise, (800, 3))
+    box = fit_box(points, upright=True)
+    aabb = np.stack([points.min(axis=0), points.max(axis=0)])
+    return Body(id, points, np.full((800, 3), 180, np.uint8), box, aabb, None)
+
+
+@pytest.mark.parametrize("arc", [(0.0, 2 * np.pi), (0.2, 3.3)])
+def test_a_ball_is_in_a_basket_of_which_only_the_far_half_is_seen(arc: tuple[float, float]) -> None:
+    ball = body(3, Piece("ball", (0, 0, 0.18), (0.24, 0.24, 0.26), round=True, points=400))
+    found = facts([body(1, FLOOR, structure="floor"), shell(2, 0.2, 0.26, arc), ball])
+    assert {(3, "in", 2), (2, "contains", 3), (2, "on", 1)} <= found
+    assert not any(p == "next_to" or (s, p) == (3, "on") for s, p, _ in found)
+
+
+def test_a_ball_beside_or_before_a_basket_is_not_in_it() -> None:
+    for x, y in ((0.36, 0.0), (0.0, 0.36)):
+        ball = body(3, Piece("ball", (x, y, 0.1), (0.2, 0.2, 0.2), round=True, points=400))
+        assert not any(p == "in" for _, p, _ in facts([shell(2, 0.2, 0.26, (0.0, 2 * np.pi)), ball]))
+
+
+def test_what_stands_between_the_boards_of_a_shelf_is_in_it_and_what_stands_on_top_is_not() -> None:
+    boards = [Piece("board", (0, 0, z), (0.8, 0.3, 0.03), points=500) for z in (0.1, 0.6, 1.1, 1.6)]
+    shelf = body(2, *boards, Piece("back", (0, -0.14, 0.85), (0.8, 0.02, 1.5), points=900))
+    vase = body(3, Piece("vase", (0.2, 0.02, 0.75), (0.14, 0.14, 0.25), round=True, points=400))
+    bowl = body(4, Piece("bowl", (-0.2, 0.02, 1.68), (0.2, 0.2, 0.1), round=True, points=400))
+    found = facts([body(1, FLOOR, structure="floor"), shelf, vase, bowl])
+    assert (3, "in", 2) in found and (4, "on", 2) in found and (4, "in", 2) not in found
+
+
+def test_a_gap_is_not_made_wider_by_the_sides_that_are_hidden() -> None:
+    left = body(2, Piece("left", (0, 0, 0.1), (0.2, 0.2, 0.2), points=600), view=np.pi)
+    right = body(3, Piece("right", (0.28, 0, 0.1), (0.2, 0.2, 0.2), points=600), view=0.0)
+    assert (2, "next_to", 3) in facts([left, right])
+
+
+def test_a_shade_whose_thin_foot_was_not_seen_stands_on_what_is_under_it() -> None:
+    table = body(2, TABLE, *LEGS)
+    top = float(table.points[:, 2].max())
+    shade = body(3, Piece("shade", (0.1, 0.1, top + 0.18), (0.22, 0.22, 0.17), round=True, points=400))
+    assert (3, "on", 2) in facts([body(1, FLOOR, structure="floor"), table, shade])

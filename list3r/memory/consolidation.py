@@ -20,7 +20,8 @@ from list3r.memory.identities import Identities, assign_ids
 from list3r.memory.merging import Key, MergeSettings, PairScores, merge_nodes, pair_scores
 from list3r.memory.planes import place_planes
 from list3r.memory.records import ChunkRow, Instance, MergeDecision, Observation, Relation
-from list3r.memory.relations import Measured, RelationSettings, relations
+from list3r.memory.relation_scene import Measured, RelationSettings
+from list3r.memory.relations import relations
 from list3r.memory.store import Store
 from list3r.memory.structure import StructureSettings, classify_structure, flagged_only
 from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, light_of, world_unit

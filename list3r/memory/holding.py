@@ -1,0 +1,228 @@
+"""What a thing stands on and what it is in."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from list3r.memory.bodies import Body, neighbours_of
+from list3r.memory.geometry import Array
+from list3r.memory.relation_scene import (
+    Found,
+    Held,
+    Scene,
+    Sure,
+    certainty,
+    contact_of,
+    hull_under,
+    spacing_of,
+    wall_touched,
+)
+
+# ---------------------------------------------------------------------------------------------- on
+
+
+def supports(scene: Scene, taken: set[int]) -> list[Found]:
+    """Each thing on at most one other: the one whose surface it touches best."""
+    out = []
+    holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.bodies], dtype=bool)
+    for a, body in enumerate(scene.bodies):
+        if a in taken or body.structure is not None:
+            continue
+        best: Held | None = None
+        reach = contact_of(scene, a) + 0.05 * scene.unit
+        middle = body.points[:, :2].mean(axis=0)
+        aside = np.maximum(scene.low[:, :2] - middle, middle - scene.high[:, :2]).max(axis=1)
+        near = holds & (scene.box_gap[a] <= reach) & (scene.low[:, 2] <= scene.low[a, 2] + reach)
+        near &= aside <= 0.25 * scene.unit
+        near[a] = False
+        for b in np.flatnonzero(near).tolist():
+            found = scene.measure("on", a, b, _stands_on)
+            if found is not None and (best is None or found[0] > best[1]):
+                best = (b, *found)
+        if best is not None:
+            out.append((a, *best))
+    on = {a: b for a, b, _, _ in out}
+    base = [float(np.prod(b.box.size[:2])) for b in scene.bodies]
+    return [f for f in out if not (on.get(f[1]) == f[0] and (base[f[0]], f[0]) > (base[f[1]], f[1]))]
+
+
+def on_hidden_feet(scene: Scene, held: set[int]) -> list[Found]:
+    """Things that must stand on the floor or on the thing under them, for nothing else holds them, though their feet
+    were not seen.
+    """
+    s = scene.s
+    out = []
+    floors = [n for n, b in enumerate(scene.bodies) if b.structure == "floor"]
+    for a, body in enumerate(scene.bodies):
+        if a in held or body.structure is not None or wall_touched(scene, a) is not None:
+            continue
+        z = body.points[:, 2]
+        limit = min(s.hidden_feet * body.size, s.hidden_feet_m * scene.unit)
+        gaps = []
+        for b in floors:
+            aside = np.maximum(scene.low[b, :2] - body.box.center[:2], body.box.center[:2] - scene.high[b, :2]).max()
+            if np.isfinite(scene.box_gap[a, b]) and aside <= 0.25 * scene.unit:
+                near = neighbours_of(body.box.center[None, :2], scene.plan(b).tree, min(12, len(scene.plan(b).points)))[
+                    1
+                ]
+                gaps.append((float(np.quantile(z, 0.01) - np.median(scene.plan(b).points[near[0], 2])), b))
+        gaps += [(gap, b) for gap, b in _beneath(scene, a) if gap < 0.25 * scene.unit]
+        if gaps and 0.0 <= min(gaps)[0] < limit:
+            gap, b = min(gaps)
+            out.append((a, b, 0.8 * (1.0 - 0.5 * gap / limit), limit - gap))
+    return out
+
+
+def _beneath(scene: Scene, a: int) -> list[tuple[float, int]]:
+    """(clearance, position) of the things wholly below a that have a surface under its middle."""
+    middle, bottom = scene.bodies[a].box.center[:2], float(np.quantile(scene.bodies[a].points[:, 2], 0.01))
+    below = scene.thing & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
+    slack = 0.25 * scene.unit
+    below &= np.all((scene.low[:, :2] - slack <= middle) & (scene.high[:, :2] + slack >= middle), axis=1)
+    out = []
+    for b in np.flatnonzero(below).tolist():
+        plan = scene.plan(b)
+        distance, at = neighbours_of(middle[None], plan.tree, min(6, len(plan.points)))
+        if distance[0, 0] < max(0.05 * scene.unit, 3.0 * plan.spacing):
+            out.append((bottom - float(np.max(plan.points[at[0], 2])), b))
+    return out
+
+
+def _stands_on(scene: Scene, a: int, b: int) -> Sure | None:
+    """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
+    subject, other = scene.bodies[a], scene.bodies[b]
+    z = subject.points[:, 2]
+    bottom, tolerance = float(np.quantile(z, 0.01)), contact_of(scene, a)
+    sink = scene.s.contact_m * scene.unit + 0.5 * scene.s.contact_per_height * min(float(np.ptp(z)), scene.unit)
+    layer = other.points[(other.points[:, 2] > bottom - tolerance) & (other.points[:, 2] < bottom + sink)]
+    if len(layer) < 3:
+        return None
+    middle = subject.points[:, :2].mean(axis=0)
+    spacing = spacing_of(layer)
+    hold = max(0.02 * scene.unit, min(spacing, 0.25 * scene.unit))
+    outside, area = hull_under(middle, layer[:, :2])
+    if outside > hold or area < scene.s.least_base * float(np.prod(subject.box.size[:2])):
+        return None
+    radius = 0.5 * float(np.linalg.norm(subject.box.size[:2])) + max(0.06 * scene.unit, 2.0 * spacing)
+    around = layer[np.linalg.norm(layer[:, :2] - middle, axis=1) < radius]
+    if len(around) < 3:
+        return None
+    distance = neighbours_of(around[:, :2], cKDTree(subject.points[:, :2]))[0][:, 0]
+    close = around[np.argsort(distance, kind="stable")[:24]]
+    surface = float(np.median(close[:, 2]))
+    if float((z > surface - 0.7 * sink).mean()) < 0.6:
+        return None
+    gap = bottom - surface
+    margin = tolerance - gap if gap >= 0 else sink + gap
+    if margin < 0:
+        return None
+    noise = scene.s.noise_m * scene.unit
+    below = float((other.points[:, 2] <= float(np.median(z))).mean()) if other.structure is None else 1.0
+    confidence = certainty(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, around)
+    return confidence, margin
+
+
+def _steady(subject: Body, around: Array) -> float:
+    """1 where the surface is seen all round the thing's middle, less where only on one side of it: what lies beside
+    a thing on a table is as high as the table, to the noise, but does not go round it.
+    """
+    away = around[:, :2] - subject.points[:, :2].mean(axis=0)
+    sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 8).astype(int) % 8)
+    return 0.6 + 0.4 * min(1.0, len(sectors) / 7)
+
+
+# ---------------------------------------------------------------------------------------------- in
+
+
+def containments(scene: Scene) -> list[Found]:
+    """Each thing in at most one container, the smallest that encloses it."""
+    out = []
+    for a, body in enumerate(scene.bodies):
+        if body.structure is not None:
+            continue
+        volume = float(np.prod(body.box.size))
+        holders = [
+            (float(np.prod(scene.bodies[b].box.size)), b)
+            for b in np.flatnonzero(scene.thing & (scene.box_gap[a] == 0.0)).tolist()
+            if a != b and volume <= 0.7 * float(np.prod(scene.bodies[b].box.size))
+        ]
+        for _, b in sorted(holders):
+            found = scene.measure("in", a, b, _held_inside)
+            if found is not None:
+                out.append((a, b, *found))
+                break
+    return out
+
+
+def _held_inside(scene: Scene, a: int, b: int) -> Sure | None:
+    """Whether a is in b: inside its box, with b's sides round it or b's boards under and over it, or down in an open
+    container whose sides go round it as far as they are seen. A seat or a table top holds nothing so.
+    """
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    local = (subject.points - holder.box.center) @ holder.box.rotation
+    inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
+    share, uneven = _sides_round(scene, a, b)
+    width = float(np.min(subject.box.size[:2]))
+    if inside >= scene.s.inside:
+        if share >= scene.s.enclosed and _rests_on(scene, a, b):
+            return inside * min(1.0, 0.5 + share / 2), (share - scene.s.enclosed) * width
+        covered = _between_boards(scene, a, b)
+        if covered is not None:
+            return 0.9 * inside, covered
+    if share >= scene.s.around and uneven < scene.s.uneven and _down_in(scene, a, b):
+        return 0.5 + 0.5 * min(share, 0.8), (share - scene.s.around) * width
+    return None
+
+
+def _sides_round(scene: Scene, a: int, b: int) -> tuple[float, float]:
+    """Share of the directions round a in which b has a surface at a's height, above a's lowest part; and how far they
+    are from being equally far away, as the deviation of their distances over the mean.
+    """
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
+    brim = low + max(0.3 * (high - low), 2.5 * scene.s.noise_m * scene.unit)
+    z = holder.points[:, 2]
+    sides = holder.points[(z > brim) & (z < max(high, brim) + 0.3 * (high - low))]
+    away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
+    away = away[np.linalg.norm(away, axis=1) > 0.25 * float(np.min(subject.box.size[:2]))]
+    if len(away) == 0:
+        return 0.0, np.inf
+    sector = np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 12).astype(int) % 12
+    distance = np.linalg.norm(away, axis=1)
+    least = np.array([distance[sector == n].min() for n in np.unique(sector)])
+    return len(least) / 12, float(least.std() / least.mean())
+
+
+def _rests_on(scene: Scene, a: int, b: int) -> bool:
+    low, high = np.quantile(scene.bodies[a].points[:, 2], [0.03, 0.97])
+    return int((scene.bodies[b].points[:, 2] < low + 0.3 * (high - low)).sum()) >= 3
+
+
+def _between_boards(scene: Scene, a: int, b: int) -> float | None:
+    """How far the board over a is above it, where b has surfaces both under a and over it: a shelf."""
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
+    noise = 2.0 * scene.s.noise_m * scene.unit
+    within = np.all(
+        np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2] <= subject.box.size[:2] / 2 + noise,
+        axis=1,
+    )
+    z = holder.points[within, 2]
+    under, over = z[(z < low + noise) & (z > low - contact_of(scene, a) - noise)], z[z > high + noise]
+    return float(over.min() - high - noise) if len(under) >= 2 and len(over) >= 2 else None
+
+
+def _down_in(scene: Scene, a: int, b: int) -> bool:
+    """Whether a sits below the rim of an open container not much wider than it, over the container's middle."""
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    width, noise = float(np.max(subject.box.size[:2])), 2.0 * scene.s.noise_m * scene.unit
+    footprints = float(np.prod(subject.box.size[:2])) / max(float(np.prod(holder.box.size[:2])), 1e-12)
+    wide = float(np.max(holder.box.size[:2])) > scene.s.most_wider * width
+    if wide or footprints > 0.8 or holder.size > scene.s.open_m * scene.unit:
+        return False
+    rim, bottom = float(np.quantile(holder.points[:, 2], 0.97)), float(np.quantile(subject.points[:, 2], 0.03))
+    if bottom > rim - max(noise, 0.25 * float(subject.box.size[2])) or bottom < scene.low[b, 2] - noise:
+        return False
+    outside, _ = hull_under(subject.points[:, :2].mean(axis=0), holder.points[:, :2])
+    return outside <= 0.25 * width
