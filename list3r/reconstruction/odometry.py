@@ -187,7 +187,9 @@ class Tracker:
         return best.T_model_cam
 
     def _doubtful(self, segment: Segment, found: Registration | None) -> bool:
-        """Whether much less agrees than did in the frames before, as in a false minimum."""
+        """Whether much less agrees than did in the frames before, as in a false minimum; always without forerunners."""
+        if len(segment.T_segment_cam) < 2:
+            return True
         return found is None or found.inliers < self.settings.doubt * segment.usual_inliers
 
     def _predict(self, segment: Segment, last: int, gap_s: float) -> Pose:
