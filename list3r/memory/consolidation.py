@@ -22,6 +22,7 @@ from list3r.memory.planes import place_planes
 from list3r.memory.records import ChunkRow, Instance, MergeDecision, Observation, Relation
 from list3r.memory.relation_scene import Measured, RelationSettings
 from list3r.memory.relations import relations
+from list3r.memory.settling import Settled, SettlingSettings, settle
 from list3r.memory.store import Store
 from list3r.memory.structure import StructureSettings, classify_structure, flagged_only
 from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, light_of, world_unit
@@ -36,6 +37,7 @@ class ConsolidationSettings:
     structure: StructureSettings = field(default_factory=StructureSettings)
     relations: RelationSettings = field(default_factory=RelationSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
+    settling: SettlingSettings = field(default_factory=SettlingSettings)
 
 
 @dataclass(frozen=True)
@@ -64,11 +66,12 @@ def consolidate(
     library: the partition on the local instances and on where the chunks lie, the ids on the observations before.
     """
     s = settings or ConsolidationSettings()
-    chunks = store.chunks()
-    if not chunks:
-        return ConsolidationReport(0, 0, (), (), 0)
     summaries = chunk_summaries(store)
-    pairs = _known_pairs(store, chunks, summaries)
+    if not summaries:
+        return ConsolidationReport(0, 0, (), (), 0)
+    settled = settle(store, summaries, s.settling)
+    chunks = settled.chunks
+    pairs = _known_pairs(store, settled, summaries)
     groups, decisions = _partition(chunks, summaries, pairs, s.merging)
     before = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     evidence = weigh(groups, {k: v.shapes for k, v in summaries.items()}, pairs, s.evidence)
@@ -78,7 +81,7 @@ def consolidate(
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
     things = _things(store, groups, ids, evidence, chunks, summaries, s)
     things = _with_structure(store, things, chunks, summaries, s)
-    _write(store, things, groups, ids, summaries)
+    _write(store, things, groups, ids, summaries, settled)
     store.replace_relations(None, _relations(store, things, chunks, summaries, s))
     _log(store, chunk_id if chunk_id is not None else chunks[-1].chunk_id, decisions, before, ids)
     return ConsolidationReport(
@@ -93,16 +96,7 @@ def consolidate(
 # ---------------------------------------------------------------------------------------------- merging
 
 
-@dataclass(frozen=True)
-class _Scored:
-    """Scores of a pair of chunks, and what they were computed from."""
-
-    exact: bytes
-    rounded: bytes
-    scores: PairScores
-
-
-_scored: WeakKeyDictionary[Store, dict[tuple[int, int], _Scored]] = WeakKeyDictionary()
+_scored: WeakKeyDictionary[Store, dict[tuple[int, int], tuple[bytes, PairScores]]] = WeakKeyDictionary()
 _FAR_M = 0.5
 """Chunks whose points lie further apart than this share no thing."""
 
@@ -129,38 +123,27 @@ def _partition(
 
 
 def _known_pairs(
-    store: Store, chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
+    store: Store, settled: Settled, summaries: Mapping[int, ChunkSummary]
 ) -> dict[tuple[int, int], PairScores]:
-    """Scores of all pairs of chunks of one component. Each is computed at the pose rounded to about a millimetre: it
-    is a function of what the store holds, and it need not be computed again while a graph settles.
-    """
+    """Scores of all pairs of chunks of one component that lie near each other; what stays is not compared again."""
     known = _scored.setdefault(store, {})
     checks = {k: crc.to_bytes(4, "big") for k, crc in store.chunk_checksums().items()}
+    chunks = settled.chunks
     slack = 0.5 * _FAR_M * world_unit(chunks, summaries)
     extent = {c.chunk_id: _extent(summaries[c.chunk_id], c.S_world_chunk, slack) for c in chunks}
-    pose = {c.chunk_id: c.S_world_chunk.as_matrix().tobytes() for c in chunks}
+    pose = {k: S.as_matrix().tobytes() for k, S in settled.S_graph_chunk.items()}
     out = {}
     for n, u in enumerate(chunks):
         for v in chunks[n:]:
-            pair = (u.chunk_id, v.chunk_id)
-            if u.component != v.component or aabb_gap(extent[pair[0]], extent[pair[1]]) > 0.0:
+            a, b = u.chunk_id, v.chunk_id
+            if u.component != v.component or aabb_gap(extent[a], extent[b]) > 0.0:
                 continue
-            before, crcs = known.get(pair), checks[pair[0]] + checks[pair[1]]
-            exact = pose[pair[0]] + pose[pair[1]] + crcs
-            if before is None or before.exact != exact:
-                known[pair] = _score(summaries[pair[0]], summaries[pair[1]], u, v, exact, crcs, before)
-            out[pair] = known[pair].scores
+            stamp = checks[a] + checks[b] + (b"" if a == b else pose[a] + pose[b])
+            if (a, b) not in known or known[a, b][0] != stamp:
+                S_a_b = settled.S_graph_chunk[a].inverse() @ settled.S_graph_chunk[b] if a != b else Sim3.identity()
+                known[a, b] = (stamp, pair_scores(summaries[a].shapes, summaries[b].shapes, S_a_b))
+            out[a, b] = known[a, b][1]
     return out
-
-
-def _score(
-    a: ChunkSummary, b: ChunkSummary, u: ChunkRow, v: ChunkRow, exact: bytes, checks: bytes, before: _Scored | None
-) -> _Scored:
-    S_u_v = _rounded(u.S_world_chunk.inverse() @ v.S_world_chunk, a.unit) if u is not v else Sim3.identity()
-    rounded = S_u_v.as_matrix().tobytes() + checks
-    if before is not None and before.rounded == rounded:
-        return replace(before, exact=exact)
-    return _Scored(exact, rounded, pair_scores(a.shapes, b.shapes, S_u_v))
 
 
 def _extent(summary: ChunkSummary, S_world_chunk: Sim3, slack: float) -> Array:
@@ -169,11 +152,6 @@ def _extent(summary: ChunkSummary, S_world_chunk: Sim3, slack: float) -> Array:
         return np.array([[np.inf] * 3, [-np.inf] * 3])
     p = S_world_chunk.apply(summary.shapes.points)
     return np.stack([p.min(axis=0) - slack, p.max(axis=0) + slack])
-
-
-def _rounded(transform: Sim3, unit: float) -> Sim3:
-    step = np.array([1e-3 * unit] * 3 + [5e-4] * 4)
-    return Sim3.exp(np.round(transform.log() / step) * step)
 
 
 def _at(summaries: Mapping[int, ChunkSummary], key: Key) -> int:
@@ -198,7 +176,7 @@ def _things(
     s: ConsolidationSettings,
 ) -> list[Thing]:
     rows = {c.chunk_id: c for c in chunks}
-    placed = {c.chunk_id: _rounded(c.S_world_chunk, world_unit([c], summaries)) for c in chunks}
+    placed = {c.chunk_id: c.S_world_chunk for c in chunks}
     checks = store.chunk_checksums()
     upright = _gravity_known(store)
     first = min(c.component for c in chunks)
@@ -282,6 +260,7 @@ def _write(
     groups: Sequence[Sequence[Key]],
     ids: Identities,
     summaries: Mapping[int, ChunkSummary],
+    settled: Settled,
 ) -> None:
     times = {(f.session_id, f.frame_index): f.time_s for f in store.frames()}
     metric = store.get_value("scale_kind", "metric") != "relative"
@@ -291,7 +270,10 @@ def _write(
         store.drop_instance(old, dict(ids.aliases).get(old))
     labels = {i.id: i.label for i in store.instances()}
     light = light_of(summaries)
-    store.put_instances(_record(t, labels.get(t.body.id), times, unit, light, metric=metric) for t in things)
+    store.put_instances(
+        _moved(_record(t, labels.get(t.body.id), times, unit, light, metric=metric), settled.S_exact_settled[t.anchor])
+        for t in things
+    )
     store.clear_observations()
     store.set_observations(
         Observation(n, *key) for group, n in zip(groups, ids.of_group, strict=True) if n is not None for key in group
@@ -337,6 +319,13 @@ def _record(
         component=body.component,
         best_view=thing.best_view,
     )
+
+
+def _moved(instance: Instance, S_exact_settled: Sim3) -> Instance:
+    """The instance where its chunk lies to the last digit, not where it was settled."""
+    by = S_exact_settled.apply(instance.center[None])[0] - instance.center
+    box = replace(instance.box, center=instance.box.center + by)
+    return replace(instance, center=instance.center + by, aabb=instance.aabb + by, box=box)
 
 
 def _log(

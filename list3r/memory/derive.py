@@ -62,6 +62,8 @@ class Thing:
     frames: tuple[tuple[int, int], ...]
     """(session id, Frame.index) of every frame in which it is seen, in order."""
     best_view: BestView | None
+    anchor: int
+    """Id of the chunk that saw it longest."""
     swatches: tuple[Swatch, ...]
     """Its colours, the commonest first."""
 
@@ -107,8 +109,9 @@ def derive_thing(
         component=component,
         confidence=_confidence(len(frames), stability, members, agreement, s),
     )
+    anchor = members[int(np.argmax(counts))].shapes.chunk_id
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
-    return Thing(body, unit_feature, tuple(frames), _best_view(members, s), dominant_colors(rgb))
+    return Thing(body, unit_feature, tuple(frames), _best_view(members, s), anchor, dominant_colors(rgb))
 
 
 def _aabb(points: Array, trim: float) -> Array:
