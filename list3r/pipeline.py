@@ -183,22 +183,57 @@ class _Target:
 
 
 def _open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume: bool, force: bool) -> _Target:
+    path = path.resolve() if path.is_symlink() else path
     if path.is_dir():
         raise MemoryFileError(f"{path} is a folder; name a file for the memory, such as {path / 'memory.l3r'}")
     if path.exists() and path.stat().st_size == 0:
         path.unlink()
+    replaced = _left_aside(path)
     if not path.exists():
-        return _Target(Store.create(path), fresh=True)
+        return _Target(_create(path), fresh=True)
     if resume and not force:
         with Store.open(path) as store:
             _check_same(store, info, settings)
-        return _Target(Store.open(path, writable=True), fresh=False)
+        return _Target(Store.open(path, writable=True), fresh=False, replaced=replaced)
     if not force:
         raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
     Store.open(path, writable=True).close()
-    replaced = path.with_name(f"{path.name}.replaced")
-    path.rename(replaced)
-    return _Target(Store.create(path), fresh=True, replaced=replaced)
+    if replaced is None:
+        replaced = _aside(path)
+        path.rename(replaced)
+    else:
+        remove_memory(path)
+    return _Target(_create(path), fresh=True, replaced=replaced)
+
+
+def _create(path: Path) -> Store:
+    """A new memory. Closed once, so that a build killed before its first chunk leaves a file that can be opened."""
+    Store.create(path).close()
+    return Store.open(path, writable=True)
+
+
+def _aside(path: Path) -> Path:
+    """Where `--force` keeps the old memory until the new one has its first chunk."""
+    return path.with_name(f"{path.name}.replaced")
+
+
+def _left_aside(path: Path) -> Path | None:
+    """The old memory that a killed `--force` left aside: put back where no new one is, removed where that has chunks."""
+    aside = _aside(path)
+    if not aside.is_file():
+        return None
+    try:
+        Store.open(aside).close()
+    except MemoryFileError:
+        raise MemoryFileError(f"{aside} is no memory, but has the name that --force needs; move it away") from None
+    if not path.exists():
+        aside.rename(path)
+        return None
+    with Store.open(path) as store:
+        begun = bool(store.chunks())
+    if begun:
+        aside.unlink()
+    return None if begun else aside
 
 
 def _session(store: Store, info: SourceInfo, settings: BuildSettings) -> int:
