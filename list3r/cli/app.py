@@ -7,7 +7,9 @@ it is said.
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from types import FrameType
 
 import typer
 
@@ -41,7 +43,15 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
 
 def main() -> None:
     """Run the command line and exit."""
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL:
+            signal.signal(getattr(signal, name), _interrupt)
     sys.exit(run(sys.argv[1:]))
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Being ended is treated like Ctrl-C, so that nothing half-written stays behind."""
+    raise KeyboardInterrupt
 
 
 def run(arguments: list[str]) -> int:
@@ -49,6 +59,7 @@ def run(arguments: list[str]) -> int:
     command = typer.main.get_command(app)
     try:
         status = command.main(arguments, prog_name="list3r", standalone_mode=False)
+        sys.stdout.flush()
         return status if isinstance(status, int) else 0
     except _USAGE_ERROR as error:
         return _usage_error(error)
@@ -56,18 +67,24 @@ def run(arguments: list[str]) -> int:
         return _fail(error.format_message())  # type: ignore[attr-defined]
     except List3rError as error:
         return _fail(str(error))
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         print("\ninterrupted", file=sys.stderr)
         return 1
-    except typer.Abort:
-        print("\ninterrupted", file=sys.stderr)
-        return 1
+    except SystemExit as stop:
+        if not isinstance(stop.__context__, BrokenPipeError):
+            raise
+        return _unheard()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _unheard()
     except OSError as error:
         where = f" {error.filename}:" if error.filename else ""
         return _fail(f"{where} {error.strerror or error}".strip())
+
+
+def _unheard() -> int:
+    """Whoever read the output has heard enough, as in `list3r list house.l3r | head -1`: that is no failure."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return 0
 
 
 def _usage_error(error: BaseException) -> int:

@@ -130,8 +130,11 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
 
     tqdm.monitor_interval = 0
     with tqdm(unit="frame", desc="building", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
+        kept = bool(arguments.get("resume"))
 
         def progress(done: int, total: int) -> None:
+            nonlocal kept
+            kept = True
             bar.total = total
             bar.update(done - bar.n)
 
@@ -139,10 +142,10 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
             return build_memory(source, memory, progress=progress, **arguments)
         except KeyboardInterrupt:
             bar.close()
-            if memory.exists():
+            if kept and memory.exists():
                 note(f"\ninterrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
             else:
-                note("\ninterrupted before the first chunk was finished; nothing was written")
+                note("\ninterrupted before the first chunk was finished; nothing was changed")
             raise typer.Exit(1) from None
 
 

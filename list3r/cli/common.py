@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
@@ -52,8 +53,9 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
 
 
 def note(message: str) -> None:
-    """A line for people, on standard error."""
-    print(message, file=sys.stderr)
+    """A line for people, on standard error; work goes on where nobody listens any more."""
+    with contextlib.suppress(BrokenPipeError):
+        print(message, file=sys.stderr, flush=True)
 
 
 def _cell(value: object) -> str:

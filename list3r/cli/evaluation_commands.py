@@ -118,11 +118,13 @@ def _stored(path: Path) -> Trajectory:
     import numpy as np
 
     from list3r.evaluation.trajectory import Trajectory
+    from list3r.memory.errors import OptionError
 
     with open_memory(path) as scene:
         poses = scene.store.camera_poses()
-    T_world_cam = np.stack([S.as_matrix() for _, S in poses]) if poses else np.zeros((0, 4, 4))
-    return Trajectory(np.array([f.time_s for f, _ in poses]), T_world_cam)
+    if not poses:
+        raise OptionError(f"{path} has no frame with a pose; finish its build with --resume")
+    return Trajectory(np.array([f.time_s for f, _ in poses]), np.stack([S.as_matrix() for _, S in poses]))
 
 
 def _given(path: Path) -> Trajectory:
