@@ -135,8 +135,13 @@ def test_flat_long_and_table() -> None:
 
 
 def test_descriptions_tell_centimetres_only_where_there_are_metres() -> None:
-    p, size = block((0.2, 0.15, 0.14)), np.array([0.2, 0.15, 0.14])
-    assert describe(p, "red", size, 1.0, metric=True, structure=None) == "small red box, 20 cm"
-    assert describe(p * 3, "red", size * 3, 3.0, metric=False, structure=None) == "small red box"
-    assert describe(p, "grey", np.array([3.0, 2.0, 0.01]), 1.0, metric=True, structure="floor") == "grey floor, 3.0 m"
-    assert describe(p, "grey", np.array([0.996, 0.3, 0.2]), 1.0, metric=True, structure="wall") == "grey wall, 1.0 m"
+    size = np.array([0.2, 0.15, 0.14])
+    assert describe("box", "red", size, 1.0, metric=True, structure=None) == "small red box, 20 cm"
+    assert describe("box", "red", size * 3, 3.0, metric=False, structure=None) == "small red box"
+    assert describe("bar", "red", size, 1.0, metric=True, structure=None) == "long red bar, 20 cm"
+    assert (
+        describe("box", "grey", np.array([3.0, 2.0, 0.01]), 1.0, metric=True, structure="floor") == "grey floor, 3.0 m"
+    )
+    assert (
+        describe("box", "grey", np.array([0.996, 0.3, 0.2]), 1.0, metric=True, structure="wall") == "grey wall, 1.0 m"
+    )

@@ -11,7 +11,7 @@ import numpy as np
 
 from list3r.memory.bodies import Body, aabb_gap
 from list3r.memory.colors import Reference, color_words, main_color
-from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing
+from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing, with_agreement
 from list3r.memory.describe import describe
 from list3r.memory.evidence import Evidence, EvidenceSettings, contested, weigh
 from list3r.memory.geometry import Array, Sim3
@@ -193,13 +193,13 @@ def _things(
         members = [Member(shapes[k], _at(summaries, (k, n)), placed[k], dropped[k]) for k, n in group]
         poses = tuple((checks[k], placed[k].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
         cuts = b"".join(np.packbits(m.dropped[m.shapes.owner == m.at]).tobytes() for m in members)
-        key: tuple[object, ...] = (instance_id, component, up, seen.agreement, tuple(group), poses, cuts)
+        key: tuple[object, ...] = (instance_id, component, up, tuple(group), poses, cuts)
         if key not in before:
-            thing = derive_thing(instance_id, members, component, seen.agreement, upright=up, settings=s.derive)
+            thing = derive_thing(instance_id, members, component, upright=up, settings=s.derive)
             known[key] = replace(thing, body=replace(thing.body, stamp=next(_stamps)))
         else:
             known[key] = before[key]
-        out.append(known[key])
+        out.append(with_agreement(known[key], seen.agreement))
     _derived[store] = known
     return sorted(out, key=lambda t: t.body.id)
 
@@ -297,10 +297,9 @@ def _record(
 ) -> Instance:
     body: Body = thing.body
     seen = [times[f] for f in thing.frames if f in times] or [0.0]
-    local = (body.points - body.box.center) @ body.box.rotation
     name, rgb = main_color(thing.swatches, light)
     color = color_words(thing.swatches, light)
-    words = describe(local, color, body.box.size, unit, metric=metric, structure=body.structure)
+    words = describe(thing.shape, color, body.box.size, unit, metric=metric, structure=body.structure)
     return Instance(
         id=body.id,
         label=label,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.bodies import Body, fit_box, without_strays
 from list3r.memory.colors import Swatch, dominant_colors
+from list3r.memory.describe import shape_word
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import BestView
 from list3r.memory.shapes import ChunkShapes
@@ -21,7 +22,7 @@ class DeriveSettings:
 
     half_frames: float = 12.0
     """Frames after which half of the doubt is gone."""
-    max_points: int = 1500
+    max_points: int = 1000
     """Surface points kept for boxes and relations."""
     trim: float = 0.01
     """Share of points outside the box at either end of each axis."""
@@ -62,8 +63,12 @@ class Thing:
     frames: tuple[tuple[int, int], ...]
     """(session id, Frame.index) of every frame in which it is seen, in order."""
     best_view: BestView | None
+    certainty: float
+    """How sure it is that it exists as one thing, before it is asked who else should have seen it."""
     anchor: int
     """Id of the chunk that saw it longest."""
+    shape: str
+    """Its shape in a word, see `memory.describe`."""
     swatches: tuple[Swatch, ...]
     """Its colours, the commonest first."""
 
@@ -72,15 +77,11 @@ def derive_thing(
     instance_id: int,
     members: Sequence[Member],
     component: int,
-    agreement: float,
     *,
     upright: bool,
     settings: DeriveSettings,
 ) -> Thing:
-    """All that follows from the members of one thing.
-
-    `agreement` is the share of the chunks that saw its place and found it; `upright` says that z is up.
-    """
+    """All that follows from the members of one thing; `upright` says that z is up."""
     s = settings
     points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[m.own]) for m in members])
     rgb = np.concatenate([m.shapes.rgb[m.own] for m in members])
@@ -107,11 +108,19 @@ def derive_thing(
         normal=_normal(members, points, s),
         flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
         component=component,
-        confidence=_confidence(len(frames), stability, members, agreement, s),
     )
+    certainty = _certainty(len(frames), stability, members, s)
     anchor = members[int(np.argmax(counts))].shapes.chunk_id
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
-    return Thing(body, unit_feature, tuple(frames), _best_view(members, s), anchor, dominant_colors(rgb))
+    shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
+    colors = dominant_colors(rgb)
+    view = _best_view(members, s)
+    return Thing(body, unit_feature, tuple(frames), view, certainty, anchor, shape, colors)
+
+
+def _metre(members: Sequence[Member]) -> float:
+    """What a metre is about in the world, as its chunks tell."""
+    return float(np.median([m.shapes.unit * float(m.S_world_chunk.scale) for m in members]))
 
 
 def _aabb(points: Array, trim: float) -> Array:
@@ -160,12 +169,17 @@ def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Arra
     return np.asarray(axes[2] if axes[2] @ toward >= 0 else -axes[2])
 
 
-def _confidence(frames: int, stability: float, members: Sequence[Member], agreement: float, s: DeriveSettings) -> float:
-    """Grows with frames and with chunks that found the thing on their own; stability and agreement cap it."""
+def with_agreement(thing: Thing, agreement: float) -> Thing:
+    """The thing with its confidence; `agreement` is the share of the chunks that saw its place and found it."""
+    return replace(thing, body=replace(thing.body, confidence=round(thing.certainty * agreement, 4)))
+
+
+def _certainty(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:
+    """Grows with frames and with chunks that found the thing on their own; stability caps it."""
     chunks = len({m.shapes.chunk_id for m in members})
     seen = frames / (frames + s.half_frames)
     agreed = 1.0 - 0.5**chunks
-    return round(float(np.clip(stability, 0.0, 1.0)) * agreement * (0.6 * seen + 0.4 * agreed), 4)
+    return float(np.clip(stability, 0.0, 1.0)) * (0.6 * seen + 0.4 * agreed)
 
 
 def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:

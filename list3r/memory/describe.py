@@ -83,11 +83,11 @@ def _on_faces(points: Array, size: Array, tolerance: float) -> float:
     return float((np.abs(np.abs(sides) - size[:2] / 2.0).min(axis=1) < tolerance).mean())
 
 
-def describe(points: Array, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
+def describe(shape: str, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
     """Description of a thing: "small white cylinder, 9 cm".
 
-    `points` (N, 3) are in the axes of its box and `size` (3,) are the box's full edge lengths, world units; `unit` is
-    what a metre is about, also where the memory is not metric, and then no centimetres are told.
+    `shape` is the `shape_word` and `size` (3,) the full edge lengths of its box, world units; `unit` is what a metre is
+    about, also where the memory is not metric, and then no centimetres are told.
     """
     longest = float(np.max(size))
     if structure is not None:
@@ -95,7 +95,6 @@ def describe(points: Array, color: str, size: Array, unit: float, *, metric: boo
         return _with_size(f"{color} {what}", longest, metric)
     metres = longest / unit
     scale = "tiny" if metres < 0.06 else "small" if metres < 0.3 else "medium" if metres < 0.8 else "large"
-    shape = shape_word(points, size, unit)
     return _with_size(f"long {color} bar" if shape == "bar" else f"{scale} {color} {shape}", longest, metric)
 
 

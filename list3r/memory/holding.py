@@ -99,6 +99,9 @@ def _stands_on(scene: Scene, a: int, b: int) -> Sure | None:
     if len(layer) < 3:
         return None
     middle = subject.points[:, :2].mean(axis=0)
+    aside = np.maximum(layer[:, :2].min(axis=0) - middle, middle - layer[:, :2].max(axis=0)).max()
+    if aside > 0.25 * scene.unit:
+        return None
     spacing = spacing_of(layer)
     hold = max(0.02 * scene.unit, min(spacing, 0.25 * scene.unit))
     outside, area = hull_under(middle, layer[:, :2])
