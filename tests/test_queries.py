@@ -76,8 +76,18 @@ def test_words_find_labels_and_descriptions(store: Store) -> None:
     assert ids(nearest(store, words="the cups")) == [MUG, TWIN]
     assert nearest(store, words="elephant") == []
     assert nearest(store, words="mug")[0].distance_m is None
-    assert ids(nearest(store, words="wall")) == [] and ids(nearest(store, words="walls", structure=True)) == [WALL]
+    assert ids(nearest(store, words="wall")) == ids(nearest(store, words="walls", structure=True)) == [WALL]
     assert ids(nearest(store, words="mug", point=(2.2, -0.1, 0.8), k=1)) == [TWIN]
+
+
+def test_words_that_nothing_bears_are_told(store: Store) -> None:
+    assert nearest(store, words="golden mug")[0].reason == "named mug, not golden"
+    assert nearest(store, words="mug")[0].reason == "named mug"
+
+
+def test_things_that_touch_have_no_distance(store: Store) -> None:
+    touching = {m.instance.id: m.distance_m for m in nearest(store, instance_id=TABLE, k=9)}
+    assert touching[MUG] == 0.0 and touching[CHAIR] > 0.01
 
 
 def test_more_words_found_beat_fewer(store: Store) -> None:

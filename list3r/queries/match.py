@@ -25,7 +25,7 @@ class Match:
     score: float
     """How well it answers, larger is better; what it means depends on the query and stands in `reason`."""
     distance_m: float | None
-    """Between surfaces, 0 inside; None where the question has no place."""
+    """Between surfaces as they were seen, 0 where two things touch; None where the question has no place."""
     center_distance_m: float | None
     """Between centres of boxes (or from the point asked about to the centre)."""
     reason: str

@@ -12,7 +12,7 @@ from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.match import Filters, Match, checked_count, checked_length, checked_point
 from list3r.queries.surfaces import distance_between, distance_to_point
-from list3r.queries.words import wanted_words, word_score
+from list3r.queries.words import STRUCTURE, wanted_words, word_score
 
 
 def nearest(
@@ -30,9 +30,9 @@ def nearest(
     """The k things nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
     With `words` only things whose label or description bears one of them; with words alone those that they name best
-    (most words, then confidence), without distances. The words must all be found where any thing bears them all.
-    `max_distance` bounds the distance between surfaces. Raises `OptionError` for arguments that make no sense and
-    `UnknownIdError` for an id that was never given.
+    (most words, then confidence), without distances. The words must all be found where any thing bears them all. Words
+    that name a kind of structure ("floor", "wall") ask for structure too. `max_distance` bounds the distance between
+    surfaces. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that was never given.
     """
     k = checked_count(k)
     if point is not None and instance_id is not None:
@@ -43,7 +43,7 @@ def nearest(
         if point is None and instance_id is None:
             raise OptionError("a largest distance needs a point or an instance to measure from")
         max_distance = checked_length(max_distance, "max_distance")
-    filters = Filters(structure, min_confidence, state)
+    filters = Filters(structure or _names_structure(words), min_confidence, state)
     origin = None if instance_id is None else store.instance(instance_id)
     candidates = [i for i in filters.select(store.instances()) if origin is None or i.id != origin.id]
     named = _named(candidates, words) if words is not None else [(i, 1.0, "") for i in candidates]
@@ -62,7 +62,16 @@ def _named(candidates: Sequence[Instance], words: str) -> list[tuple[Instance, f
     wanted = wanted_words(words)
     found = [(i, *word_score(i, wanted)) for i in candidates]
     most = max((len(hit) for _, _, hit in found), default=0)
-    return [(i, score, f"named {' '.join(hit)}") for i, score, hit in found if hit and len(hit) == most]
+    return [(i, score, _named_so(hit, wanted)) for i, score, hit in found if hit and len(hit) == most]
+
+
+def _named_so(hit: Sequence[str], wanted: Sequence[str]) -> str:
+    missing = [w for w in wanted if w not in hit]
+    return f"named {' '.join(hit)}" + (f", not {' '.join(missing)}" if missing else "")
+
+
+def _names_structure(words: str | None) -> bool:
+    return words is not None and not STRUCTURE.isdisjoint(wanted_words(words))
 
 
 def _reasons(named: Sequence[tuple[Instance, float, str]]) -> dict[int, str]:

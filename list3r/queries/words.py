@@ -8,7 +8,10 @@ from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 
 _IGNORED = frozenset("a an the of in on at with and or some any my thing things object objects".split())
+STRUCTURE = frozenset(("floor", "ceiling", "wall"))
+"""Kinds of structure that people name."""
 _SYNONYMS = {
+    "ground": "floor",
     "gray": "grey",
     "big": "large",
     "little": "small",
