@@ -218,7 +218,7 @@ def _aside(path: Path) -> Path:
 
 
 def _left_aside(path: Path) -> Path | None:
-    """The old memory that a killed `--force` left aside: put back where no new one is, removed where that has chunks."""
+    """The old memory that a killed `--force` left aside: put back where no new one is, removed where it has chunks."""
     aside = _aside(path)
     if not aside.is_file():
         return None
@@ -310,14 +310,20 @@ def _overlap(spans: list[ChunkSpan]) -> int:
 def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...]:
     notes = []
     if bad:
-        notes.append(f"{bad} frames could not be decoded and were skipped: {_listed(store)}")
-    if lost:
-        notes.append(f"the camera could not be followed in {lost} frames; they have no pose")
+        notes.append(f"{_count(bad, 'frame')} could not be decoded, skipped: {_listed(store)}")
+    if lost and store.get_value("poses") == "given":
+        notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
+    elif lost:
+        notes.append(f"the camera could not be followed in {_count(lost, 'frame')}; they have no pose")
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
     if store.get_value("gravity") == "unknown":
         notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
     return tuple(notes)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _listed(store: Store, most: int = 5) -> str:

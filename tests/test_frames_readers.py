@@ -127,6 +127,34 @@ def test_tum_camera_comes_from_option_file_name_or_default(tmp_path: Path) -> No
     assert require_camera(open_source(named).info).fx == 535.4
 
 
+def test_replica_poses_keep_to_the_numbers_of_their_frames(tmp_path: Path) -> None:
+    write_replica(tmp_path, count=5)
+    for k in (0, 2):
+        (tmp_path / f"results/frame{k:06d}.jpg").unlink()
+    source = open_source(tmp_path)
+    frames = [f for f in source.read(0, 3) if isinstance(f, Frame)]
+    assert [f.T_source_cam[2, 3] for f in frames if f.T_source_cam is not None] == [1, 3, 4]
+    assert "5 poses for 3 frames" in " ".join(source.info.notes)
+
+
+def test_depth_with_fractions_is_metres(tmp_path: Path) -> None:
+    write_tum(tmp_path, count=3)
+    (tmp_path / "calibration.txt").write_text("70 70 39.5 29.5")
+    text = (tmp_path / "depth.txt").read_text()
+    (tmp_path / "depth.txt").write_text(text.replace(".png", ".npy"))
+    for k in range(3):
+        depth = np.full((60, 80), 1.25, np.float32)
+        depth[0], depth[1] = np.nan, np.inf
+        np.save(tmp_path / f"depth/{k}.npy", depth)
+    source = open_source(tmp_path)
+    frame = next(source.read(0, 1))
+    assert isinstance(frame, Frame) and frame.depth is not None
+    assert np.all(frame.depth[2:] == 1.25) and not frame.depth[:2].any()
+    assert "--depth-scale" in " ".join(source.info.notes)
+    scaled = next(open_source(tmp_path, SourceOptions(depth_scale=0.5)).read(0, 1))
+    assert isinstance(scaled, Frame) and scaled.depth is not None and np.all(scaled.depth[2:] == 2.5)
+
+
 def test_replica_has_its_scale_camera_and_trajectory(tmp_path: Path) -> None:
     source = open_source(write_replica(tmp_path / "room0"))
     frames = frames_of(source)

@@ -36,7 +36,11 @@ class FolderSource:
         optics = self.optics
         self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files[:_PROBES])
         self._typical_raw = 0.0
+        self._floats = False
         sizes = self._probe(root)
+        if self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0):
+            self.optics = optics = replace(optics, depth_scale=1.0)
+            notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale says otherwise")
         self._rig = build_rig(optics, *sizes, options.max_depth_m)
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
@@ -101,7 +105,7 @@ class FolderSource:
                     return color.shape[:2], None
                 if file.depth is not None:
                     raw = read_raw_depth(file.depth)
-                    self._typical_raw = _median_known(raw)
+                    self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
                     return color.shape[:2], raw.shape
             except FrameError as error:
                 reason = reason or str(error)

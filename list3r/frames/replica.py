@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from list3r.frames.layout import (
     IMAGE_ENDINGS,
     FrameFile,
@@ -32,7 +35,7 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
     if not colors:
         return None
     depths = {n[len("depth") :].split(".")[0]: results / n for n in names if n.startswith("depth")}
-    poses, notes = _poses(base / "traj.txt", len(colors))
+    poses, notes = _poses(base / "traj.txt", colors)
     files = tuple(
         FrameFile(results / name, depths.get(name[len("frame") :].split(".")[0]), None, pose)
         for name, pose in zip(colors, poses, strict=True)
@@ -42,14 +45,24 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
     return Layout("replica", files, optics, "color", intrinsics, (*note, *notes))
 
 
-def _poses(path: Path, count: int) -> tuple[list, tuple[str, ...]]:  # type: ignore[type-arg]
+def _poses(path: Path, colors: list[str]) -> tuple[list[NDArray[np.float64] | None], tuple[str, ...]]:
+    """A row for every image; where there are more or fewer rows than images, row n belongs to the image numbered n."""
     if not path.is_file():
-        return [None] * count, ()
-    poses = [pose_matrix(row) for row in read_numbers(path)]
-    short = count - len(poses)
-    if short > 0:
-        return poses + [None] * short, (f"{path.name} has {len(poses)} poses for {count} frames; the last have none",)
-    return poses[:count], ()
+        return [None] * len(colors), ()
+    rows = [pose_matrix(row) for row in read_numbers(path)]
+    if len(rows) == len(colors):
+        return rows, ()
+    numbers = [int(digits) for digits in (_number(name) for name in colors) if digits.isdigit()]
+    if len(numbers) < len(colors):
+        raise SourceError(f"{path} has {len(rows)} poses for {len(colors)} images without numbers; mend or remove it")
+    poses = [rows[n] if n < len(rows) else None for n in numbers]
+    known = sum(n < len(rows) for n in numbers)
+    note = f"{path.name} has {len(rows)} poses for {len(colors)} frames; {known} frames have the pose of their number"
+    return poses, (note,)
+
+
+def _number(name: str) -> str:
+    return name[len("frame") :].split(".")[0].lstrip("_-")
 
 
 def _camera(base: Path, options: SourceOptions) -> tuple[Intrinsics, float, tuple[str, ...]]:
