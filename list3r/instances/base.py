@@ -33,6 +33,9 @@ class Proposals:
     """The thing each candidate is a view of, where the discoverer knows it across anchors. Shape (N,)."""
     structure: NDArray[np.bool_] | None = None
     """Candidates that bound the room (floor, wall, ceiling), where the discoverer knows. Shape (N,)."""
+    base: NDArray[np.float64] | None = None
+    """Plane, in camera coordinates of the anchor, of the wall or floor that a flat candidate lies on, NaN for the
+    others, where the discoverer knows. Shape (N, 4)."""
 
 
 class Discoverer(Protocol):

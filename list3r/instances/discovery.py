@@ -88,10 +88,14 @@ def _proposals(
     renumber = np.zeros(len(cut.segments) + 1, np.int32)
     renumber[order + 1] = np.arange(1, len(order) + 1)
     full = np.repeat(np.repeat(renumber[labels], stride, axis=0), stride, axis=1)[: shape[0], : shape[1]]
-    planes = np.full((len(order), 4), np.nan)
+    planes, bases = np.full((len(order), 4), np.nan), np.full((len(order), 4), np.nan)
     for row, number in enumerate(order):
-        equation = cut.segments[number].plane
-        if equation is not None:
-            planes[row] = equation @ view.T_chunk_cam
+        segment = cut.segments[number]
+        if segment.plane is not None:
+            planes[row] = segment.plane @ view.T_chunk_cam
+        if segment.base is not None:
+            bases[row] = segment.base @ view.T_chunk_cam
     structure = np.array([cut.segments[number].structure for number in order], bool)
-    return Proposals(view.position, full, score[order], features[order], planes, order.astype(np.int64), structure)
+    return Proposals(
+        view.position, full, score[order], features[order], planes, order.astype(np.int64), structure, bases
+    )

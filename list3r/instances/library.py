@@ -58,4 +58,5 @@ def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposal
         plane=proposals.plane[keep],
         identity=None if proposals.identity is None else proposals.identity[keep],
         structure=None if proposals.structure is None else proposals.structure[keep],
+        base=None if proposals.base is None else proposals.base[keep],
     )

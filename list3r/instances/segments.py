@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from list3r.instances.cloud import Cloud
 from list3r.instances.clutter import split_crowds
+from list3r.instances.furniture import join_bodies
 from list3r.instances.planes import find_planes, plane_tolerance
 from list3r.instances.settings import SegmentSettings
 from list3r.instances.sheets import find_sheets
@@ -19,6 +20,7 @@ from list3r.instances.things import (
     attach_parts,
     connect_rest,
     drop_junk,
+    drop_reveals,
     drop_slivers,
     least_voxels,
 )
@@ -36,6 +38,8 @@ class Segment:
     """A surface that bounds the room."""
     score: float
     """How sure it is one thing, in [0, 1]."""
+    base: NDArray[np.float64] | None = None
+    """Plane of the wall or floor that a panel lies on, chunk coordinates, n towards the cameras. Shape (4,)."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +69,14 @@ def segment_cloud(
     labels = split_crowds(scene, surfaces, labels)
     labels = adopt_fragments(scene, surfaces, labels)
     labels = drop_slivers(scene, surfaces, labels)
+    labels = drop_reveals(scene, surfaces, labels)
     labels = drop_junk(scene, surfaces, labels)
     labels, sheets = find_sheets(scene, surfaces, labels)
-    return _describe(scene, surfaces, labels, set(sheets))
+    labels = join_bodies(scene, surfaces, labels, sheets)
+    return _describe(scene, surfaces, labels, sheets)
 
 
-def _describe(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: set[int]) -> Segmentation:
+def _describe(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: dict[int, int]) -> Segmentation:
     """Number the labels that are left from 1 and say what each is."""
     present = np.unique(labels[labels > 0])
     renumber = np.zeros(int(labels.max(initial=0)) + 1, np.int32)
@@ -87,17 +93,21 @@ def _describe(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: set
             segments.append(Segment(kind, equation, surface.structure, 0.95))
             continue
         if label in sheets:
-            segments.append(Segment("sheet", _plane_of(scene, mine), False, 0.8))
+            under = surfaces[sheets[label]]
+            base = under.plane.equation if under.structure else None
+            plane = _plane_of(scene, mine, scene.up if base is None else base[:3])
+            rug = base is not None and under.level
+            segments.append(Segment("sheet", None if rug else plane, False, 0.8, base))
             continue
         score = 1.0 - np.exp(-mine.sum() / (2.0 * least_voxels(scene)))
         segments.append(Segment("thing", None, False, float(score)))
     return Segmentation(np.asarray(renumber[labels], np.int32), tuple(segments), scene.up)
 
 
-def _plane_of(scene: Scene, mine: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Least-squares plane through the voxels of a flat level thing, normal up. Shape (4,)."""
+def _plane_of(scene: Scene, mine: NDArray[np.bool_], toward: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least-squares plane through the voxels of a flat thing, its normal on the side of `toward`. Shape (4,)."""
     points = scene.cloud.points[mine].astype(np.float64)
     mean = points.mean(axis=0)
     n = np.linalg.eigh(np.cov((points - mean).T))[1][:, 0]
-    n = n if n @ scene.up > 0 else -n
+    n = n if n @ toward > 0 else -n
     return np.append(n, -n @ mean)

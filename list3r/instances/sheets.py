@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.instances.features import lab_of
 from list3r.instances.planes import Raster, plane_raster
-from list3r.instances.surfaces import Labels, Scene, Surface
+from list3r.instances.surfaces import Labels, Scene, Surface, hull_of
 from list3r.instances.things import members_of
 
 Float = NDArray[np.float32]
@@ -18,6 +18,18 @@ Float = NDArray[np.float32]
 MIN_SURFACE_AREA_M2 = 0.15
 MIN_CONTRAST = 7.0
 """Colour difference (Lab, lightness halved) below which nothing is told apart."""
+
+
+SHEET_M = 0.025
+"""Thickness up to which a thing on a top is flat."""
+PANEL_M = 0.05
+"""Thickness up to which a thing on a wall or floor is flat."""
+PANEL_AREA_M2 = 0.06
+"""Smallest panel on a wall or floor: a sheet of A4."""
+PANEL_FILL = 0.8
+"""Share of what is seen in its rectangle that a panel fills."""
+PANEL_SEEN = 0.5
+"""Share of its rectangle that must be seen; the image's border and what stands before it cut the rest."""
 
 
 @dataclass(frozen=True)
@@ -36,23 +48,24 @@ class _Top:
     """Row-major cell of each of them. Shape (M,)."""
 
 
-def find_sheets(scene: Scene, surfaces: list[Surface], labels: Labels) -> tuple[Labels, list[int]]:
-    """Labels with flat things cut out of the level surfaces they lie on, and which labels these are."""
+def find_sheets(scene: Scene, surfaces: list[Surface], labels: Labels) -> tuple[Labels, dict[int, int]]:
+    """Labels with flat things cut out of the surfaces they lie on or hang at, and the surface's number for each."""
     out = labels.copy()
-    found: list[int] = []
+    found: dict[int, int] = {}
     for number, surface in enumerate(surfaces):
-        if not surface.level or surface.sheet or surface.structure:
+        if surface.sheet or not (surface.level or surface.structure):
             continue
         if surface.plane.area < MIN_SURFACE_AREA_M2 * scene.unit**2:
             continue
         if np.count_nonzero(out == number + 1) < 0.5 * len(surface.plane.members):
             continue
         top = _look_down(scene, surfaces, out, number)
-        pieces = _pieces(scene, top)
+        pieces = _panels(scene, top) if surface.structure else _pieces(scene, top)
         mine = pieces.ravel()[top.cell]
         first = int(out.max(initial=0))
-        out[top.voxels] = np.where(mine > 0, first + mine, number + 1)
-        found.extend(range(first + 1, first + int(pieces.max(initial=0)) + 1))
+        rest = out[top.voxels] if surface.structure else number + 1
+        out[top.voxels] = np.where(mine > 0, first + mine, rest)
+        found.update({label: number for label in range(first + 1, first + int(pieces.max(initial=0)) + 1)})
     return out, found
 
 
@@ -62,15 +75,18 @@ def _look_down(scene: Scene, surfaces: list[Surface], labels: Labels, number: in
     height = plane.height(cloud.points)
     chosen = np.zeros(len(labels), bool)
     chosen[labels == number + 1] = True
-    flat = 0.025 * scene.unit
+    bounding = surfaces[number].structure
+    flat = (PANEL_M if bounding else SHEET_M) * scene.unit
+    below = hull_of(plane.footprint) if bounding else plane.footprint
     for label, mine in members_of(labels, 0).items():
-        thin = label > len(surfaces) or surfaces[label - 1].sheet
+        thin = label > len(surfaces) or surfaces[label - 1].sheet or (bounding and not surfaces[label - 1].structure)
         if thin and np.quantile(height[mine], 0.9) < flat and np.quantile(height[mine], 0.1) > -flat:
-            over = plane.raster.look_up(plane.footprint, cloud.points[mine]) > 0
+            over = plane.raster.look_up(below, cloud.points[mine]) > 0
             chosen[mine] = over.mean() > 0.3
     chosen &= (height > -1.5 * scene.tolerance) & (height < 2.0 * flat)
     voxels = np.flatnonzero(chosen)
-    raster = plane_raster(plane.equation, cloud.points[voxels], cloud.voxel)
+    grain = cloud.voxel * (2.0 if bounding else 1.0)
+    raster = plane_raster(plane.equation, cloud.points[voxels], grain)
     rc = raster.cells(cloud.points[voxels])
     cell = rc[:, 0] * raster.shape[1] + rc[:, 1]
     size = raster.shape[0] * raster.shape[1]
@@ -83,16 +99,54 @@ def _look_down(scene: Scene, surfaces: list[Surface], labels: Labels, number: in
     return _Top(raster, known, np.stack(images[:3], axis=-1), images[3], voxels, cell)
 
 
-def _pieces(scene: Scene, top: _Top) -> NDArray[np.int32]:
-    """Flat things, numbered from 1, on the grid."""
+def _stands_out(scene: Scene, top: _Top) -> tuple[Float, NDArray[np.bool_]]:
+    """Smoothed colour, and the cells that differ from the surface around them in colour or height."""
     channels = [cv2.medianBlur(np.ascontiguousarray(top.color[..., k]), 3) for k in range(3)]
     color = np.stack(channels, axis=-1).astype(np.float32)
     away, ground = _away_from_ground(color, top, scene)
     height = np.asarray(cv2.blur(np.where(top.known, top.height, 0.0), (3, 3)), np.float32)
     noise = 1.4826 * float(np.median(np.abs(height[ground]))) if ground.any() else 0.0
     raised = top.known & (_less_ground(height, ground, top, scene) > max(4.0 * noise, 0.004 * scene.unit))
+    return color, away | raised
+
+
+def _panels(scene: Scene, top: _Top) -> NDArray[np.int32]:
+    """Rectangles on a wall or floor (pictures, boards, rugs), numbered from 1, on the grid.
+
+    A wall has edges, shadows and stains of its own, so only a well filled rectangle that leaves most of the wall bare
+    counts, whatever the pattern inside it.
+    """
+    mask = _stands_out(scene, top)[1].astype(np.uint8)
+    wide = 2 * max(1, round(0.03 * scene.unit / top.raster.cell)) + 1
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((wide, wide), np.uint8))
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((wide, wide), np.uint8))
+    count, regions = cv2.connectedComponents(opened, connectivity=4)
+    square = (scene.unit / top.raster.cell) ** 2
+    out, number = np.zeros(top.known.shape, np.int32), 0
+    for region in range(1, count):
+        inside = (regions == region) & top.known
+        area = float(np.count_nonzero(regions == region))
+        if area < PANEL_AREA_M2 * square or area > 0.5 * np.count_nonzero(top.known):
+            continue
+        rectangle = cv2.minAreaRect(np.argwhere(regions == region)[:, ::-1].astype(np.float32))
+        sides = np.asarray(rectangle[1]) + 1.0
+        frame = cv2.fillConvexPoly(
+            np.zeros(mask.shape, np.uint8), np.rint(cv2.boxPoints(rectangle)).astype(np.int32), 1
+        )
+        bare = np.count_nonzero((frame > 0) & top.known & (regions != region))
+        if sides.max() > 5.0 * sides.min() or area < PANEL_SEEN * float(np.prod(sides)):
+            continue
+        if area > PANEL_FILL * (area + bare):
+            number += 1
+            out[inside] = number
+    return out
+
+
+def _pieces(scene: Scene, top: _Top) -> NDArray[np.int32]:
+    """Flat things, numbered from 1, on the grid."""
+    color, differs = _stands_out(scene, top)
     square = np.ones((3, 3), np.uint8)
-    opened = cv2.morphologyEx((away | raised).astype(np.uint8), cv2.MORPH_OPEN, square)
+    opened = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, square)
     mask = (np.asarray(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, square)) > 0) & top.known
     least = int(scene.settings.flat_area_m2 / (top.raster.cell / scene.unit) ** 2)
     regions = merge_regions(color, mask, least)

@@ -74,8 +74,10 @@ def estimate_up(planes: list[Plane], T_chunk_cam: NDArray[np.float64]) -> NDArra
 def choose_surfaces(scene: Scene, planes: list[Plane]) -> list[Surface]:
     """The planes that cut, largest first: big ones, what bounds the room, what things rest on, and sheets."""
     out: list[Surface] = []
-    for plane in sorted(merge_coplanar(scene, planes), key=lambda p: -p.area):
-        level, structure = scene.level(plane), is_structure(scene, plane)
+    joined = sorted(merge_coplanar(scene, planes), key=lambda p: -p.area)
+    for plane in joined:
+        level = scene.level(plane)
+        structure = is_structure(scene, plane) and (level or not _mounted(scene, plane, joined))
         sheet = level and any(_lies_on(scene, plane, other) for other in out if other.level)
         area = plane.area / scene.unit**2
         long = plane.extent()[0] / scene.unit > 0.9 and area > 0.2 and scene.upright(plane)

@@ -8,8 +8,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from list3r.instances.cloud import Cloud, linked_components, neighbour_pairs
+from list3r.instances.planes import Plane
 from list3r.instances.surfaces import Labels, Scene, Surface, hull_of
 
+REVEAL_M = 0.25
+"""Walls up to this thick show their end faces beside doors."""
 SEAT_AREA_M2 = 0.35
 """Level surfaces up to this may be parts (seat, lid, step) of a thing that is larger than they are."""
 
@@ -156,6 +159,39 @@ def drop_slivers(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
         best = int(np.argmax(touching)) if touching else 0
         out[mine] = best + 1 if touching and touching[best] > 0.5 * len(mine) else 0
     return out
+
+
+def drop_reveals(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
+    """Labels without the end faces of walls, beside doors and windows: narrow upright strips that meet a wall along
+    their length and are nowhere before it.
+    """
+    walls = [n for n, s in enumerate(surfaces) if scene.upright(s.plane) and _is_wall(scene, s.plane)]
+    contact = contacts(scene.cloud, labels)
+    out = labels.copy()
+    for part, mine in members_of(labels, 0).items():
+        if part <= len(surfaces) and (part - 1 in walls or surfaces[part - 1].structure):
+            continue
+        points = scene.cloud.points[mine]
+        tall = float(np.ptp(np.quantile(points @ scene.up, [0.03, 0.97])))
+        spread = points - points.mean(axis=0)
+        level = spread - np.outer(spread @ scene.up, scene.up)
+        wide = float(np.ptp(np.quantile(level @ np.linalg.eigh(level.T @ level)[1][:, 2], [0.03, 0.97])))
+        if wide > REVEAL_M * scene.unit or tall < 3.0 * wide or tall < 0.5 * scene.unit:
+            continue
+        for number in walls:
+            touching = contact.get((min(number + 1, part), max(number + 1, part)), 0)
+            height = surfaces[number].plane.height(points)
+            behind = float(np.mean(height < scene.tolerance[mine] + scene.cloud.reading[mine]))
+            if touching * scene.cloud.voxel > 0.5 * tall and behind > 0.9:
+                out[mine] = 0
+                break
+    return out
+
+
+def _is_wall(scene: Scene, plane: Plane) -> bool:
+    """True for an upright surface as tall as no furniture but a wardrobe is."""
+    tall = np.ptp(np.quantile(scene.cloud.points[plane.members] @ scene.up, [0.02, 0.98]))
+    return bool(tall > 1.2 * scene.unit and plane.area > scene.settings.big_plane_area_m2 * scene.unit**2)
 
 
 def _is_back(scene: Scene, surface: Surface, points: NDArray[np.float32], height: NDArray[np.float32]) -> bool:
