@@ -192,7 +192,7 @@ def _things(
         up = upright and component == first
         members = [Member(shapes[k], _at(summaries, (k, n)), placed[k], dropped[k]) for k, n in group]
         poses = tuple((checks[k], placed[k].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
-        cuts = b"".join(np.packbits(m.dropped[m.shapes.owner == m.at]).tobytes() for m in members)
+        cuts = b"".join(np.packbits(m.dropped[slice(*m.span)]).tobytes() for m in members)
         key: tuple[object, ...] = (instance_id, component, up, tuple(group), poses, cuts)
         if key not in before:
             thing = derive_thing(instance_id, members, component, upright=up, settings=s.derive)

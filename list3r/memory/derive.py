@@ -48,9 +48,15 @@ class Member:
     """Points of the chunk's shapes that belong to something else. Shape (R,)."""
 
     @property
-    def own(self) -> NDArray[np.bool_]:
-        """The points of the chunk's shapes that are its surface. Shape (R,)."""
-        return np.asarray((self.shapes.owner == self.at) & ~self.dropped)
+    def span(self) -> tuple[int, int]:
+        """First and end of its points in the chunk's shapes, which are ordered by owner."""
+        start, stop = np.searchsorted(self.shapes.owner, [self.at, self.at + 1])
+        return int(start), int(stop)
+
+    def own(self) -> NDArray[np.int64]:
+        """Positions of the points of the chunk's shapes that are its surface. Shape (M,)."""
+        start, stop = self.span
+        return np.asarray(start + np.flatnonzero(~self.dropped[start:stop]))
 
 
 @dataclass(frozen=True)
@@ -83,11 +89,12 @@ def derive_thing(
 ) -> Thing:
     """All that follows from the members of one thing; `upright` says that z is up."""
     s = settings
-    points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[m.own]) for m in members])
-    rgb = np.concatenate([m.shapes.rgb[m.own] for m in members])
+    own = [m.own() for m in members]
+    points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[k]) for m, k in zip(members, own, strict=True)])
+    rgb = np.concatenate([m.shapes.rgb[k] for m, k in zip(members, own, strict=True)])
     if len(points) == 0:
         points, rgb = members[0].S_world_chunk.apply(np.zeros((1, 3))), np.zeros((1, 3), np.uint8)
-    owner = np.repeat(np.arange(len(members)), [int(m.own.sum()) for m in members])
+    owner = np.repeat(np.arange(len(members)), [len(k) for k in own])
     step = -(-len(points) // s.max_points)
     points, rgb, owner = points[::step], rgb[::step], owner[::step]
     keep = _confirmed(points, owner, members, s)
