@@ -137,6 +137,15 @@ def test_replica_poses_keep_to_the_numbers_of_their_frames(tmp_path: Path) -> No
     assert "5 poses for 3 frames" in " ".join(source.info.notes)
 
 
+def test_depth_that_begins_late_is_depth(tmp_path: Path) -> None:
+    write_replica(tmp_path, count=14)
+    for k in range(11):
+        (tmp_path / f"results/depth{k:06d}.png").unlink()
+    source = open_source(tmp_path)
+    assert source.info.has_depth
+    assert [type(f) for f in source.read(10, 12)] == [BadFrame, Frame]
+
+
 def test_depth_with_fractions_is_metres(tmp_path: Path) -> None:
     write_tum(tmp_path, count=3)
     (tmp_path / "calibration.txt").write_text("70 70 39.5 29.5")

@@ -113,3 +113,18 @@ def test_output_that_nobody_reads_is_no_failure(command: str, tmp_path: Path) ->
     process.stdout.close()
     assert process.stderr.read() == b""
     assert process.wait(timeout=60) == 0
+
+
+def test_ctrl_c_in_any_command_is_said_and_is_a_failure(tmp_path: Path) -> None:
+    program = """
+import os, signal, sys
+import list3r.scene_memory
+list3r.scene_memory.SceneMemory.export = lambda *_: os.kill(os.getpid(), signal.SIGINT) or signal.pause()
+from list3r.cli import main
+main()
+"""
+    out = tmp_path / "room.json"
+    arguments = ["export", str(write_room(tmp_path / "room.l3r")), "--to", "json", "--out", str(out)]
+    command = [sys.executable, "-c", program, *arguments]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (result.returncode, result.stdout, result.stderr.strip()) == (1, "", "interrupted")

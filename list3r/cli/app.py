@@ -28,6 +28,8 @@ app = typer.Typer(
 for module in (build_commands, memory_commands, query_commands, file_commands, evaluation_commands):
     module.register(app)
 
+_INTERRUPTED = 130
+"""Status that typer gives when Ctrl-C reaches it."""
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 _COMMAND_ERROR: type[Exception] = typer.BadParameter.__mro__[2]
 
@@ -60,6 +62,8 @@ def run(arguments: list[str]) -> int:
     try:
         status = command.main(arguments, prog_name="list3r", standalone_mode=False)
         sys.stdout.flush()
+        if status == _INTERRUPTED:
+            raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except _USAGE_ERROR as error:
         return _usage_error(error)

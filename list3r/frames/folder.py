@@ -34,7 +34,7 @@ class FolderSource:
         self._fps = options.fps or _rate(layout.files) or DEFAULT_FPS
         self.optics, notes = merge_optics(layout, options)
         optics = self.optics
-        self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files[:_PROBES])
+        self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files)
         self._typical_raw = 0.0
         self._floats = False
         sizes = self._probe(root)
