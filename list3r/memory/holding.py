@@ -75,14 +75,19 @@ def on_hidden_feet(scene: Scene, held: set[int]) -> list[Found]:
 
 
 def _beneath(scene: Scene, a: int) -> list[tuple[float, int]]:
-    """(clearance, position) of the things wholly below a that have a surface under its middle."""
+    """(clearance, position) of the things wholly below a that have a surface under its middle and are wide enough to
+    bear it.
+    """
     middle, bottom = scene.bodies[a].box.center[:2], float(np.quantile(scene.bodies[a].points[:, 2], 0.01))
     below = scene.thing & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
     slack = 0.25 * scene.unit
     below &= np.all((scene.low[:, :2] - slack <= middle) & (scene.high[:, :2] + slack >= middle), axis=1)
+    base = float(np.prod(scene.bodies[a].box.size[:2]))
     out = []
     for b in np.flatnonzero(below).tolist():
         plan = scene.plan(b)
+        if float(np.prod(scene.bodies[b].box.size[:2])) < 0.5 * base:
+            continue
         distance, at = neighbours_of(middle[None], plan.tree, min(6, len(plan.points)))
         if distance[0, 0] < max(0.05 * scene.unit, 3.0 * plan.spacing):
             out.append((bottom - float(np.max(plan.points[at[0], 2])), b))
