@@ -89,9 +89,9 @@ def _join_backs(
                 root = _root(parent, pair[0] if pair[1] == label else pair[1])
                 cells = len(np.unique(np.floor(places / (CELL_M * scene.unit)), axis=0))
                 framed[root] = framed.get(root, 0.0) + 0.5 * cells * CELL_M * scene.unit
-        best = max(framed, key=lambda k: (framed[k], -k), default=None)
-        if best is not None and sum(framed.values()) > FRAMED_SHARE * rim:
-            _unite(parent, label, best)
+        if sum(framed.values()) > FRAMED_SHARE * rim:
+            bodies = {_root(parent, face.label) for face in faces.values() if face.surface}
+            _unite(parent, label, max(framed, key=lambda k: (k in bodies, framed[k], -k)))
 
 
 def _faces(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: Mapping[int, int]) -> dict[int, _Face]:

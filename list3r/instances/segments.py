@@ -24,6 +24,7 @@ from list3r.instances.things import (
     drop_slivers,
     least_voxels,
 )
+from list3r.instances.vessels import join_vessels
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ def segment_cloud(
     labels = attach_parts(scene, surfaces, labels)
     labels = split_crowds(scene, surfaces, labels)
     labels = adopt_fragments(scene, surfaces, labels)
+    labels = join_vessels(scene, surfaces, labels)
     labels = drop_slivers(scene, surfaces, labels)
     labels = drop_reveals(scene, surfaces, labels)
     labels = drop_junk(scene, surfaces, labels)
