@@ -90,7 +90,7 @@ def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]
     sample = rgb[:: -(-len(rgb) // _SAMPLE)]
     lab = lab_from_rgb(sample)
     place = lab * _HALF_LIGHT
-    alike = ((place[:, None] - place[None]) ** 2).sum(axis=2) < _ALIKE**2
+    alike = sum(np.subtract.outer(channel, channel) ** 2 for channel in place.T) < _ALIKE**2
     left = np.ones(len(sample), dtype=bool)
     out: list[Swatch] = []
     while left.any() and len(out) < most:
