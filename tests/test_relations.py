@@ -235,3 +235,13 @@ def test_a_shade_whose_thin_foot_was_not_seen_stands_on_what_is_under_it() -> No
     top = float(table.points[:, 2].max())
     shade = body(3, Piece("shade", (0.1, 0.1, top + 0.18), (0.22, 0.22, 0.17), round=True, points=400))
     assert (3, "on", 2) in facts([body(1, FLOOR, structure="floor"), table, shade])
+
+
+def test_a_rug_is_next_to_nothing_but_a_magazine_on_the_table_is() -> None:
+    rug = body(9, Piece("rug", (1.2, 1.0, 0.008), (1.2, 1.4, 0.012), points=1500))
+    found = facts([*kitchen(), rug])
+    assert (9, "on", 1) in found and not any(p == "next_to" and 9 in (s, o) for s, p, o in found)
+    beside = moved(body(6, MAGAZINE), (0.0, 0.0, 0.0))
+    low, high = beside.aabb
+    mug = body(3, Piece("mug", (high[0] + 0.08, (low[1] + high[1]) / 2, low[2] + 0.05), (0.08, 0.08, 0.1), round=True))
+    assert (3, "next_to", 6) in facts([beside, mug])

@@ -50,6 +50,8 @@ class RelationSettings:
     """Longest edge of such a container."""
     above_m: float = 1.5
     """Higher than this over something is no longer said to be above it."""
+    covering_m: float = 0.06
+    """What lies on the floor and is lower than this is a rug: things stand on it or near it, not next to it."""
     next_to_m: tuple[float, float] = (0.1, 0.4)
     """Gap between surfaces: half the mean size of the two, within these."""
     near_m: tuple[float, float] = (0.15, 0.4)
@@ -104,6 +106,8 @@ class Scene:
         self.low, self.high = low, high
         self.foot = low[:, 2].copy()
         """Where each body ends below; down to the floor for what stands on it."""
+        self.covering = np.zeros(len(bodies), dtype=bool)
+        """Whether each body is a rug."""
         self.size = np.array([b.size for b in bodies])
         self.thing = np.array([b.structure is None for b in bodies], dtype=bool)
 

@@ -62,6 +62,7 @@ def relations(
                 holding |= {(a, b), (b, a)}
                 if bodies[b].structure == "floor":
                     scene.foot[a] = min(scene.foot[a], float(np.median(bodies[b].points[:, 2])))
+                    scene.covering[a] = scene.high[a, 2] - scene.low[a, 2] < s.covering_m * unit
                 out += _both(bodies, a, predicate, b, confidence, margin)
         out += _overhead(scene, holding)
         out += _attached(scene, {a for a, _, _, _ in (*inside, *supported)})
@@ -178,7 +179,9 @@ def _box_gap(a: OrientedBox, b: OrientedBox) -> float:
 
 
 def _side_by_side(scene: Scene, a: int, b: int) -> bool:
-    """Whether two things share a good part of their heights."""
+    """Whether two things share a good part of their heights, and neither is a rug."""
+    if scene.covering[a] or scene.covering[b]:
+        return False
     low = max(scene.foot[a], scene.foot[b])
     high = min(scene.high[a, 2], scene.high[b, 2])
     shorter = min(scene.high[a, 2] - scene.foot[a], scene.high[b, 2] - scene.foot[b])
