@@ -30,7 +30,7 @@ from list3r.memory.store import Store
 from list3r.workers import OrderedPool, default_workers
 
 Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all) after every chunk."""
+"""Called with (frames done, frames in all) at the start and after every chunk."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +118,8 @@ def _add_all(
 ) -> None:
     """Add the chunks in order, with one thread, so that sums do not depend on the machine."""
     bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
+    if progress is not None:
+        progress(len(target.store.frames(session)), info.frame_count)
     for span, result in zip((t.span for t in tasks), pool.map(tasks), strict=True):
         bad.update(index for index, _ in result.bad_frames)
         check_bad_share(len(bad), info.frame_count)

@@ -134,9 +134,10 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
 
         def progress(done: int, total: int) -> None:
             nonlocal kept
-            kept = True
+            kept = kept or done > 0
             bar.total = total
             bar.update(done - bar.n)
+            bar.refresh()
 
         try:
             return build_memory(source, memory, progress=progress, **arguments)
