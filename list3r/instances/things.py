@@ -147,7 +147,6 @@ def adopt_islands(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labe
 
 def drop_slivers(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
     """Give thin strips along a surface (edges of boards, plinths, mouldings) to the surface, or drop them."""
-    contact = contacts(scene.cloud, labels)
     out = labels.copy()
     for part, mine in members_of(labels, len(surfaces)).items():
         spread = scene.cloud.points[mine] - scene.cloud.points[mine].mean(axis=0)
@@ -155,10 +154,18 @@ def drop_slivers(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
         size = np.ptp(np.quantile(spread @ axes, [0.03, 0.97], axis=0), axis=0)
         if size[1] > 0.06 * scene.unit or size[2] < 5.0 * size[1] or size[2] < 0.25 * scene.unit:
             continue
+        contact = contacts(scene.cloud, _around(scene, labels, mine))
         touching = [contact.get((number + 1, part), 0) for number in range(len(surfaces))]
         best = int(np.argmax(touching)) if touching else 0
         out[mine] = best + 1 if touching and touching[best] > 0.5 * len(mine) else 0
     return out
+
+
+def _around(scene: Scene, labels: Labels, mine: NDArray[np.int64]) -> Labels:
+    """Labels of the voxels in reach of some, 0 elsewhere: enough for the contacts of these."""
+    points, reach = scene.cloud.points, 4.0 * scene.cloud.voxel
+    low, high = points[mine].min(axis=0) - reach, points[mine].max(axis=0) + reach
+    return np.asarray(np.where(((points >= low) & (points <= high)).all(axis=1), labels, 0), np.int32)
 
 
 def drop_reveals(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
@@ -166,7 +173,6 @@ def drop_reveals(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
     their length and are nowhere before it.
     """
     walls = [n for n, s in enumerate(surfaces) if scene.upright(s.plane) and _is_wall(scene, s.plane)]
-    contact = contacts(scene.cloud, labels)
     out = labels.copy()
     for part, mine in members_of(labels, 0).items():
         if part <= len(surfaces) and (part - 1 in walls or surfaces[part - 1].structure):
@@ -178,6 +184,7 @@ def drop_reveals(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
         wide = float(np.ptp(np.quantile(level @ np.linalg.eigh(level.T @ level)[1][:, 2], [0.03, 0.97])))
         if wide > REVEAL_M * scene.unit or tall < 3.0 * wide or tall < 0.5 * scene.unit:
             continue
+        contact = contacts(scene.cloud, _around(scene, labels, mine))
         for number in walls:
             touching = contact.get((min(number + 1, part), max(number + 1, part)), 0)
             height = surfaces[number].plane.height(points)
