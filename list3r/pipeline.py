@@ -192,7 +192,7 @@ def _open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resum
         path.unlink()
     replaced = _left_aside(path)
     if not path.exists():
-        return _Target(_create(path), fresh=True)
+        return _Target(Store.create(path), fresh=True)
     if resume and not force:
         with Store.open(path) as store:
             _check_same(store, info, settings)
@@ -205,13 +205,7 @@ def _open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resum
         path.rename(replaced)
     else:
         remove_memory(path)
-    return _Target(_create(path), fresh=True, replaced=replaced)
-
-
-def _create(path: Path) -> Store:
-    """A new memory. Closed once, so that a build killed before its first chunk leaves a file that can be opened."""
-    Store.create(path).close()
-    return Store.open(path, writable=True)
+    return _Target(Store.create(path), fresh=True, replaced=replaced)
 
 
 def _aside(path: Path) -> Path:

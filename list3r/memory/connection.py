@@ -81,9 +81,10 @@ class Connection:
             if version < SCHEMA_VERSION and not writable:
                 raise MemoryFileError(f"{path} has the old schema version {version}; open it once for writing")
             if writable:
+                # Before the write-ahead log: so the file itself says what it is, whatever happens next.
+                _migrate(database, version, fresh)
                 database.execute("PRAGMA journal_mode=WAL")
                 database.execute("PRAGMA synchronous=NORMAL")
-                _migrate(database, version, fresh)
         except sqlite3.DatabaseError as error:
             _release(database, lock)
             raise MemoryFileError(_explain(path, error)) from error
