@@ -49,13 +49,12 @@ def _watch(process: subprocess.Popen[str]) -> float:
 
 def _descendants(pid: int) -> list[int]:
     found: list[int] = []
-    for task in Path(f"/proc/{pid}/task").glob("*"):
-        try:
-            children = [int(word) for word in (task / "children").read_text().split()]
-        except OSError:
-            continue
-        for child in children:
-            found += [child, *_descendants(child)]
+    try:
+        texts = [(task / "children").read_text() for task in Path(f"/proc/{pid}/task").iterdir()]
+    except OSError:  # it has ended meanwhile
+        return found
+    for child in (int(word) for text in texts for word in text.split()):
+        found += [child, *_descendants(child)]
     return found
 
 

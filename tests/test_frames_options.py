@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.options import SourceOptions, parse_distortion, parse_intrinsics, parse_range, parse_transform
 from list3r.memory.errors import OptionError
+from list3r.workers import OrderedPool
 
 
 def test_intrinsics_are_four_numbers() -> None:
@@ -87,5 +88,9 @@ def test_values_without_sense_are_refused(bad: dict) -> None:
 
 def test_options_survive_the_way_to_another_process() -> None:
     options = SourceOptions(intrinsics=(5, 5, 2, 2), T_color_depth=np.eye(4), distortion=(0.1,))
-    assert pickle.loads(pickle.dumps(options)) == options
-    assert hash(options) == hash(pickle.loads(pickle.dumps(options)))
+    pool: OrderedPool[SourceOptions, str] = OrderedPool(repr, 1)
+    try:
+        assert list(pool.map([options])) == [repr(options)]
+    finally:
+        pool.stop()
+    assert hash(options) == hash(copy.deepcopy(options))

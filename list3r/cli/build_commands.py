@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from list3r.cli import source_options as src
+from list3r.cli.building import report_lines, run_build
 from list3r.cli.common import JsonOption, note, print_json
-
-if TYPE_CHECKING:
-    from list3r.pipeline import BuildReport
 
 
 def register(app: typer.Typer) -> None:
@@ -120,47 +117,6 @@ def build(
         print_json({"memory": str(memory), **report.as_dict()})
     else:
         print("\n".join(report_lines(memory, report)))
-
-
-def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any) -> BuildReport:
-    """Build with a progress bar; Ctrl-C says how to go on."""
-    from tqdm import tqdm
-
-    from list3r.pipeline import build as build_memory
-
-    tqdm.monitor_interval = 0
-    with tqdm(unit="frame", desc="building", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
-        kept = bool(arguments.get("resume"))
-
-        def progress(done: int, total: int) -> None:
-            nonlocal kept
-            kept = kept or done > 0
-            bar.total = total
-            bar.update(done - bar.n)
-            bar.refresh()
-
-        try:
-            return build_memory(source, memory, progress=progress, **arguments)
-        except KeyboardInterrupt:
-            bar.close()
-            if kept and memory.exists():
-                note(f"\ninterrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
-            else:
-                note("\ninterrupted before the first chunk was finished; nothing was changed")
-            raise typer.Exit(1) from None
-
-
-def report_lines(memory: Path, report: BuildReport) -> list[str]:
-    """What a build did, for people."""
-    size = memory.stat().st_size / 1e6
-    lines = [
-        f"{memory}  {size:.1f} MB",
-        f"frames     {report.posed} of {report.frames} posed, {report.lost} lost, {report.bad} unreadable",
-        f"chunks     {report.chunks} in {report.components} part{'s' * (report.components > 1)}, {report.loops} loops",
-        f"instances  {report.instances} things, {report.structure} pieces of structure, {report.relations} relations",
-        f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
-    ]
-    return lines + [f"note: {line}" for line in report.notes]
 
 
 def demo(

@@ -45,7 +45,11 @@ def print_json(value: object) -> None:
 
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
-    """Left-aligned columns under a header."""
+    """Left-aligned columns under a header; a word where there are no rows."""
+    rows = list(rows)
+    if not rows:
+        print("nothing found")
+        return
     cells = [list(header), *[[_cell(v) for v in row] for row in rows]]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:

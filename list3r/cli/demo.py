@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from list3r.cli.build_commands import report_lines, run_build
+from list3r.cli.building import report_lines, run_build
 from list3r.cli.common import open_memory, print_table
 from list3r.cli.evaluation_commands import score_rows
 from list3r.memory.errors import OptionError

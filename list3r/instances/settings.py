@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from list3r.memory.errors import OptionError
@@ -56,6 +57,8 @@ class TrackSettings:
     """How masks are followed and which tracks are kept."""
 
     min_frames: int = 5
+    """Fewer are asked of a chunk of few frames: `short_share` of them, but never fewer than three."""
+    short_share: float = 0.15
     min_share: float = 0.08
     """Of the chunk's posed frames."""
     min_stability: float = 0.4
@@ -64,6 +67,11 @@ class TrackSettings:
     cannot_link_frames: int = 3
     """Frames in which a pair must be seen side by side."""
     support_points: int = 3000
+
+    def least_frames(self, posed: int) -> float:
+        """Frames in which a track of a chunk with so many posed frames must be seen to be kept."""
+        least = min(self.min_frames, max(3, math.ceil(self.short_share * posed)), posed)
+        return max(least, self.min_share * posed)
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ class ReprojectionTracker:
     ) -> LocalLibrary:
         size = (views.reconstruction.camera.height, views.reconstruction.camera.width)
         posed = int(views.reconstruction.posed.sum())
-        least = max(min(self.settings.track.min_frames, posed), self.settings.track.min_share * posed)
+        least = self.settings.track.least_frames(posed)
         instances: list[LocalInstance] = []
         for number, (track, support) in enumerate(zip(tracks, supports, strict=True)):
             stability = float(np.mean(track.agreement)) if track.agreement else 0.0

@@ -287,6 +287,10 @@ class ChunkVerbs(Connection):
         )
         return [read_frame_row(row) for row in self._rows(query, arguments)]
 
+    def posed_count(self) -> int:
+        """How many frames have a pose."""
+        return int(self._rows("SELECT count(*) FROM frames WHERE state = 'posed'")[0][0])
+
     def bad_frames(self) -> list[tuple[int, int, str]]:
         """(session id, Frame.index, reason) of the frames that could not be decoded."""
         query = "SELECT session_id, frame_index, note FROM frames WHERE state = 'bad' ORDER BY session_id, frame_index"

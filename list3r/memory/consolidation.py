@@ -76,7 +76,8 @@ def consolidate(
     before = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     evidence = weigh(groups, {k: v.shapes for k, v in summaries.items()}, pairs, s.evidence)
     weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
-    shown = [e.shown(s.evidence) for e in evidence]
+    posed = store.posed_count()
+    shown = [e.shown(s.evidence, posed) for e in evidence]
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
     things = _things(store, groups, ids, evidence, chunks, summaries, s)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from list3r.memory.colors import lab_from_rgb as lab_from_rgb
 from list3r.memory.geometry import Array
 
 _SMALL_M = 0.6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,9 @@ class EvidenceSettings:
     """When a group of local instances is shown."""
 
     min_frames: int = 12
-    """A thing seen in fewer frames, over all chunks, is not shown."""
+    """A thing seen in fewer frames, over all chunks, is not shown; fewer are asked of a short memory."""
+    min_share: float = 0.15
+    """Share of all frames that is enough in a short memory, but never fewer than three frames."""
     swallowed: float = 0.75
     """Share of its surface that another chunk gives to one other thing, to speak against it."""
     min_agreement: float = 0.4
@@ -47,10 +50,11 @@ class Evidence:
         """Share of the chunks that saw its place and found it as a thing of its own."""
         return self.found / max(self.found + self.swallowed, 1)
 
-    def shown(self, s: EvidenceSettings) -> bool:
-        """Enough frames, and more chunks for it than against it (or nearly so when several found it)."""
+    def shown(self, s: EvidenceSettings, all_frames: int) -> bool:
+        """Seen in enough of all posed frames, and more chunks for it than against (or nearly, if several found it)."""
         agreed = self.found > self.swallowed or (self.found >= 3 and self.agreement >= s.min_agreement)
-        return self.frames >= s.min_frames and agreed
+        enough = min(s.min_frames, max(3, math.ceil(s.min_share * all_frames)))
+        return self.frames >= enough and agreed
 
 
 def weigh(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.chunk_verbs import LocalNode
-from list3r.memory.describe import lab_from_rgb
+from list3r.memory.colors import lab_from_rgb
 from list3r.memory.geometry import Array, Sim3
 
 Ints = NDArray[np.int64]
