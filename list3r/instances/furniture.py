@@ -192,7 +192,8 @@ def _root(parent: dict[int, int], label: int) -> int:
 
 
 def _rename(labels: Labels, parent: dict[int, int]) -> Labels:
-    table = np.arange(int(labels.max(initial=0)) + 1, dtype=np.int32)
+    # The highest label may have been joined to another before, and be no longer among `labels`.
+    table = np.arange(max(int(labels.max(initial=0)), *parent, 0) + 1, dtype=np.int32)
     for label in parent:
         table[label] = _root(parent, label)
     return np.asarray(table[labels], np.int32)

@@ -77,7 +77,7 @@ def attach_parts(scene: Scene, surfaces: list[Surface], labels: Labels) -> Label
     fixed = np.array([0] + [k + 1 for k, surface in enumerate(surfaces) if surface.structure])
     contact = contacts(cloud, np.where(np.isin(labels, fixed), 0, labels))
     parts = members_of(labels, len(surfaces))
-    parent = np.arange(int(labels.max(initial=0)) + 1)
+    parent = np.arange(max(int(labels.max(initial=0)), len(surfaces)) + 1)
     for number, surface in enumerate(surfaces):
         if not surface.level or surface.structure or surface.sheet:
             continue
@@ -238,7 +238,7 @@ def adopt_fragments(scene: Scene, surfaces: list[Surface], labels: Labels) -> La
     """
     taken, points = len(surfaces), scene.cloud.points
     parts = members_of(labels, taken)
-    parent = np.arange(int(labels.max(initial=0)) + 1)
+    parent = np.arange(max(int(labels.max(initial=0)), len(surfaces)) + 1)
     size = np.bincount(labels, minlength=len(parent)).astype(np.int64)
     free = np.flatnonzero(labels > taken)
     reach = 0.04 * scene.unit
