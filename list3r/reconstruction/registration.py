@@ -7,6 +7,7 @@ one weight balances them, and both are under a Huber kernel. Gauss-Newton on SE(
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -136,6 +137,42 @@ def register(
     )
 
 
+def steps_without(
+    model: Samples,
+    view: View,
+    T_model_cam: NDArray[np.float64],
+    masks: Sequence[NDArray[np.bool_]],
+    settings: RegistrationSettings,
+    noise: SensorNoise,
+) -> list[NDArray[np.float64] | None]:
+    """The step (4, 4) from a registered pose that the rest of the view would take if a part were left out.
+
+    `masks` are the parts, (h, w) each; None where the rest is too little. One Gauss-Newton step, on shared residuals.
+    """
+    frame, last_gate = _Frame(view, noise), settings.gate_m * 0.5**settings.gate_halvings
+    pairs = _pair(model, frame, T_model_cam, last_gate, settings.normal_agreement)
+    rows, errors = [_geometric_slope(pairs)], [pairs.residual]
+    if pairs.gray is not None and settings.photometric_weight > 0:
+        slope, error = _photometric_slope(pairs, frame, T_model_cam)
+        rows.append(slope)
+        errors.append(error)
+    x, y = np.rint(pairs.uv).astype(np.int64).T
+    out: list[NDArray[np.float64] | None] = []
+    for mask in masks:
+        rest = np.flatnonzero(~mask[y, x])
+        if len(rest) < 50:
+            out.append(None)
+            continue
+        information, gradient = _normal_equations(rows[0][rest], errors[0][rest], _spread(errors[0][rest], 1e-3))
+        if len(rows) > 1:
+            error = errors[1][rest] - np.median(errors[1][rest])
+            more, slope64 = _normal_equations(rows[1][rest], error, _spread(error, 1.0))
+            information += settings.photometric_weight * more
+            gradient += settings.photometric_weight * slope64
+        out.append(_exp(-np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient)))
+    return out
+
+
 class _Frame:
     """The images of a view laid out for look-ups by pixel number."""
 
@@ -215,8 +252,12 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
 
 def _geometric(pairs: _Pairs, huber: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
-    slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1) * pairs.inverse_sigma[:, None]
-    return _normal_equations(slope, pairs.residual, pairs.scale, huber)
+    return _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, huber)
+
+
+def _geometric_slope(pairs: _Pairs) -> Floats:
+    slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1)
+    return np.asarray(slope * pairs.inverse_sigma[:, None])
 
 
 def _solid_information(
@@ -241,21 +282,31 @@ def _photometric(
     pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
+    slope, error = _photometric_slope(pairs, frame, T, least_gradient)
+    error -= np.median(error)
+    return _normal_equations(slope, error, _spread(error, 1.0))
+
+
+def _photometric_slope(
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
+) -> tuple[Floats, Floats]:
     assert pairs.gray is not None
     value, dx, dy = _sample(frame, pairs.uv)
     if least_gradient > 0:
         strong = dx * dx + dy * dy > least_gradient**2
         dx, dy = dx * strong, dy * strong
-    error = value - pairs.gray
-    error -= np.median(error)
-    scale = 1.4826 * float(np.median(np.abs(error))) + 1.0
     camera, p = frame.camera, pairs.points_cam
     inverse_z = 1.0 / p[:, 2]
     gx, gy = dx * np.float32(camera.fx) * inverse_z, dy * np.float32(camera.fy) * inverse_z
     slope_cam = np.stack([gx, gy, -(gx * p[:, 0] + gy * p[:, 1]) * inverse_z], axis=1)
     slope_model = slope_cam @ T[:3, :3].T.astype(np.float32)
     slope = -np.concatenate([slope_model, _cross(pairs.points, slope_model)], axis=1)
-    return _normal_equations(slope, error, scale)
+    return slope, value - pairs.gray
+
+
+def _spread(error: Floats, least: float) -> float:
+    """Robust standard deviation."""
+    return 1.4826 * float(np.median(np.abs(error))) + least
 
 
 def _anchored(

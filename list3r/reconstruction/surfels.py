@@ -89,6 +89,20 @@ class SurfelModel:
             self._drop()
         self._append(points[new], normals[new], gray[new], weight[new])
 
+    def forget(self, view: View, mask: NDArray[np.bool_], T_model_cam: NDArray[np.float64]) -> None:
+        """Drop the elements at the surface that the view shows inside a mask."""
+        pixel = np.flatnonzero(view.valid & mask)
+        if not len(pixel) or not len(self):
+            return
+        local = view.points.reshape(-1, 3)[pixel]
+        element = self.visible(T_model_cam, view.camera)[pixel]
+        R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
+        depth = (self.points[element] - t) @ R[:, 2]
+        near = (element >= 0) & (np.abs(depth - local[:, 2]) < np.float32(0.05) * local[:, 2])
+        self.weight[element[near]] = 0.0
+        if near.any():
+            self._drop()
+
     def _average(self, index: NDArray[np.int64], points: Floats, normals: Floats, gray: Floats, weight: Floats) -> None:
         old = self.weight[index]
         total = old + weight
