@@ -32,7 +32,7 @@ class MoverSettings:
     """Steps of depth beyond this share of it, and beyond noise, part surfaces."""
     suspect_m: float = 0.0025
     """The rest must want to shift a surface by at least this, and by a standard deviation, for a closer look."""
-    suspect_stride: int = 5
+    suspect_stride: int = 10
     """Every n-th model point takes part in the search for suspects."""
     check_stride: int = 3
     """Every n-th model point takes part in the closer look."""
