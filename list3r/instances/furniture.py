@@ -21,10 +21,10 @@ COLOR_JOIN = 12.0
 """Colour difference (Lab, lightness halved) up to which a piece inside a body is one of its parts."""
 BACK_SHARE = 0.7
 """Of a seat's side, over which its back reaches."""
+GROUND_M = 0.15
+"""A level face no higher than this over the lowest points is no seat."""
 INSIDE_SHARE = 0.9
 """Of a piece that must lie inside a body to be one of its parts."""
-
-
 FRAMED_SHARE = 0.35
 """Of a panel's rim along which something must stand out from the wall, for the panel to be its back."""
 
@@ -42,6 +42,7 @@ class _Face:
     plane: NDArray[np.float64] | None
     """(n, d), n outwards; None for a piece that is no surface. Shape (4,)."""
     level: bool
+    """Level itself, or lying on a level surface."""
     slack: float
     """How far a point may lie before the plane and still count as on it."""
     color: NDArray[np.float64]
@@ -77,9 +78,9 @@ def _join_backs(
     touching: dict[tuple[int, int], NDArray[np.float64]],
     parent: dict[int, int],
 ) -> None:
-    """Give a panel that something before the wall frames to it: the back of a shelf, no picture."""
+    """Give an upright panel that something before the wall frames to it: the back of a shelf, no picture."""
     for label in sorted(faces):
-        if not faces[label].panel:
+        if not faces[label].panel or faces[label].level:
             continue
         axes = np.linalg.eigh(np.cov(faces[label].points.T))[1]
         rim = 2.0 * sum(_extent(faces[label].points @ axes[:, k]) for k in (1, 2))
@@ -98,6 +99,7 @@ def _faces(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: Mappin
     out = {}
     for label, mine in members_of(labels, 0).items():
         surface = surfaces[label - 1] if label <= len(surfaces) else None
+        base = surfaces[sheets[label]] if label in sheets else surface
         panel = label in sheets and surfaces[sheets[label]].structure
         flat = (label in sheets and not panel) or (surface is not None and (surface.structure or surface.sheet))
         if flat:
@@ -109,7 +111,7 @@ def _faces(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: Mappin
             panel,
             scene.cloud.points[some],
             None if surface is None else surface.plane.equation,
-            surface is not None and surface.level,
+            base is not None and base.level,
             float(np.median(scene.tolerance[some])) + 0.01 * scene.unit,
             np.median(lab_of(scene.cloud.rgb[some]), axis=0).astype(np.float64),
         )
@@ -169,11 +171,17 @@ def _one_body(scene: Scene, a: _Face, b: _Face, places: NDArray[np.float64]) -> 
     if np.quantile(a.height(b.points), 0.9) < a.slack and np.quantile(b.height(a.points), 0.9) < b.slack:
         return True
     seat, back = (a, b) if a.level else (b, a)
-    if not seat.level or back.level:
+    if not seat.level or back.level or _on_the_ground(scene, seat):
         return False
     behind = np.quantile(back.height(seat.points), 0.1) > -back.slack
     low = float(np.quantile(seat.height(back.points), 0.05))
     return bool(behind and low < 0.05 * scene.unit and met > BACK_SHARE * _extent(seat.points @ edge))
+
+
+def _on_the_ground(scene: Scene, face: _Face) -> bool:
+    """True for a level face at the foot of all that is seen: a patch of floor or a rug is no seat."""
+    ground = float(np.quantile(scene.cloud.points @ scene.up, 0.01))
+    return bool(np.median(face.points @ scene.up) < ground + GROUND_M * scene.unit)
 
 
 def _extent(along: NDArray[np.floating]) -> float:
