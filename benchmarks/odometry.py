@@ -30,8 +30,8 @@ from list3r.frames.chunks import ChunkSettings, ChunkSpan, plan_chunks
 from list3r.frames.options import SourceOptions, parse_intrinsics
 from list3r.frames.source import open_source
 from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.records import ChunkRow, Edge, Keyframe, OverlapSamples
-from list3r.reconstruction.keyframe_record import make_keyframes, overlap_samples
+from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
+from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.rgbd import RgbdReconstructor
 
 Poses = NDArray[np.float64]
@@ -47,7 +47,7 @@ class Chunk:
     T_chunk_cam: Poses
     T_source_cam: Poses
     keyframes: tuple[Keyframe, ...]
-    overlap: OverlapSamples
+    samples: FrameSamples
     seconds: dict[str, float]
 
 
@@ -87,18 +87,18 @@ def reconstruct(path: str, options: SourceOptions, span: ChunkSpan) -> Chunk:
     assert source.info.camera is not None
     result = RgbdReconstructor()(frames, source.info.camera)
     marks.append(time.process_time())
-    keyframes, overlap = make_keyframes(frames, result, keep_jpeg=False), overlap_samples(result)
+    keyframes, samples = make_keyframes(frames, result, keep_jpeg=False), frame_samples(result)
     marks.append(time.process_time())
     missing = np.full((4, 4), np.nan)
     given = np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
     seconds = dict(zip(("read", "reconstruct", "keyframes"), np.diff(marks).tolist(), strict=True))
-    return Chunk(span, result.frame_indices, result.posed, result.T_chunk_cam, given, keyframes, overlap, seconds)
+    return Chunk(span, result.frame_indices, result.posed, result.T_chunk_cam, given, keyframes, samples, seconds)
 
 
 def associate(chunks: list[Chunk]) -> tuple[list[Edge], list[Edge]]:
     """Edges between neighbours, and loop edges."""
     adjacent = [
-        align_overlap(u.overlap, v.overlap, k, k + 1, metric=True)
+        align_overlap(u.samples, v.samples, k, k + 1, metric=True)
         for k, (u, v) in enumerate(itertools.pairwise(chunks))
     ]
     store, loops = Chunks(), list[Edge]()

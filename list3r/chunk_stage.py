@@ -20,9 +20,9 @@ from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.errors import OptionError, TrackingError
-from list3r.memory.records import ChunkResult, Keyframe, LocalLibrary, OverlapSamples
+from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction, Reconstructor
-from list3r.reconstruction.keyframe_record import make_keyframes, overlap_samples
+from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     library = build_library(frames, reconstruction, task.settings.instances)
     clock.mark("instances")
     keyframes = make_keyframes(frames, reconstruction, keep_jpeg=task.settings.keep_pictures)
-    samples = overlap_samples(reconstruction, task.settings.chunks.overlap)
+    samples = frame_samples(reconstruction, library)
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
@@ -92,7 +92,7 @@ def _result(
     frames: Sequence[Frame],
     reconstruction: Reconstruction,
     library: LocalLibrary,
-    samples: OverlapSamples,
+    samples: FrameSamples,
     bad: tuple[tuple[int, str], ...],
     seconds: dict[str, float],
     keyframes: tuple[Keyframe, ...],
@@ -109,7 +109,7 @@ def _result(
         image_size=(camera.height, camera.width),
         scale_kind=reconstruction.scale_kind,
         keyframes=keyframes,
-        overlap=samples,
+        samples=samples,
         library=library,
         bad_frames=bad,
         seconds=seconds,
@@ -125,9 +125,6 @@ def _without_geometry(
 ) -> ChunkResult:
     """A chunk through which the camera could not be followed: its frames are kept as lost."""
     count = len(frames)
-    nothing = OverlapSamples(
-        np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-    )
     empty = Reconstruction(
         frame_indices=np.array([f.index for f in frames], np.int64),
         posed=np.zeros(count, bool),
@@ -139,7 +136,7 @@ def _without_geometry(
         keyframes=np.zeros(0, np.int64),
     )
     library = LocalLibrary((), np.zeros((0, 2), np.int32), FEATURE_SPACE)
-    return _result(task, frames, empty, library, nothing, bad, seconds, ())
+    return _result(task, frames, empty, library, FrameSamples.empty(), bad, seconds, ())
 
 
 def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:

@@ -40,7 +40,7 @@ def _adjacent_edge(store: Store, session_id: int, result: ChunkResult) -> list[E
     u, v = chunks[-2], chunks[-1]
     metric = u.scale_kind == v.scale_kind == "metric"
     try:
-        return [align_overlap(store.overlap_samples(u.chunk_id), result.overlap, u.chunk_id, v.chunk_id, metric=metric)]
+        return [align_overlap(store.frame_samples(u.chunk_id), result.samples, u.chunk_id, v.chunk_id, metric=metric)]
     except DegenerateError:
         return []
 

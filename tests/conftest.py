@@ -12,13 +12,13 @@ from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import (
     BestView,
     ChunkResult,
+    FrameSamples,
     Instance,
     Keyframe,
     LocalInstance,
     LocalLibrary,
     MaskTrack,
     Observation,
-    OverlapSamples,
     Relation,
     Support,
 )
@@ -77,11 +77,14 @@ def chunk_result(index: int, first: int, count: int, instances: tuple[LocalInsta
         depth_small=np.ones((6, 8), np.float32),
         camera_small=(8.0, 8.0, 4.0, 3.0),
     )
-    overlap = OverlapSamples(
+    samples = FrameSamples(
         frame=np.repeat(frames, 2),
         pixel=np.tile(np.array([5, 9], np.int32), count),
         points=np.random.default_rng(index).normal(size=(2 * count, 3)).astype(np.float32),
         confidence=np.ones(2 * count, np.float32),
+        instance=np.full(2 * count, -1, np.int32),
+        camera_frames=frames.astype(np.int64),
+        T_chunk_cam=T_chunk_cam,
     )
     return ChunkResult(
         index=index,
@@ -94,7 +97,7 @@ def chunk_result(index: int, first: int, count: int, instances: tuple[LocalInsta
         image_size=(48, 64),
         scale_kind="metric",
         keyframes=(keyframe,),
-        overlap=overlap,
+        samples=samples,
         library=LocalLibrary(instances, np.zeros((0, 2), np.int32), "test@1/16"),
     )
 

@@ -10,24 +10,27 @@ import pytest
 from list3r.association.alignment import align_overlap
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import OverlapSamples
+from list3r.memory.records import FrameSamples
 
 S_V_U = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.0])
 S_V_U_SCALED = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.35])
 
 
-def samples(first: int, count: int, points: np.ndarray) -> OverlapSamples:
+def samples(first: int, count: int, points: np.ndarray) -> FrameSamples:
     """Samples of `count` frames, as many pixels in each as the points allow."""
     each = len(points) // count
-    return OverlapSamples(
+    return FrameSamples(
         frame=np.repeat(np.arange(first, first + count), each).astype(np.int64),
         pixel=np.tile(np.arange(each), count).astype(np.int32),
         points=points.astype(np.float32),
         confidence=np.full(len(points), 0.8, np.float32),
+        instance=np.full(len(points), -1, np.int32),
+        camera_frames=np.arange(first, first + count),
+        T_chunk_cam=np.tile(np.eye(4), (count, 1, 1)),
     )
 
 
-def pair(S_v_u: Sim3, noise: float = 0.0, seed: int = 0) -> tuple[OverlapSamples, OverlapSamples]:
+def pair(S_v_u: Sim3, noise: float = 0.0, seed: int = 0) -> tuple[FrameSamples, FrameSamples]:
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1, -1, 1], [1, 1, 4], (600, 3))
     moved = S_v_u.apply(points) + noise * rng.normal(size=points.shape)

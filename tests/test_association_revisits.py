@@ -13,7 +13,7 @@ from list3r.association.verification import verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Keyframe
 from list3r.reconstruction.features import FeatureSettings, match, relative_pose
-from list3r.reconstruction.keyframe_record import make_keyframes, overlap_samples
+from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.rgbd import RgbdReconstructor
 from list3r.reconstruction.view import SensorNoise
 from tests.rgbd_scenes import CAMERA, frames_along, pose_errors, walk
@@ -140,13 +140,14 @@ def test_features_give_the_relative_pose(here: Keyframe, again: Keyframe) -> Non
     assert relative_pose(here.points_cam[:5], again.points_cam[:5], FeatureSettings(), SensorNoise()) is None
 
 
-def test_overlap_samples_are_the_same_pixels_in_every_chunk() -> None:
+def test_frame_samples_are_the_same_pixels_in_every_chunk() -> None:
     frames = frames_along(walk(8))
     result = RgbdReconstructor(poses="given")(frames, CAMERA)
     posed = result.posed.copy()
     posed[1] = False
-    samples = overlap_samples(replace(result, posed=posed), overlap=3)
-    assert set(samples.frame.tolist()) == {0, 2, 5, 6, 7}
+    samples = frame_samples(replace(result, posed=posed))
+    assert set(samples.frame.tolist()) == {0, 2, 3, 4, 5, 6, 7}
+    assert samples.camera_frames.tolist() == [0, 2, 3, 4, 5, 6, 7]
     per_frame = np.bincount(samples.frame)
     assert 150 <= per_frame[0] <= 300
     row, column = samples.pixel // CAMERA.width, samples.pixel % CAMERA.width

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.records import Edge, OverlapSamples
+from list3r.memory.records import Edge, FrameSamples
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class AlignmentSettings:
 
 
 def align_overlap(
-    u: OverlapSamples,
-    v: OverlapSamples,
+    u: FrameSamples,
+    v: FrameSamples,
     u_id: int,
     v_id: int,
     metric: bool,
@@ -61,7 +61,7 @@ def align_overlap(
     return _edge(u_id, v_id, S_v_u, residual, weight, spread, chosen, len(np.unique(u.frame[pick_u])))
 
 
-def _shared(u: OverlapSamples, v: OverlapSamples) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _shared(u: FrameSamples, v: FrameSamples) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions in u and v of the samples at the same pixel of the same frame."""
     key_u = (u.frame << np.int64(32)) + u.pixel
     key_v = (v.frame << np.int64(32)) + v.pixel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -28,10 +28,11 @@ from list3r.memory.records import (
     ChunkRow,
     Edge,
     FrameRow,
+    FrameSamples,
     Keyframe,
     LocalInstance,
     MaskTrack,
-    OverlapSamples,
+    MotionTrack,
     Session,
     Support,
 )
@@ -42,7 +43,10 @@ from list3r.memory.rows import (
     read_edge,
     read_frame_row,
     read_keyframe,
+    read_motion,
+    read_samples,
     read_track,
+    sample_arrays,
     track_arrays,
 )
 
@@ -56,6 +60,7 @@ class LocalNode:
     session_id: int
     stability: float
     structure: bool
+    dynamic: bool
     plane: NDArray[np.float64] | None
     """Chunk coordinates. Shape (4,)."""
     feature: NDArray[np.float32]
@@ -101,14 +106,7 @@ class ChunkVerbs(Connection):
 
         Of the frames that it shares with the chunk before, the second half comes to be placed by the new chunk.
         """
-        overlap = pack(
-            {
-                "frame": result.overlap.frame,
-                "pixel": result.overlap.pixel,
-                "points": result.overlap.points,
-                "confidence": result.overlap.confidence,
-            }
-        )
+        overlap = pack(sample_arrays(result.samples))
         links = result.library.cannot_link.astype("<i4").tobytes()
         cursor = self._database.execute(
             "INSERT INTO chunks (session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy,"
@@ -171,8 +169,10 @@ class ChunkVerbs(Connection):
         track = pack(track_arrays(instance.track))
         feature = instance.feature.astype("<f4").tobytes()
         plane = None if instance.plane is None else f8(instance.plane)
+        motion = None if instance.motion is None else pack(asdict(instance.motion))
         self._database.execute(
-            "INSERT INTO local_instances VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO local_instances (chunk_id, local_id, stability, structure, plane, feature, track, crc,"
+            " dynamic, motion) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
                 chunk_id,
                 instance.local_id,
@@ -182,6 +182,8 @@ class ChunkVerbs(Connection):
                 feature,
                 track,
                 checksum(feature, track),
+                int(instance.dynamic),
+                motion,
             ),
         )
         grid, points = quantise(instance.support.points)
@@ -206,21 +208,40 @@ class ChunkVerbs(Connection):
         where, arguments = ("", ()) if session_id is None else ("WHERE session_id = ?", (session_id,))
         query = (
             "SELECT chunk_id, session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy, cx,"
-            f" cy, height, width, scale_kind FROM chunks {where} ORDER BY chunk_id"
+            f" cy, height, width, scale_kind, covariance FROM chunks {where} ORDER BY chunk_id"
         )
         return [read_chunk_row(row) for row in self._rows(query, arguments)]
 
-    def place_chunks(self, poses: Mapping[int, Sim3], components: Mapping[int, int]) -> None:
-        """Rewrite `S_world_chunk` and the component of chunks: all that a loop closure moves."""
+    def place_chunks(
+        self,
+        poses: Mapping[int, Sim3],
+        components: Mapping[int, int],
+        covariances: Mapping[int, NDArray[np.float64]] | None = None,
+    ) -> None:
+        """Rewrite `S_world_chunk`, component and uncertainty of chunks: all that a loop closure moves."""
+        known = covariances or {}
         self._database.executemany(
-            "UPDATE chunks SET S_world_chunk = ?, component = ? WHERE chunk_id = ?",
-            [(pack_sim3(S_world_chunk), components[k], k) for k, S_world_chunk in poses.items()],
+            "UPDATE chunks SET S_world_chunk = ?, component = ?, covariance = ? WHERE chunk_id = ?",
+            [(pack_sim3(S), components[k], f8(known[k]) if k in known else None, k) for k, S in poses.items()],
         )
 
-    def overlap_samples(self, chunk_id: int) -> OverlapSamples:
-        """The points that a chunk shares with its neighbours, chunk coordinates."""
+    def flag_dynamic(self, chunk_id: int, motions: Mapping[int, MotionTrack | None]) -> None:
+        """Say of local instances, by local id, that they move, and where they were."""
+        self._database.executemany(
+            "UPDATE local_instances SET dynamic = 1, motion = coalesce(?, motion) WHERE chunk_id = ? AND local_id = ?",
+            [(None if m is None else pack(asdict(m)), chunk_id, n) for n, m in motions.items()],
+        )
+
+    def motion_track(self, chunk_id: int, local_id: int) -> MotionTrack | None:
+        """Where a moving local instance was, chunk coordinates; None for one that does not move."""
+        query = "SELECT motion FROM local_instances WHERE chunk_id = ? AND local_id = ?"
+        rows = self._rows(query, (chunk_id, local_id))
+        return read_motion(rows[0][0], f"the motion of local instance {chunk_id}:{local_id}") if rows else None
+
+    def frame_samples(self, chunk_id: int) -> FrameSamples:
+        """The sampled points of a chunk's frames, chunk coordinates."""
         blob = self._rows("SELECT overlap FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0]
-        return OverlapSamples(**unpack(blob, f"the overlap of chunk {chunk_id}"))
+        return read_samples(unpack(blob, f"the samples of chunk {chunk_id}"))
 
     def cannot_links(self, chunk_id: int) -> NDArray[np.int32]:
         """Pairs of local ids of a chunk that are two things. Shape (P, 2)."""
@@ -248,7 +269,8 @@ class ChunkVerbs(Connection):
     def add_edges(self, edges: Iterable[Edge]) -> None:
         """Store measured relations of chunks; one measured again replaces the old one."""
         self._database.executemany(
-            "INSERT OR REPLACE INTO edges VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT OR REPLACE INTO edges (u, v, kind, frame_u, frame_v, S_v_u, confidence, weight, inliers,"
+            " residual_m, accepted, reason, scores, covariance) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
                 (
                     e.u,
@@ -263,6 +285,7 @@ class ChunkVerbs(Connection):
                     int(e.accepted),
                     e.reason,
                     to_json(e.scores),
+                    None if e.covariance is None else f8(e.covariance),
                 )
                 for e in edges
             ],
@@ -272,7 +295,7 @@ class ChunkVerbs(Connection):
         """All measured relations of chunks, accepted or not."""
         query = (
             "SELECT u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u,"
-            " frame_v FROM edges ORDER BY u, v, kind, frame_u, frame_v"
+            " frame_v, covariance FROM edges ORDER BY u, v, kind, frame_u, frame_v"
         )
         return [read_edge(row) for row in self._rows(query)]
 
@@ -330,9 +353,10 @@ class ChunkVerbs(Connection):
         """Local instances without masks, of some chunks or of all, in the order of (chunk, local id)."""
         where = "" if chunk_ids is None else f"WHERE l.chunk_id IN ({','.join('?' * len(chunk_ids))})"
         query = (
-            "SELECT l.chunk_id, l.local_id, c.session_id, l.stability, l.structure, l.plane, l.feature, l.track,"
-            " s.count, s.grid, s.points, s.confidence, s.rgb FROM local_instances l JOIN chunks c USING (chunk_id)"
-            f" JOIN supports s USING (chunk_id, local_id) {where} ORDER BY l.chunk_id, l.local_id"
+            "SELECT l.chunk_id, l.local_id, c.session_id, l.stability, l.structure, l.dynamic, l.plane, l.feature,"
+            " l.track, s.count, s.grid, s.points, s.confidence, s.rgb FROM local_instances l"
+            " JOIN chunks c USING (chunk_id) JOIN supports s USING (chunk_id, local_id)"
+            f" {where} ORDER BY l.chunk_id, l.local_id"
         )
         return [_local_node(row) for row in self._rows(query, tuple(chunk_ids or ()))]
 
@@ -345,7 +369,8 @@ class ChunkVerbs(Connection):
 
 
 def _local_node(row: tuple[Any, ...]) -> LocalNode:
-    chunk_id, local_id, session_id, stability, structure, plane, feature, track, count, grid, points, weight, rgb = row
+    chunk_id, local_id, session_id, stability, structure, dynamic, plane, feature, track, *support_row = row
+    count, grid, points, weight, rgb = support_row
     where = f"local instance {chunk_id}:{local_id}"
     arrays = unpack(track, where)
     support = Support(
@@ -359,6 +384,7 @@ def _local_node(row: tuple[Any, ...]) -> LocalNode:
         session_id=session_id,
         stability=stability,
         structure=bool(structure),
+        dynamic=bool(dynamic),
         plane=None if plane is None else raw_array(plane, "<f8", (4,), where).copy(),
         feature=np.frombuffer(feature, "<f4").astype(np.float32),
         support=support,

@@ -17,7 +17,8 @@ from list3r.memory.records import BestView, Instance, MergeDecision, Observation
 
 _COLUMNS = (
     "id, label, description, geometry, confidence, observations, first_seen_s, last_seen_s, state, structure,"
-    " color_rgb, color_name, component, view_session, view_frame, view_box"
+    " color_rgb, color_name, component, view_session, view_frame, view_box, dynamic,"
+    " position_sigma_m"
 )
 
 
@@ -53,7 +54,7 @@ class InstanceVerbs(ChunkVerbs):
     def put_instances(self, instances: Iterable[Instance]) -> None:
         """Write instances, new or changed, with their boxes in the R*Tree."""
         rows = list(instances)
-        marks = ",".join("?" * 16)
+        marks = ",".join("?" * 18)
         self._database.executemany(
             f"INSERT OR REPLACE INTO instances ({_COLUMNS}) VALUES ({marks})", [_instance_row(i) for i in rows]
         )
@@ -227,6 +228,8 @@ def _instance_row(instance: Instance) -> tuple[object, ...]:
         None if view is None else view.session_id,
         None if view is None else int(view.frame_index),
         None if view is None else np.asarray(view.box_xyxy, dtype="<f8").tobytes(),
+        int(instance.dynamic),
+        instance.position_sigma_m,
     )
 
 
@@ -254,4 +257,6 @@ def _instance(row: tuple[Any, ...]) -> Instance:
         color_name=row[11],
         component=row[12],
         best_view=view,
+        dynamic=bool(row[16]),
+        position_sigma_m=row[17],
     )

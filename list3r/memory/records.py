@@ -45,6 +45,16 @@ class MaskTrack:
 
 
 @dataclass(frozen=True)
+class MotionTrack:
+    """Where a moving thing was over time."""
+
+    frames: NDArray[np.int64]
+    """Frame.index, ascending. Shape (V,)."""
+    positions: NDArray[np.float32]
+    """Middle of what was seen of it, chunk coordinates. Shape (V, 3)."""
+
+
+@dataclass(frozen=True)
 class LocalInstance:
     """One thing followed through one chunk (paper 3.1: a, M, V, P, z, and its geometric evidence)."""
 
@@ -61,6 +71,10 @@ class LocalInstance:
     """Plane (n, d), n . p + d = 0 in chunk coordinates, n towards the cameras, if it is flat. Shape (4,)."""
     structure: bool = False
     """True for a large flat surface that bounds the room rather than standing in it, as far as the chunk can tell."""
+    dynamic: bool = False
+    """True when it was seen to move against the rest."""
+    motion: MotionTrack | None = None
+    """Where it was while it moved, for dynamic ones."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +112,11 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
-class OverlapSamples:
-    """Points of the frames that a chunk may share with the next or the previous one, on one fixed pixel grid."""
+class FrameSamples:
+    """Points of a chunk's frames on fixed pixel grids, the same in every chunk: what alignment works on.
+
+    The same pixel of the same frame is the same surface point in two chunks that share the frame.
+    """
 
     frame: NDArray[np.int64]
     """Frame.index of each sample. Shape (S,)."""
@@ -109,6 +126,37 @@ class OverlapSamples:
     """Chunk coordinates. Shape (S, 3)."""
     confidence: NDArray[np.float32]
     """In [0, 1]. Shape (S,)."""
+    instance: NDArray[np.int32]
+    """Local id of the instance whose mask holds the pixel, -1 for none. Shape (S,)."""
+    camera_frames: NDArray[np.int64]
+    """Frame.index of the posed frames, ascending. Shape (G,)."""
+    T_chunk_cam: NDArray[np.float64]
+    """Poses of those frames' cameras. Shape (G, 4, 4)."""
+
+    @staticmethod
+    def empty() -> FrameSamples:
+        """No samples at all."""
+        return FrameSamples(
+            frame=np.zeros(0, np.int64),
+            pixel=np.zeros(0, np.int32),
+            points=np.zeros((0, 3), np.float32),
+            confidence=np.zeros(0, np.float32),
+            instance=np.zeros(0, np.int32),
+            camera_frames=np.zeros(0, np.int64),
+            T_chunk_cam=np.zeros((0, 4, 4)),
+        )
+
+
+@dataclass(frozen=True)
+class JointWindow:
+    """Frames of two places reconstructed together once more (a loop pair shares no frame): u -> window -> v."""
+
+    u: FrameSamples
+    """The frames of chunk u, window coordinates; `instance` is -1 throughout."""
+    v: FrameSamples
+    """The frames of chunk v, the same window coordinates."""
+    scale_kind: str
+    """metric or relative."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +181,7 @@ class ChunkResult:
     """(height, width), px."""
     scale_kind: str
     keyframes: tuple[Keyframe, ...]
-    overlap: OverlapSamples
+    samples: FrameSamples
     library: LocalLibrary
     bad_frames: tuple[tuple[int, str], ...] = ()
     """(Frame.index, reason) of frames that could not be decoded."""
@@ -172,6 +220,9 @@ class ChunkRow:
     intrinsics: tuple[float, float, float, float]
     image_size: tuple[int, int]
     scale_kind: str
+    covariance: NDArray[np.float64] | None = None
+    """Of the tangent error x in S_true = S_world_chunk exp(x), x = (rho, omega, sigma), relative to the first chunk of
+    the component; None where it is not known. Shape (7, 7)."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +249,9 @@ class Edge:
     scores: dict[str, float] = field(default_factory=dict)
     frames: tuple[int, int] | None = None
     """Frame.index in u and in v of the pair that proposed a loop."""
+    covariance: NDArray[np.float64] | None = None
+    """Of the tangent error x in S_true = S_v_u exp(x), x = (rho, omega, sigma) in u's units; None where it is not
+    known. Shape (7, 7)."""
 
 
 @dataclass(frozen=True)
@@ -255,6 +309,11 @@ class Instance:
     component: int
     """The frame of reference it lives in, see `ChunkRow`."""
     best_view: BestView | None
+    dynamic: bool = False
+    """True for what was seen moving; its box is where it was seen last."""
+    position_sigma_m: float | None = None
+    """Standard deviation of its position from the uncertainty of its chunks, world units, along the worst axis; None
+    where it is not known."""
 
 
 @dataclass(frozen=True)

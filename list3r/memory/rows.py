@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.codec import checksum, pack, raw_array, unpack, unpack_sim3
-from list3r.memory.records import ChunkRow, Edge, FrameRow, Keyframe, MaskTrack
+from list3r.memory.records import ChunkRow, Edge, FrameRow, FrameSamples, Keyframe, MaskTrack, MotionTrack
 
 
 def f8(values: NDArray[np.float64]) -> bytes:
@@ -19,17 +19,29 @@ def f8(values: NDArray[np.float64]) -> bytes:
 
 def read_chunk_row(row: tuple[Any, ...]) -> ChunkRow:
     """A row of `chunks`."""
-    chunk_id, session_id, index, first, last, component, pose, fx, fy, cx, cy, height, width, scale_kind = row
+    covariance = row[14]
+    chunk_id, session_id, index, first, last, component, pose, fx, fy, cx, cy, height, width, scale_kind = row[:14]
     intrinsics, image_size = (fx, fy, cx, cy), (height, width)
     S_world_chunk = unpack_sim3(pose)
     return ChunkRow(
-        chunk_id, session_id, index, first, last, component, S_world_chunk, intrinsics, image_size, scale_kind
+        chunk_id,
+        session_id,
+        index,
+        first,
+        last,
+        component,
+        S_world_chunk,
+        intrinsics,
+        image_size,
+        scale_kind,
+        _covariance(covariance, f"the uncertainty of chunk {chunk_id}"),
     )
 
 
 def read_edge(row: tuple[Any, ...]) -> Edge:
     """A row of `edges`."""
-    u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u, frame_v = row
+    covariance = row[13]
+    u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u, frame_v = row[:13]
     return Edge(
         u=u,
         v=v,
@@ -43,7 +55,12 @@ def read_edge(row: tuple[Any, ...]) -> Edge:
         reason=reason,
         scores=json.loads(scores),
         frames=None if frame_u < 0 else (frame_u, frame_v),
+        covariance=_covariance(covariance, f"the uncertainty of edge {u}-{v}"),
     )
+
+
+def _covariance(blob: bytes | None, where: str) -> NDArray[np.float64] | None:
+    return None if blob is None else raw_array(blob, "<f8", (7, 7), where).copy()
 
 
 def read_frame_row(row: tuple[Any, ...]) -> FrameRow:
@@ -81,6 +98,34 @@ def read_keyframe(chunk_id: int, frame_index: int, descriptor: bytes, features: 
         jpeg=jpeg,
         **arrays,
     )
+
+
+def sample_arrays(samples: FrameSamples) -> dict[str, NDArray[Any]]:
+    """Samples of a chunk's frames as arrays for one blob; the frame of a sample as its place among the posed frames."""
+    return {
+        "frame": samples.frame,
+        "pixel": samples.pixel.astype(np.int32),
+        "points": samples.points.astype(np.float32),
+        "confidence": samples.confidence.astype(np.float32),
+        "instance": samples.instance.astype(np.int32),
+        "camera_frames": samples.camera_frames.astype(np.int64),
+        "T_chunk_cam": samples.T_chunk_cam.astype(np.float64),
+    }
+
+
+def read_samples(arrays: dict[str, NDArray[Any]]) -> FrameSamples:
+    """The inverse of `sample_arrays`; blobs of the first schema know no instances and no cameras."""
+    missing: dict[str, Any] = {
+        "instance": np.full(len(arrays["frame"]), -1, np.int32),
+        "camera_frames": np.zeros(0, np.int64),
+        "T_chunk_cam": np.zeros((0, 4, 4)),
+    }
+    return FrameSamples(**(missing | arrays))
+
+
+def read_motion(blob: bytes | None, where: str) -> MotionTrack | None:
+    """The positions of a moving local instance."""
+    return None if blob is None else MotionTrack(**unpack(blob, where))
 
 
 def track_arrays(track: MaskTrack) -> dict[str, NDArray[Any]]:

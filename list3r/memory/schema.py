@@ -63,6 +63,15 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE TABLE aliases (id INTEGER PRIMARY KEY, instance INTEGER NOT NULL);
     CREATE VIRTUAL TABLE instance_boxes USING rtree (id, min_x, max_x, min_y, max_y, min_z, max_z);
     """,
+    # 2: uncertainty of edges, chunks and instances; things that move
+    """
+    ALTER TABLE chunks ADD COLUMN covariance BLOB;
+    ALTER TABLE edges ADD COLUMN covariance BLOB;
+    ALTER TABLE instances ADD COLUMN dynamic INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE instances ADD COLUMN position_sigma_m REAL;
+    ALTER TABLE local_instances ADD COLUMN dynamic INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE local_instances ADD COLUMN motion BLOB;
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

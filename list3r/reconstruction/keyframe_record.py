@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.records import Keyframe, OverlapSamples
+from list3r.memory.masks import decode_mask
+from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.descriptor import DescriptorSettings, frame_descriptor
 from list3r.reconstruction.features import FeatureSettings, detect
@@ -30,8 +31,8 @@ class KeyframeSettings:
 
 
 @dataclass(frozen=True)
-class OverlapSettings:
-    """Which points a chunk offers to its neighbours."""
+class SampleSettings:
+    """Which points of its frames a chunk keeps for alignment."""
 
     columns: int = 16
     rows: int = 12
@@ -52,33 +53,56 @@ def make_keyframes(
     )
 
 
-def overlap_samples(
-    reconstruction: Reconstruction, overlap: int = 30, settings: OverlapSettings | None = None
-) -> OverlapSamples:
-    """Points of the first and last `overlap` frames on one fixed pixel grid, the same in every chunk."""
-    chosen = settings or OverlapSettings()
-    count = len(reconstruction.frame_indices)
-    at_ends = np.flatnonzero((np.arange(count) < overlap) | (np.arange(count) >= count - overlap))
-    at_ends = at_ends[reconstruction.posed[at_ends]]
+def frame_samples(
+    reconstruction: Reconstruction, library: LocalLibrary | None = None, settings: SampleSettings | None = None
+) -> FrameSamples:
+    """Points of all posed frames on one fixed pixel grid, with the instances whose masks hold them."""
+    chosen = settings or SampleSettings()
+    positions = np.flatnonzero(reconstruction.posed)
     camera = reconstruction.camera
     row, column = (g.ravel() for g in _pixel_grid(camera, chosen))
-    depth = reconstruction.depth[at_ends][:, row, column]
-    confidence = reconstruction.confidence[at_ends][:, row, column].astype(np.float32)
+    depth = reconstruction.depth[positions][:, row, column]
+    confidence = reconstruction.confidence[positions][:, row, column].astype(np.float32)
     rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
-    T = reconstruction.T_chunk_cam[at_ends]
+    T = reconstruction.T_chunk_cam[positions]
     points = np.einsum("fij,fnj->fni", T[:, :3, :3], depth[..., None] * rays) + T[:, None, :3, 3]
     known = (depth > 0) & (confidence > 0)
-    frame = np.broadcast_to(reconstruction.frame_indices[at_ends][:, None], depth.shape)
+    frame = np.broadcast_to(reconstruction.frame_indices[positions][:, None], depth.shape)
     pixel = np.broadcast_to((row * camera.width + column)[None], depth.shape)
-    return OverlapSamples(
+    return FrameSamples(
         frame=frame[known].astype(np.int64),
         pixel=pixel[known].astype(np.int32),
         points=points[known].astype(np.float32),
         confidence=confidence[known],
+        instance=_instances(library, reconstruction, positions, row, column)[known],
+        camera_frames=reconstruction.frame_indices[positions].astype(np.int64),
+        T_chunk_cam=T.astype(np.float64),
     )
 
 
-def _pixel_grid(camera: Camera, settings: OverlapSettings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _instances(
+    library: LocalLibrary | None,
+    reconstruction: Reconstruction,
+    positions: NDArray[np.int64],
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+) -> NDArray[np.int32]:
+    """Local id of the smallest mask at each grid pixel of each frame, -1 for none. Shape (G, N)."""
+    out = np.full((len(positions), len(row)), -1, np.int32)
+    place = {int(reconstruction.frame_indices[p]): k for k, p in enumerate(positions)}
+    area = np.full(out.shape, np.iinfo(np.int32).max, np.int32)
+    for instance in library.instances if library is not None else ():
+        track = instance.track
+        for index, mask, size in zip(track.frames, track.masks, track.areas_px, strict=True):
+            k = place.get(int(index))
+            if k is None:
+                continue
+            held = decode_mask(mask, track.image_size)[row, column] & (size < area[k])
+            out[k, held], area[k, held] = instance.local_id, size
+    return out
+
+
+def _pixel_grid(camera: Camera, settings: SampleSettings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     rows = ((np.arange(settings.rows) + 0.5) * camera.height / settings.rows).astype(np.int64)
     columns = ((np.arange(settings.columns) + 0.5) * camera.width / settings.columns).astype(np.int64)
     grid = np.meshgrid(rows, columns, indexing="ij")

@@ -1,0 +1,45 @@
+"""What a perfect observer knows of a simulated video: the border between worlds and simulated models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.simulation.world import World
+
+
+@dataclass(frozen=True)
+class MoverTruth:
+    """A thing that moves while it is filmed."""
+
+    id: int
+    """Its id in `SimulatedVideo.ids`."""
+    label: str
+    T_world_object: NDArray[np.float64]
+    """Where it is in each frame. Shape (F, 4, 4)."""
+
+
+@dataclass(frozen=True)
+class SimulatedVideo:
+    """Truth of every frame of a walk through a world."""
+
+    preset: str
+    seed: int
+    world: World
+    camera: Camera
+    time_s: NDArray[np.float64]
+    """Seconds. Shape (F,)."""
+    T_world_cam: NDArray[np.float64]
+    """Shape (F, 4, 4)."""
+    depth: NDArray[np.float32]
+    """Along the camera's z, metres, 0 where nothing is hit. Shape (F, H, W)."""
+    ids: NDArray[np.int32]
+    """Id of the thing in every pixel, 0 for nothing. Shape (F, H, W)."""
+    cuts: tuple[int, ...]
+    """Frames before which the camera jumps."""
+    movers: tuple[MoverTruth, ...]
+    looks: dict[int, int]
+    """Class of appearance of each thing: two things of one class look alike (twins)."""
