@@ -1,0 +1,275 @@
+"""The paper's ablation on simulated videos with known truth: baseline, + ILRD, + IASM, + CWGO.
+
+python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FILE [--plot FILE]
+
+Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
+model and the instance tracker are simulated (`list3r.simulation.feedforward`). `baseline` is the split-and-fuse way of
+VGGT-Long: support by confidence alone, adjacent edges, loops by frame similarity of 0.85 without verification, plain
+least squares. Each variant adds to the one before; `iasm-only` is the baseline with instance-aware support alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, write_json
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+VARIANTS = ("baseline", "ilrd", "iasm", "cwgo")
+PRESETS = ("calm", "loop", "kidnap", "dynamic", "twins", "sparse", "corridor")
+TITLES = {
+    "baseline": "baseline",
+    "ilrd": "+ ILRD",
+    "iasm": "+ IASM",
+    "cwgo": "+ CWGO (full)",
+    "iasm-only": "baseline + IASM alone",
+}
+SHOWN = ("ate_sim3_m", "rte_m", "rre_deg", "completeness_cm", "chamfer_cm", "f_at_5cm", "false_loops", "true_loops")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presets", default=",".join(PRESETS))
+    parser.add_argument("--seeds", default="1,2,3,4,5,6,7,8")
+    parser.add_argument("--variants", default=",".join(VARIANTS))
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path, help="picture of the table: ATE of every seed by preset and variant")
+    words = parser.parse_args()
+    presets, variants = words.presets.split(","), words.variants.split(",")
+    for given, known in ((presets, PRESETS), (variants, TITLES)):
+        if unknown := sorted(set(given) - set(known)):
+            parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(known)}")
+    jobs = [(preset, int(seed), tuple(variants)) for preset in presets for seed in words.seeds.split(",")]
+    rows: list[dict[str, Any]] = []
+    with ProcessPoolExecutor(words.workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
+        for done in pool.map(run_video, jobs):
+            rows += done
+            ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
+            print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
+    summary = summarise(rows, presets, variants)
+    print_tables(summary, presets, variants)
+    print(machine())
+    write_json(words.json, {"summary": summary, "runs": rows})
+    if words.plot is not None:
+        plot(words.plot, rows, presets, variants)
+
+
+def _one_thread() -> None:
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+
+
+def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
+    """All variants on one simulated video."""
+    from list3r.frames.chunks import ChunkSettings, plan_chunks
+    from list3r.frames.cuts import cuts_by_descriptor
+    from list3r.simulation.feedforward import FeedForwardModel
+    from list3r.simulation.presets import make_video
+
+    preset, seed, variants = job
+    video = make_video(preset, seed)
+    model = FeedForwardModel(video, seed=seed)
+    truth = _Truth(video)
+    cuts = cuts_by_descriptor(model.descriptors)
+    chunks: dict[Any, Any] = {}
+    rows = []
+    for variant in variants:
+        spans = plan_chunks(len(video.time_s), ChunkSettings(), () if variant in ("baseline", "iasm-only") else cuts)
+        for span in spans:
+            if span not in chunks:
+                chunks[span] = model.chunk(span)
+        started = time.process_time()
+        row = run_variant(variant, [chunks[s] for s in spans], model, truth)
+        seconds = round(time.process_time() - started, 2)
+        rows.append({"preset": preset, "seed": seed, "variant": variant, "cpu_s": seconds, **row})
+    return rows
+
+
+def variant_settings(variant: str) -> Any:
+    """The product's settings with the parts that a variant lacks switched to the baseline's way."""
+    from list3r.mapping import AssociationSettings
+
+    full = AssociationSettings()
+    plain_loops = replace(full.revisits, instance_cues=False, verified=False)
+    plain_edges = replace(full.edges, instance_aware=False)
+    plain_graph = replace(full.graph, weighted=False, robust=False)
+    step = {"baseline": 0, "iasm-only": 0, "ilrd": 1, "iasm": 2, "cwgo": 3}[variant]
+    return AssociationSettings(
+        revisits=full.revisits if step >= 1 else plain_loops,
+        edges=full.edges if step >= 2 or variant == "iasm-only" else plain_edges,
+        graph=full.graph if step >= 3 else plain_graph,
+    )
+
+
+def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth) -> dict[str, Any]:
+    """Build a memory of the chunks (placed only) and measure it."""
+    from list3r.association.motion import flag_moving
+    from list3r.frames.base import Camera
+    from list3r.mapping import add_chunk, finish_session
+    from list3r.memory.store import Store
+
+    settings = variant_settings(variant)
+    with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:
+        with store.transaction():
+            store.set_value("scale_kind", "relative")
+            store.set_value("gravity", "unknown")
+            store.set_value("poses", "estimate")
+            session = store.add_session("simulation", "", {}, truth.frames)
+        for result in results:
+            chunk = result
+            if settings.edges.instance_aware:
+                height, width = result.image_size
+                camera = Camera(width, height, *result.intrinsics)
+                chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
+            add_chunk(store, session, chunk, model, settings, library=False)
+        finish_session(store, session, settings, library=False)
+        return truth.measure(store)
+
+
+class _Truth:
+    """Measures of a memory against a simulated video."""
+
+    def __init__(self, video: Any) -> None:
+        self.frames = len(video.time_s)
+        self._video = video
+        self._cloud = _true_cloud(video)
+
+    def measure(self, store: Any) -> dict[str, Any]:
+        """Errors of all frames in the one frame of the memory: parts that were not joined count as they lie."""
+        from list3r.evaluation.cloud import evaluate_cloud
+        from list3r.evaluation.trajectory import Trajectory, align, evaluate_trajectory
+
+        placed = store.camera_poses()
+        rows = np.array([f.frame_index for f, _ in placed])
+        poses = np.stack([_rigid(S) for _, S in placed])
+        truth = Trajectory(rows.astype(float), self._video.T_world_cam[rows])
+        estimate = Trajectory(rows.astype(float), poses)
+        S_truth_world = align(truth, estimate, with_scale=True)
+        scaled = Trajectory(estimate.time_s, _moved(S_truth_world, poses))
+        errors = evaluate_trajectory(truth, scaled, delta_frames=30)
+        cloud = evaluate_cloud(self._cloud, S_truth_world.apply(_points(store)))
+        loops = [e for e in store.edges() if e.kind == "loop"]
+        good = [self._true_loop(store, e) for e in loops if e.accepted]
+        return {
+            "posed": len(rows) / self.frames,
+            "components": len({c.component for c in store.chunks()}),
+            "ate_sim3_m": round(errors.ate_sim3_m.rmse, 5),
+            "rte_m": round(errors.rpe_translation_m.rmse, 5),
+            "rre_deg": round(errors.rpe_rotation_deg.rmse, 4),
+            "completeness_cm": round(cloud.completeness_cm, 3),
+            "chamfer_cm": round(cloud.chamfer_cm, 3),
+            "f_at_5cm": round(100 * cloud.f_score, 2),
+            "candidates": len(loops),
+            "true_loops": sum(good),
+            "false_loops": len(good) - sum(good),
+        }
+
+    def _true_loop(self, store: Any, edge: Any) -> bool:
+        """Whether the two frames see the same place: any share of one's surface is seen by the other."""
+        from list3r.simulation.covisibility import covisibility
+
+        u, v = edge.frames
+        window = [np.clip(np.arange(f - 10, f + 11, 5), 0, self.frames - 1) for f in (u, v)]
+        return bool(covisibility(self._video, *window).max() >= 0.05)
+
+
+def _rigid(S: Any) -> Array:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = S.rotation, S.translation
+    return out
+
+
+def _moved(S: Any, poses: Array) -> Array:
+    out = poses.copy()
+    out[:, :3, :3] = S.rotation @ poses[:, :3, :3]
+    out[:, :3, 3] = S.apply(poses[:, :3, 3])
+    return out
+
+
+def _points(store: Any) -> Array:
+    parts = []
+    for chunk in store.chunks():
+        samples = store.frame_samples(chunk.chunk_id)
+        parts.append(chunk.S_world_chunk.apply(samples.points[samples.confidence > 0.3][::5]))
+    return np.concatenate(parts)
+
+
+def _true_cloud(video: Any) -> Array:
+    """Every tenth frame's surface, movers left out, thinned to a grid of 2 cm."""
+    camera, points = video.camera, []
+    moving = [m.id for m in video.movers]
+    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
+    for k in range(0, len(video.depth), 10):
+        keep = (video.depth[k] > 0) & ~np.isin(video.ids[k], moving)
+        T = video.T_world_cam[k]
+        points.append((video.depth[k][..., None] * rays)[keep] @ T[:3, :3].T + T[:3, 3])
+    cloud = np.concatenate(points)
+    _, first = np.unique(np.floor(cloud / 0.02).astype(np.int64), axis=0, return_index=True)
+    return cloud[np.sort(first)]
+
+
+def summarise(rows: Sequence[dict[str, Any]], presets: Sequence[str], variants: Sequence[str]) -> dict[str, Any]:
+    """Mean and standard deviation over the seeds of every figure, by preset and variant, and the ratio of the ATE."""
+    out: dict[str, Any] = {}
+    for preset in presets:
+        for variant in variants:
+            chosen = [r for r in rows if (r["preset"], r["variant"]) == (preset, variant)]
+            figures = {key: [r[key] for r in chosen] for key in SHOWN}
+            out.setdefault(preset, {})[variant] = {
+                key: {"mean": round(float(np.mean(v)), 4), "std": round(float(np.std(v)), 4)}
+                for key, v in figures.items()
+            }
+        first = out[preset][variants[0]]["ate_sim3_m"]["mean"]
+        for variant in variants:
+            out[preset][variant]["ate_ratio"] = round(out[preset][variant]["ate_sim3_m"]["mean"] / first, 4)
+    return out
+
+
+def print_tables(summary: dict[str, Any], presets: Sequence[str], variants: Sequence[str]) -> None:
+    """The ablation table of each preset."""
+    for preset in presets:
+        print(f"\n{preset}: mean (standard deviation) over the seeds")
+        print(f"{'':24}" + "".join(f"{key:>20}" for key in SHOWN) + f"{'ATE ratio':>12}")
+        for variant in variants:
+            entry = summary[preset][variant]
+            cells = "".join(f"{entry[k]['mean']:12.3f} ({entry[k]['std']:.3f})" for k in SHOWN)
+            print(f"{TITLES[variant]:24}{cells}{entry['ate_ratio']:12.3f}")
+
+
+def plot(path: Path, rows: Sequence[dict[str, Any]], presets: Sequence[str], variants: Sequence[str]) -> None:
+    """ATE of every seed (dots) and their mean (bars), one panel a preset."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(presets), figsize=(2.4 * len(presets) + 1, 3.6), squeeze=False)
+    for axis, preset in zip(axes[0], presets, strict=True):
+        for k, variant in enumerate(variants):
+            ates = [r["ate_sim3_m"] for r in rows if (r["preset"], r["variant"]) == (preset, variant)]
+            axis.bar(k, np.mean(ates), color="#9fc5e8" if k < len(variants) - 1 else "#2a6fb0")
+            axis.scatter(np.full(len(ates), k), ates, s=9, color="#333333", zorder=3)
+        axis.set_xticks(range(len(variants)), [TITLES[v] for v in variants], rotation=40, ha="right", fontsize=8)
+        axis.set_title(preset, fontsize=10)
+        axis.set_ylim(bottom=0)
+    axes[0][0].set_ylabel("ATE after Sim(3) alignment, m")
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+
+
+if __name__ == "__main__":
+    main()
