@@ -1,0 +1,205 @@
+"""Measure the relation of two chunks that share frames (paper 3.2, instance-aware subsequence merging).
+
+Shared pixels, without regions that move, spread evenly over space and instances, then aligned. The same code serves
+adjacent chunks and both halves of a loop (chunk u against the window, the window against chunk v).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.alignment import Alignment, AlignmentSettings, align
+from list3r.association.support import (
+    Fit,
+    Mask,
+    Pairs,
+    StaticSupport,
+    SupportSettings,
+    balanced_sample,
+    confident,
+    expected_deviation,
+    shared_pairs,
+    static_support,
+)
+from list3r.frames.base import Camera
+from list3r.memory.errors import DegenerateError
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge, FrameSamples
+
+
+@dataclass(frozen=True)
+class EdgeSettings:
+    """How an edge is measured."""
+
+    instance_aware: bool = True
+    """False for the paper's baseline: all pairs that are confident enough, whatever they belong to (VGGT-Long)."""
+    least_pairs: int = 60
+    """Fewest pairs that an edge stands on."""
+    least_inliers: float = 0.3
+    """Least share of the weight within three residual scales for an edge to be accepted."""
+    most_moving: float = 0.9
+    """Largest share of the confident pairs that may move in an accepted edge."""
+    trial_pairs: int = 1500
+    """Pairs that a trial alignment works on."""
+    support: SupportSettings = field(default_factory=SupportSettings)
+    alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
+
+
+@dataclass(frozen=True)
+class EdgeSupport:
+    """What became of the N pairs of an edge, for pictures."""
+
+    frame: NDArray[np.int64]
+    """Frame.index. Shape (N,)."""
+    pixel: NDArray[np.int64]
+    """Row-major number in the colour image. Shape (N,)."""
+    confident: Mask
+    """What confidence alone would take. Shape (N,)."""
+    removed: Mask
+    """Confident, but on a region that moves. Shape (N,)."""
+    kept: Mask
+    """What the edge stands on. Shape (N,)."""
+
+
+@dataclass(frozen=True)
+class MeasuredEdge:
+    """An edge, and what it stands on."""
+
+    edge: Edge
+    moving_u: frozenset[int]
+    """Local ids of chunk u that the two chunks place inconsistently."""
+    moving_v: frozenset[int]
+    """Local ids of chunk v that the two chunks place inconsistently."""
+    support: EdgeSupport
+
+
+def measure_edge(
+    u: FrameSamples,
+    v: FrameSamples,
+    u_id: int,
+    v_id: int,
+    camera: Camera,
+    metric: bool,
+    settings: EdgeSettings | None = None,
+    *,
+    kind: str = "adjacent",
+    frames: tuple[int, int] | None = None,
+) -> MeasuredEdge:
+    """The edge between two chunks that share frames; a rigid one when `metric`.
+
+    `camera` is that of the colour images. Raises `DegenerateError` where the shared points determine no transform; an
+    edge that they determine but do not agree on is returned with `accepted` false and the reason.
+    """
+    chosen = settings or EdgeSettings()
+    try:
+        pairs = shared_pairs(u, v)
+        if len(pairs) < chosen.least_pairs:
+            raise DegenerateError(f"only {len(pairs)} points are shared; at least {chosen.least_pairs} are needed")
+        return _measure(pairs, u_id, v_id, camera, metric, chosen, kind, frames)
+    except DegenerateError as error:
+        raise DegenerateError(f"chunks {u_id} and {v_id} cannot be aligned: {error}") from error
+
+
+def _measure(
+    pairs: Pairs,
+    u_id: int,
+    v_id: int,
+    camera: Camera,
+    metric: bool,
+    settings: EdgeSettings,
+    kind: str,
+    frames: tuple[int, int] | None,
+) -> MeasuredEdge:
+    if settings.instance_aware:
+        static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support)
+        rest = static.confident & ~static.removed
+        picked = balanced_sample(pairs, rest, settings.support)
+        off = np.linalg.norm(static.S_v_u.apply(pairs.p_u[picked]) - pairs.p_v[picked], axis=1)
+        deviation = expected_deviation(off, pairs.cam_v[picked, 2])
+        weight = pairs.weight[picked] * _relative_information(deviation)
+    else:
+        sure = confident(pairs, settings.support)
+        static = StaticSupport(Sim3.identity(), sure, np.zeros(len(pairs), bool), frozenset(), frozenset(), 0.0)
+        picked = np.flatnonzero(sure)
+        weight = pairs.weight[picked]
+    found = align(pairs.p_u[picked], pairs.p_v[picked], weight, pairs.frame[picked], metric, settings.alignment)
+    kept = np.zeros(len(pairs), bool)
+    kept[picked] = True
+    return MeasuredEdge(
+        edge=_edge(pairs, static, found, picked, u_id, v_id, settings, kind, frames),
+        moving_u=static.moving_u,
+        moving_v=static.moving_v,
+        support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, kept),
+    )
+
+
+def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
+    """Robust alignment of a thinned part of the pairs."""
+
+    def fit(pairs: Pairs, mask: Mask) -> Sim3:
+        rows = np.flatnonzero(mask)
+        if len(rows) > settings.trial_pairs:
+            rows = rows[np.linspace(0, len(rows) - 1, settings.trial_pairs).astype(np.int64)]
+        found = align(
+            pairs.p_u[rows], pairs.p_v[rows], pairs.weight[rows], pairs.frame[rows], metric, settings.alignment
+        )
+        return found.S_v_u
+
+    return fit
+
+
+def _relative_information(deviation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse variances, 1 for the median pair; no pair has more than ten times its say."""
+    middle = float(np.median(deviation))
+    return np.asarray(np.clip((middle / np.maximum(deviation, 1e-300)) ** 2, 0.1, 10.0))
+
+
+def _edge(
+    pairs: Pairs,
+    static: StaticSupport,
+    found: Alignment,
+    picked: NDArray[np.int64],
+    u_id: int,
+    v_id: int,
+    settings: EdgeSettings,
+    kind: str,
+    frames: tuple[int, int] | None,
+) -> Edge:
+    shared_frames = len(np.unique(pairs.frame[picked]))
+    moving = float(static.removed.sum()) / max(1, int(static.confident.sum()))
+    reason = f"{found.inliers} of {len(picked)} points of {shared_frames} shared frames agree to {found.rms:.4f}"
+    if static.removed.any():
+        reason += f"; {moving:.0%} of what is shared moves and was left out"
+    accepted = True
+    if found.close < settings.least_inliers:
+        width = 3 * settings.alignment.residual_scale * found.spread
+        reason, accepted = f"{reason}; only {found.close:.0%} of the weight lies within {width:.3f}", False
+    elif moving > settings.most_moving:
+        reason, accepted = f"{reason}; too little stands still", False
+    return Edge(
+        u=u_id,
+        v=v_id,
+        kind=kind,
+        S_v_u=found.S_v_u,
+        confidence=found.confidence,
+        weight=found.confidence if accepted else 0.0,
+        inliers=found.inliers,
+        residual_m=found.rms,
+        accepted=accepted,
+        reason=reason,
+        scores={
+            "pairs": float(len(picked)),
+            "shared_pairs": float(len(pairs)),
+            "shared_frames": float(shared_frames),
+            "spread": found.spread,
+            "close": found.close,
+            "moving": moving,
+            "removed_instances": float(max(len(static.moving_u), len(static.moving_v))),
+            "delta_max_px": static.delta_max_px,
+        },
+        frames=frames,
+        covariance=found.covariance,
+    )

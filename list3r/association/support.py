@@ -1,0 +1,462 @@
+"""What two chunks may be aligned on: shared pixels, without what moves, spread evenly (paper 3.2 and A.3).
+
+The same pixel of the same frame is the same surface point in both chunks. Regions are the instances, by the masks of
+either chunk, and blocks of the picture where no mask holds the pixel. A region moves when the two chunks place it
+differently from what surrounds it. The paper measures that in pixels,
+
+    delta(o) = mean over p in Omega_o of | pi(S_v_u P_u(p)) - phi_uv(p) |,
+
+with phi_uv(p) = p on shared frames. A pixel residual cannot see a thing that is displaced along the ray, which is what
+a moving thing mostly does there (its rays are given by the frame), so the share of its depth by which it is displaced
+along the ray is measured beside it. Both are held against what the static regions show, never against a fixed limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.memory.errors import DegenerateError
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import FrameSamples
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Fit = Callable[["Pairs", Mask], Sim3]
+"""A robust similarity S_v_u from the pairs that a mask of shape (N,) chooses; raises `DegenerateError`."""
+
+
+@dataclass(frozen=True)
+class SupportSettings:
+    """What counts as confident, as moving, and how the support is spread."""
+
+    confidence_share: float = 0.1
+    """Least confidence, as a share of the smaller median of the two chunks (VGGT-Long's rule)."""
+    blocks: tuple[int, int] = (4, 3)
+    """Columns and rows of blocks into which pixels without an instance are divided."""
+    least_region_pairs: int = 12
+    """Fewest pairs on which a region is judged."""
+    factor: float = 3.0
+    """A region moves when it is off by so many times what static regions are off by."""
+    deviations: float = 6.0
+    """... and by so many robust deviations of the static regions more than they are."""
+    least_pixels: float = 0.002
+    """... and by no less than this share of the image's width."""
+    least_depth: float = 0.01
+    """... or, along the ray, this share of its depth."""
+    rounds: int = 2
+    """Rounds of alignment and removal."""
+    hypotheses: int = 6
+    """Largest regions that are tried as what stands still."""
+    budget: int = 4000
+    """Most pairs handed to the alignment."""
+    cells: int = 10
+    """Cells across the spread of the points, for even coverage."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """N surface points that two chunks both hold."""
+
+    p_u: Floats
+    """In u. Shape (N, 3)."""
+    p_v: Floats
+    """In v. Shape (N, 3)."""
+    confidence_u: Floats
+    """Shape (N,)."""
+    confidence_v: Floats
+    """Shape (N,)."""
+    frame: Ints
+    """Frame.index. Shape (N,)."""
+    pixel: Ints
+    """Row-major number in the colour image. Shape (N,)."""
+    instance_u: Ints
+    """Local id in u, -1 for none. Shape (N,)."""
+    instance_v: Ints
+    """Local id in v, -1 for none. Shape (N,)."""
+    T_cam_u: Floats
+    """From chunk u to the camera of each pair's frame. Shape (N, 3, 4)."""
+    T_cam_v: Floats
+    """From chunk v to the camera of each pair's frame. Shape (N, 3, 4)."""
+    cam_v: Floats
+    """p_v in the camera of its frame. Shape (N, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def weight(self) -> Floats:
+        """Geometric mean of the two confidences. Shape (N,)."""
+        return np.asarray(np.sqrt(self.confidence_u * self.confidence_v))
+
+
+@dataclass(frozen=True)
+class Regions:
+    """A division of the pairs into R regions by the masks of one chunk."""
+
+    label: Ints
+    """Local id of each region, -1 for a block of the picture without an instance. Shape (R,)."""
+    of_pair: Ints
+    """Region of each pair. Shape (N,)."""
+    count: Ints
+    """Pairs of each region. Shape (R,)."""
+
+
+@dataclass(frozen=True)
+class Inconsistency:
+    """How far the two chunks place each of R regions apart."""
+
+    delta_px: Floats
+    """The paper's delta. Shape (R,)."""
+    across_px: Floats
+    """Displacement across the ray relative to the frame, px. Shape (R,)."""
+    along: Floats
+    """Displacement along the ray relative to the frame, as a share of the depth. Shape (R,)."""
+    moving: Mask
+    """Shape (R,)."""
+
+
+@dataclass(frozen=True)
+class StaticSupport:
+    """What of the pairs stands still."""
+
+    S_v_u: Sim3
+    """The similarity of what stands still, first estimate."""
+    confident: Mask
+    """Pairs that confidence alone would take. Shape (N,)."""
+    removed: Mask
+    """Confident pairs on regions that move. Shape (N,)."""
+    moving_u: frozenset[int]
+    """Local ids of chunk u whose regions move."""
+    moving_v: frozenset[int]
+    """Local ids of chunk v whose regions move."""
+    delta_max_px: float
+    """Largest delta of a region that stays."""
+
+
+def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
+    """The samples at the same pixel of the same frame, finite, with confidence, seen from posed cameras.
+
+    Raises `DegenerateError` when there is none, naming what is missing.
+    """
+    pick_u, pick_v = shared_samples(u, v)
+    if not len(pick_u):
+        frames = np.intersect1d(u.frame, v.frame)
+        raise DegenerateError(
+            f"the chunks share {len(frames)} frames and 0 points; chunks that overlap share posed frames"
+        )
+    row_u, row_v = _camera_rows(u, u.frame[pick_u]), _camera_rows(v, v.frame[pick_v])
+    p_u, p_v = u.points[pick_u].astype(np.float64), v.points[pick_v].astype(np.float64)
+    posed = (row_u >= 0) & (row_v >= 0)
+    finite = np.isfinite(p_u).all(axis=1) & np.isfinite(p_v).all(axis=1)
+    sure = (u.confidence[pick_u] > 0) & (v.confidence[pick_v] > 0)
+    for kept, what in (
+        (posed, "lies in a frame whose camera both chunks placed"),
+        (posed & finite, "has finite coordinates in both chunks"),
+        (posed & finite & sure, "has a confidence above zero in both chunks"),
+    ):
+        if not kept.any():
+            raise DegenerateError(f"of {len(pick_u)} shared points none {what}")
+    keep = np.flatnonzero(posed & finite & sure)
+    T_cam_u = np.linalg.inv(u.T_chunk_cam)[row_u[keep], :3]
+    T_cam_v = np.linalg.inv(v.T_chunk_cam)[row_v[keep], :3]
+    return Pairs(
+        p_u=p_u[keep],
+        p_v=p_v[keep],
+        confidence_u=u.confidence[pick_u[keep]].astype(np.float64),
+        confidence_v=v.confidence[pick_v[keep]].astype(np.float64),
+        frame=u.frame[pick_u[keep]],
+        pixel=u.pixel[pick_u[keep]].astype(np.int64),
+        instance_u=u.instance[pick_u[keep]].astype(np.int64),
+        instance_v=v.instance[pick_v[keep]].astype(np.int64),
+        T_cam_u=T_cam_u,
+        T_cam_v=T_cam_v,
+        cam_v=_moved(T_cam_v, p_v[keep]),
+    )
+
+
+def shared_samples(u: FrameSamples, v: FrameSamples) -> tuple[Ints, Ints]:
+    """Positions in u and v of the samples at the same pixel of the same frame, by frame and pixel."""
+    key_u = (u.frame.astype(np.int64) << np.int64(32)) + u.pixel
+    key_v = (v.frame.astype(np.int64) << np.int64(32)) + v.pixel
+    _, pick_u, pick_v = np.intersect1d(key_u, key_v, assume_unique=True, return_indices=True)
+    return pick_u, pick_v
+
+
+def confident(pairs: Pairs, settings: SupportSettings) -> Mask:
+    """Pairs that confidence alone would take. Shape (N,)."""
+    least = settings.confidence_share * min(np.median(pairs.confidence_u), np.median(pairs.confidence_v))
+    return np.asarray((pairs.confidence_u > least) & (pairs.confidence_v > least))
+
+
+def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: SupportSettings) -> Regions:
+    """Regions by one chunk's instances, and by blocks of the picture where there is none."""
+    columns, rows = settings.blocks
+    block = (pairs.pixel % camera.width) * columns // camera.width
+    block = block + columns * ((pairs.pixel // camera.width) * rows // camera.height)
+    key = np.where(instance >= 0, instance, -1 - block)
+    values, of_pair, count = np.unique(key, return_inverse=True, return_counts=True)
+    return Regions(np.maximum(values, -1), of_pair.ravel().astype(np.int64), count)
+
+
+def static_support(pairs: Pairs, camera: Camera, fit: Fit, settings: SupportSettings) -> StaticSupport:
+    """Find what stands still, and the similarity it agrees on, even where a mover covers half of the pairs.
+
+    Raises `DegenerateError` when no part of the pairs determines a similarity.
+    """
+    sure = confident(pairs, settings)
+    if not sure.any():
+        raise DegenerateError("no shared point has enough confidence in both chunks")
+    by_u = divide(pairs, pairs.instance_u, camera, settings)
+    by_v = divide(pairs, pairs.instance_v, camera, settings)
+    S_v_u = _best_hypothesis(pairs, sure, by_u, fit, settings)
+    removed = np.zeros(len(pairs), bool)
+    of_u = of_v = None
+    for _ in range(settings.rounds):
+        of_u = inconsistency(pairs, sure, by_u, S_v_u, camera, settings, removed)
+        of_v = inconsistency(pairs, sure, by_v, S_v_u, camera, settings, removed)
+        removed_now = sure & (of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair])
+        if np.array_equal(removed_now, removed):
+            break
+        removed = removed_now
+        S_v_u = fit(pairs, sure & ~removed)
+    assert of_u is not None and of_v is not None
+    staying = np.concatenate([of_u.delta_px[~of_u.moving], of_v.delta_px[~of_v.moving]])
+    return StaticSupport(
+        S_v_u=S_v_u,
+        confident=sure,
+        removed=removed,
+        moving_u=_ids(by_u, of_u),
+        moving_v=_ids(by_v, of_v),
+        delta_max_px=float(np.nanmax(staying)) if np.isfinite(staying).any() else 0.0,
+    )
+
+
+def inconsistency(
+    pairs: Pairs,
+    sure: Mask,
+    regions: Regions,
+    S_v_u: Sim3,
+    camera: Camera,
+    settings: SupportSettings,
+    removed: Mask,
+) -> Inconsistency:
+    """How far each region is off, and whether that is more than what stands still is off by.
+
+    The pose error of a frame displaces all that the frame shows and says nothing of motion, so points are compared in
+    the camera of their frame, each chunk's by its own pose, after the frame's common change of scale is taken out;
+    where the poses of the two chunks agree worse than their points do, in chunk v.
+    """
+    off_world = _moved(pairs.T_cam_v, S_v_u.apply(pairs.p_u)) - pairs.cam_v
+    depth = np.maximum(pairs.cam_v[:, 2], 1e-9)
+    delta = np.linalg.norm(_pixels(off_world + pairs.cam_v, camera) - _pixels(pairs.cam_v, camera), axis=1)
+    delta = np.minimum(delta, np.hypot(camera.width, camera.height))
+    rest = sure & ~removed
+    off = _relative_to_frame(pairs, S_v_u, rest)
+    if _typical(off, depth, rest) > _typical(off_world, depth, rest):
+        off = off_world
+    share = off / depth[:, None]
+    medians, row, weight = _by_region_and_frame(share, regions, pairs.frame, sure)
+    total = np.maximum(np.bincount(row, weight, len(regions.count)), 1e-12)
+    focal = np.array([camera.fx, camera.fy])
+    across = np.bincount(row, weight * np.linalg.norm(medians[:, :2] * focal, axis=1), len(regions.count)) / total
+    along = np.bincount(row, weight * np.abs(medians[:, 2]), len(regions.count)) / total
+    judged = np.bincount(regions.of_pair, sure, len(regions.count)) >= settings.least_region_pairs
+    still = np.bincount(regions.of_pair, rest, len(regions.count))
+    limit_across = _limit(across, still, judged, settings, settings.least_pixels * camera.width)
+    limit_along = _limit(along, still, judged, settings, settings.least_depth)
+    mean_delta = np.bincount(regions.of_pair, delta * sure, len(regions.count)) / np.maximum(
+        np.bincount(regions.of_pair, sure, len(regions.count)), 1
+    )
+    moving = judged & ((across > limit_across) | (along > limit_along))
+    return Inconsistency(mean_delta, across, along, moving)
+
+
+def balanced_sample(pairs: Pairs, candidates: Mask, settings: SupportSettings) -> Ints:
+    """At most `budget` of the candidates, with equal quotas for every cell of space and instance in it.
+
+    Inside a cell frames take turns, each with its most confident pair first. Positions, ascending. Shape (M,).
+    """
+    chosen = np.flatnonzero(candidates)
+    if len(chosen) <= 1:
+        return chosen
+    places = pairs.p_v[chosen]
+    low, high = np.quantile(places, [0.05, 0.95], axis=0)
+    cell = max(float(np.linalg.norm(high - low)) / settings.cells, 1e-9)
+    key = np.column_stack([np.floor((places - low) / cell).astype(np.int64), pairs.instance_u[chosen]])
+    _, group = np.unique(key, axis=0, return_inverse=True)
+    group = group.ravel()
+    turn = _turns(group, pairs.frame[chosen], pairs.weight[chosen])
+    quota = _quota(np.bincount(group), settings.budget)
+    return chosen[np.sort(np.flatnonzero(turn < quota))]
+
+
+def expected_deviation(residual: Floats, depth: Floats) -> Floats:
+    """Standard deviation of the residuals as a power of depth, fitted to their medians over depth. Shape (N,).
+
+    Sensors err with the square of depth, point-map models in proportion to it, poses by a constant; the exponent is
+    held between 0 and 2.
+    """
+    order = np.argsort(depth, kind="stable")
+    parts = np.array_split(order, min(8, max(1, len(order) // 50)))
+    x = np.log([max(float(np.median(depth[k])), 1e-9) for k in parts])
+    y = np.log([max(float(np.median(residual[k])) / 1.538, 1e-12) for k in parts])
+    spread = float(((x - x.mean()) ** 2).sum())
+    slope = float(np.clip(((x - x.mean()) * (y - y.mean())).sum() / spread, 0.0, 2.0)) if spread > 1e-6 else 0.0
+    return np.asarray(np.exp(y.mean() + slope * (np.log(np.maximum(depth, 1e-9)) - x.mean())))
+
+
+# ------------------------------------------------------------------------------------------------ parts
+
+
+def _best_hypothesis(pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: SupportSettings) -> Sim3:
+    """The similarity that most regions agree with: of all pairs, of what has no instance, and of each large region.
+
+    A region counts by the square root of its pairs, so that one thing, however large, is outvoted by a few others, and
+    by its extent in space, because what bounds a room is wide.
+    """
+    held = np.bincount(regions.of_pair, sure, len(regions.count))
+    extent = np.array([_extent(pairs.p_v[(regions.of_pair == k) & sure]) for k in range(len(held))])
+    vote = np.sqrt(held) * np.sqrt(extent / max(float(extent.max()), 1e-12)) * (held >= settings.least_region_pairs)
+    masks = [sure, sure & (regions.label[regions.of_pair] < 0)]
+    masks += [sure & (regions.of_pair == k) for k in np.argsort(-vote, kind="stable")[: settings.hypotheses]]
+    depth = np.maximum(pairs.cam_v[:, 2], 1e-9)
+    found: list[tuple[Sim3, Floats]] = []
+    failure = DegenerateError("the shared points do not determine a transform")
+    for number, mask in enumerate(masks):
+        try:
+            S_v_u = fit(pairs, mask)
+        except DegenerateError as error:
+            failure = error if number == 0 else failure
+            continue
+        off = np.linalg.norm(S_v_u.apply(pairs.p_u) - pairs.p_v, axis=1) / depth
+        found.append((S_v_u, np.array([_median(off[(regions.of_pair == k) & sure]) for k in range(len(held))])))
+    if not found:
+        raise failure
+    if not vote.any():
+        return found[0][0]
+    scale = max(2.0 * min(_weighted_quantile(off, vote, 0.4) for _, off in found), 1e-6)
+    scores = [float((vote / (1.0 + (np.nan_to_num(off, nan=1e6) / scale) ** 2)).sum()) for _, off in found]
+    best = int(np.argmax(scores))
+    return found[0][0] if scores[0] >= 0.98 * scores[best] else found[best][0]
+
+
+def _relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:
+    """Points of u against those of v in the camera of their frame, each by its own chunk's pose. Shape (N, 3)."""
+    cam_u = _moved(pairs.T_cam_u, pairs.p_u)
+    ratio = np.log(np.maximum(pairs.cam_v[:, 2], 1e-9) / np.maximum(cam_u[:, 2], 1e-9))
+    frames, which = np.unique(pairs.frame, return_inverse=True)
+    common = np.full(len(frames), np.log(float(S_v_u.scale)))
+    for k in range(len(frames)):
+        mine = ratio[(which == k) & rest]
+        if len(mine) >= 8:
+            common[k] = np.median(mine)
+    return np.asarray(np.exp(common[which.ravel()])[:, None] * cam_u - pairs.cam_v)
+
+
+def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mask) -> tuple[Floats, Ints, Floats]:
+    """Median displacement of each region in each frame, its region, and its number of pairs."""
+    pick = np.flatnonzero(sure)
+    _, place = np.unique(frame[pick], return_inverse=True)
+    key = regions.of_pair[pick] * (int(place.max()) + 1) + place.ravel()
+    order = np.argsort(key, kind="stable")
+    bounds = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1))
+    medians = np.array(
+        [np.median(share[pick[order[a:b]]], axis=0) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    )
+    row = regions.of_pair[pick[order[bounds[:-1]]]]
+    return medians.reshape(-1, 3), row, np.diff(bounds).astype(np.float64)
+
+
+def _limit(value: Floats, still: Floats, judged: Mask, settings: SupportSettings, least: float) -> float:
+    """What a static region is off by at most, from those that were not removed."""
+    vote = np.sqrt(still) * judged
+    if not vote.any():
+        return float("inf")
+    middle = _weighted_quantile(value, vote, 0.5)
+    deviation = 1.4826 * _weighted_quantile(np.abs(value - middle), vote, 0.5)
+    return max(settings.factor * middle, middle + settings.deviations * deviation, least)
+
+
+def _turns(group: Ints, frame: Ints, weight: Floats) -> Ints:
+    """Place of each pair in the order in which its group is drawn from: frames take turns. Shape (M,)."""
+    order = np.lexsort((-weight, frame, group))
+    starts = np.diff(group[order], prepend=-1) != 0
+    round_starts = starts | (np.diff(frame[order], prepend=-1) != 0)
+    turn = np.empty(len(group), np.int64)
+    turn[order] = _count_up(round_starts)
+    order = np.lexsort((frame, turn, group))
+    starts = np.diff(group[order], prepend=-1) != 0
+    out = np.empty(len(group), np.int64)
+    out[order] = _count_up(starts)
+    return out
+
+
+def _count_up(starts: Mask) -> Ints:
+    position = np.arange(len(starts))
+    return position - np.maximum.accumulate(np.where(starts, position, 0))
+
+
+def _quota(sizes: Ints, budget: int) -> int:
+    """The largest quota for each group with which at most `budget` are drawn, at least one."""
+    if int(sizes.sum()) <= budget:
+        return int(sizes.max())
+    low, high = 1, int(sizes.max())
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if int(np.minimum(sizes, middle).sum()) <= budget else (low, middle - 1)
+    return low
+
+
+def _ids(regions: Regions, found: Inconsistency) -> frozenset[int]:
+    return frozenset(int(k) for k in regions.label[found.moving] if k >= 0)
+
+
+def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
+    """Row of each frame's camera, -1 where it has none that is finite."""
+    if not len(samples.camera_frames):
+        return np.full(len(frame), -1, np.int64)
+    order = np.argsort(samples.camera_frames, kind="stable")
+    row = order[np.minimum(np.searchsorted(samples.camera_frames[order], frame), len(order) - 1)]
+    good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
+    return np.where((samples.camera_frames[row] == frame) & good[row], row, -1)
+
+
+def _moved(T: Floats, points: Floats) -> Floats:
+    """Each point by its own transform. Shapes (N, 3, 4), (N, 3) -> (N, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", T[:, :, :3], points) + T[:, :, 3])
+
+
+def _pixels(cam: Floats, camera: Camera) -> Floats:
+    """Pinhole projection, px; a point behind the camera projects far outside. Shape (N, 3) -> (N, 2)."""
+    depth = np.maximum(cam[:, 2:], 1e-6)
+    return np.asarray(cam[:, :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+
+
+def _typical(off: Floats, depth: Floats, rest: Mask) -> float:
+    return float(np.median(np.linalg.norm(off[rest], axis=1) / depth[rest])) if rest.any() else 0.0
+
+
+def _extent(points: Floats) -> float:
+    if len(points) < 2:
+        return 0.0
+    low, high = np.quantile(points, [0.05, 0.95], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _median(values: Floats) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _weighted_quantile(values: Floats, weight: Floats, share: float) -> float:
+    known = np.isfinite(values) & (weight > 0)
+    if not known.any():
+        return 0.0
+    order = np.argsort(values[known], kind="stable")
+    total = np.cumsum(weight[known][order])
+    return float(values[known][order][np.searchsorted(total, share * total[-1])])
