@@ -6,6 +6,7 @@ adjacent chunks and both halves of a loop (chunk u against the window, the windo
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -87,10 +88,13 @@ def measure_edge(
     *,
     kind: str = "adjacent",
     frames: tuple[int, int] | None = None,
+    dynamic_u: Collection[int] = (),
+    dynamic_v: Collection[int] = (),
 ) -> MeasuredEdge:
     """The edge between two chunks that share frames; a rigid one when `metric`.
 
-    `camera` is that of the colour images. Raises `DegenerateError` where the shared points determine no transform; an
+    `camera` is that of the colour images; `dynamic_u` and `dynamic_v` are local ids of instances that are known to move
+    (`motion.flag_moving`), which are left out. Raises `DegenerateError` where the shared points determine no transform; an
     edge that they determine but do not agree on is returned with `accepted` false and the reason.
     """
     chosen = settings or EdgeSettings()
@@ -98,13 +102,15 @@ def measure_edge(
         pairs = shared_pairs(u, v)
         if len(pairs) < chosen.least_pairs:
             raise DegenerateError(f"only {len(pairs)} points are shared; at least {chosen.least_pairs} are needed")
-        return _measure(pairs, u_id, v_id, camera, metric, chosen, kind, frames)
+        known = np.isin(pairs.instance_u, list(dynamic_u)) | np.isin(pairs.instance_v, list(dynamic_v))
+        return _measure(pairs, known, u_id, v_id, camera, metric, chosen, kind, frames)
     except DegenerateError as error:
         raise DegenerateError(f"chunks {u_id} and {v_id} cannot be aligned: {error}") from error
 
 
 def _measure(
     pairs: Pairs,
+    known: Mask,
     u_id: int,
     v_id: int,
     camera: Camera,
@@ -114,7 +120,7 @@ def _measure(
     frames: tuple[int, int] | None,
 ) -> MeasuredEdge:
     if settings.instance_aware:
-        static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support)
+        static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
         rest = static.confident & ~static.removed
         picked = balanced_sample(pairs, rest, settings.support)
         off = np.linalg.norm(static.S_v_u.apply(pairs.p_u[picked]) - pairs.p_v[picked], axis=1)

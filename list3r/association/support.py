@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,8 +164,7 @@ def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
         if not kept.any():
             raise DegenerateError(f"of {len(pick_u)} shared points none {what}")
     keep = np.flatnonzero(posed & finite & sure)
-    T_cam_u = np.linalg.inv(u.T_chunk_cam)[row_u[keep], :3]
-    T_cam_v = np.linalg.inv(v.T_chunk_cam)[row_v[keep], :3]
+    T_cam_u, T_cam_v = _cameras(u, row_u[keep]), _cameras(v, row_v[keep])
     return Pairs(
         p_u=p_u[keep],
         p_v=p_v[keep],
@@ -204,23 +204,27 @@ def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: SupportSettin
     return Regions(np.maximum(values, -1), of_pair.ravel().astype(np.int64), count)
 
 
-def static_support(pairs: Pairs, camera: Camera, fit: Fit, settings: SupportSettings) -> StaticSupport:
+def static_support(
+    pairs: Pairs, camera: Camera, fit: Fit, settings: SupportSettings, known: Mask | None = None
+) -> StaticSupport:
     """Find what stands still, and the similarity it agrees on, even where a mover covers half of the pairs.
 
-    Raises `DegenerateError` when no part of the pairs determines a similarity.
+    `known` (N,) are pairs on things that are known to move. Raises `DegenerateError` when no part of the pairs
+    determines a similarity.
     """
     sure = confident(pairs, settings)
-    if not sure.any():
-        raise DegenerateError("no shared point has enough confidence in both chunks")
+    known = np.zeros(len(pairs), bool) if known is None else sure & known
+    if not (sure & ~known).any():
+        raise DegenerateError("no shared point that stands still has enough confidence in both chunks")
     by_u = divide(pairs, pairs.instance_u, camera, settings)
     by_v = divide(pairs, pairs.instance_v, camera, settings)
-    S_v_u = _best_hypothesis(pairs, sure, by_u, fit, settings)
-    removed = np.zeros(len(pairs), bool)
+    S_v_u, doubted = _best_hypothesis(pairs, sure & ~known, by_u, fit, settings)
+    removed = known | doubted
     of_u = of_v = None
     for _ in range(settings.rounds):
         of_u = inconsistency(pairs, sure, by_u, S_v_u, camera, settings, removed)
         of_v = inconsistency(pairs, sure, by_v, S_v_u, camera, settings, removed)
-        removed_now = sure & (of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair])
+        removed_now = known | (sure & (of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair]))
         if np.array_equal(removed_now, removed):
             break
         removed = removed_now
@@ -314,8 +318,11 @@ def expected_deviation(residual: Floats, depth: Floats) -> Floats:
 # ------------------------------------------------------------------------------------------------ parts
 
 
-def _best_hypothesis(pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: SupportSettings) -> Sim3:
-    """The similarity that most regions agree with: of all pairs, of what has no instance, and of each large region.
+def _best_hypothesis(
+    pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: SupportSettings
+) -> tuple[Sim3, Mask]:
+    """The similarity that most regions agree with (of all pairs, of what has no instance, and of each large region),
+    and the pairs of the regions that do not.
 
     A region counts by the square root of its pairs, so that one thing, however large, is outvoted by a few others, and
     by its extent in space, because what bounds a room is wide.
@@ -339,11 +346,12 @@ def _best_hypothesis(pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, setti
     if not found:
         raise failure
     if not vote.any():
-        return found[0][0]
+        return found[0][0], np.zeros(len(pairs), bool)
     scale = max(2.0 * min(_weighted_quantile(off, vote, 0.4) for _, off in found), 1e-6)
     scores = [float((vote / (1.0 + (np.nan_to_num(off, nan=1e6) / scale) ** 2)).sum()) for _, off in found]
-    best = int(np.argmax(scores))
-    return found[0][0] if scores[0] >= 0.98 * scores[best] else found[best][0]
+    best = 0 if scores[0] >= 0.98 * max(scores) else int(np.argmax(scores))
+    doubted = found[best][1] > settings.factor * scale
+    return found[best][0], sure & doubted[regions.of_pair]
 
 
 def _relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:
@@ -366,16 +374,16 @@ def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mas
     key = regions.of_pair[pick] * (int(place.max()) + 1) + place.ravel()
     order = np.argsort(key, kind="stable")
     bounds = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1))
-    medians = np.array(
-        [np.median(share[pick[order[a:b]]], axis=0) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    )
+    medians = np.array([np.median(share[pick[order[a:b]]], axis=0) for a, b in pairwise(bounds)])
     row = regions.of_pair[pick[order[bounds[:-1]]]]
     return medians.reshape(-1, 3), row, np.diff(bounds).astype(np.float64)
 
 
-def _limit(value: Floats, still: Floats, judged: Mask, settings: SupportSettings, least: float) -> float:
+def _limit(
+    value: Floats, still: NDArray[np.signedinteger], judged: Mask, settings: SupportSettings, least: float
+) -> float:
     """What a static region is off by at most, from those that were not removed."""
-    vote = np.sqrt(still) * judged
+    vote = np.asarray(np.sqrt(still) * judged, np.float64)
     if not vote.any():
         return float("inf")
     middle = _weighted_quantile(value, vote, 0.5)
@@ -427,6 +435,12 @@ def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
     return np.where((samples.camera_frames[row] == frame) & good[row], row, -1)
 
 
+def _cameras(samples: FrameSamples, row: Ints) -> Floats:
+    """From the chunk to the cameras of rows. Shape (N, 3, 4)."""
+    used, which = np.unique(row, return_inverse=True)
+    return np.asarray(np.linalg.inv(samples.T_chunk_cam[used])[which.ravel(), :3], np.float64)
+
+
 def _moved(T: Floats, points: Floats) -> Floats:
     """Each point by its own transform. Shapes (N, 3, 4), (N, 3) -> (N, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", T[:, :, :3], points) + T[:, :, 3])
@@ -454,9 +468,9 @@ def _median(values: Floats) -> float:
 
 
 def _weighted_quantile(values: Floats, weight: Floats, share: float) -> float:
-    known = np.isfinite(values) & (weight > 0)
+    known = np.asarray(np.isfinite(values) & (weight > 0))
     if not known.any():
         return 0.0
     order = np.argsort(values[known], kind="stable")
-    total = np.cumsum(weight[known][order])
-    return float(values[known][order][np.searchsorted(total, share * total[-1])])
+    total = np.asarray(np.cumsum(weight[known][order]))
+    return float(values[known][order][int(np.searchsorted(total, share * total[-1]))])
