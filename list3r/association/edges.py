@@ -94,8 +94,8 @@ def measure_edge(
     """The edge between two chunks that share frames; a rigid one when `metric`.
 
     `camera` is that of the colour images; `dynamic_u` and `dynamic_v` are local ids of instances that are known to move
-    (`motion.flag_moving`), which are left out. Raises `DegenerateError` where the shared points determine no transform; an
-    edge that they determine but do not agree on is returned with `accepted` false and the reason.
+    (`motion.flag_moving`), which are left out. Raises `DegenerateError` where the shared points determine no transform;
+    an edge that they determine but do not agree on is returned with `accepted` false and the reason.
     """
     chosen = settings or EdgeSettings()
     try:

@@ -394,12 +394,12 @@ def _limit(
 def _turns(group: Ints, frame: Ints, weight: Floats) -> Ints:
     """Place of each pair in the order in which its group is drawn from: frames take turns. Shape (M,)."""
     order = np.lexsort((-weight, frame, group))
-    starts = np.diff(group[order], prepend=-1) != 0
-    round_starts = starts | (np.diff(frame[order], prepend=-1) != 0)
+    starts = np.asarray(np.diff(group[order], prepend=-1) != 0)
+    round_starts = np.asarray(starts | (np.diff(frame[order], prepend=-1) != 0))
     turn = np.empty(len(group), np.int64)
     turn[order] = _count_up(round_starts)
     order = np.lexsort((frame, turn, group))
-    starts = np.diff(group[order], prepend=-1) != 0
+    starts = np.asarray(np.diff(group[order], prepend=-1) != 0)
     out = np.empty(len(group), np.int64)
     out[order] = _count_up(starts)
     return out
@@ -407,7 +407,7 @@ def _turns(group: Ints, frame: Ints, weight: Floats) -> Ints:
 
 def _count_up(starts: Mask) -> Ints:
     position = np.arange(len(starts))
-    return position - np.maximum.accumulate(np.where(starts, position, 0))
+    return np.asarray(position - np.maximum.accumulate(np.where(starts, position, 0)))
 
 
 def _quota(sizes: Ints, budget: int) -> int:
@@ -431,7 +431,7 @@ def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
         return np.full(len(frame), -1, np.int64)
     order = np.argsort(samples.camera_frames, kind="stable")
     row = order[np.minimum(np.searchsorted(samples.camera_frames[order], frame), len(order) - 1)]
-    good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(samples.T_chunk_cam).all(axis=(1, 2)))
     return np.where((samples.camera_frames[row] == frame) & good[row], row, -1)
 
 

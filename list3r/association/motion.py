@@ -1,0 +1,293 @@
+"""Find what moves inside one chunk, by the chunk's own poses and the mask tracks (paper A.3, within a subsequence).
+
+A thing that stands still is found again where it was: its points of frame a, projected into frame b, meet it there, or
+something nearer hides them, or they lie outside. A thing that moved leaves its place: frame b sees through its points
+to what lies behind. Seeing through is what is counted, because it is the one thing that neither another viewpoint, nor
+being half hidden, nor a mask that leaks, breaks or changes hands can cause; and since each frame is held against each
+other in both directions, a thing that moves along the ray is caught as well (its later points float before what the
+earlier frame saw). What counts as "behind" follows from how well the static part of the chunk agrees with itself.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
+
+from list3r.frames.base import Camera
+from list3r.memory.records import FrameSamples, LocalInstance, LocalLibrary, MotionTrack
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """When an instance counts as moving."""
+
+    frames: int = 24
+    """Frames, spread over the chunk, that are held against one another."""
+    grid: tuple[int, int] = (64, 48)
+    """Columns and rows of the depth grid of a frame."""
+    deviations: float = 5.0
+    """Robust deviations of the static part's depth beyond which a point is seen through."""
+    least_step: float = 0.03
+    """Least share of the depth by which what lies behind must be farther."""
+    footprint: float = 1.5
+    """A point within so many sample spacings of its instance's own points in the other frame is found again."""
+    least_points: int = 5
+    """Fewest points of an instance on which a pair of frames is judged."""
+    least_pairs: int = 6
+    """Fewest pairs of frames on which an instance is judged."""
+    pair_quantile: float = 0.75
+    """The instance is judged by this quantile over its pairs of frames: it may stand still for most of the chunk."""
+    least_share: float = 0.5
+    """Share of the points seen again that are seen through, from which the instance moves."""
+    smoothing_frames: int = 3
+    """Frames on either side that steady a position, the fuller views counting for more."""
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """The samples of the chosen frames."""
+
+    points: Floats
+    """Chunk coordinates. Shape (S, 3)."""
+    place: Ints
+    """Number of the frame among the chosen. Shape (S,)."""
+    instance: Ints
+    """Row of the instance in the library, -1 for none. Shape (S,)."""
+    xy: Floats
+    """Pixel. Shape (S, 2)."""
+    T_cam_chunk: Floats
+    """Shape (K, 4, 4)."""
+    frames: Ints
+    """Frame.index. Shape (K,)."""
+
+
+@dataclass(frozen=True)
+class _DepthGrid:
+    """What one frame sees, on a coarse grid."""
+
+    nearest: Floats
+    """Least depth in the neighbourhood of a cell, infinite where nothing is known. Shape (h, w)."""
+    farthest: Floats
+    """Greatest depth there, 0 where nothing is known. Shape (h, w)."""
+    middle: Floats
+    """Depth in the cell itself, NaN where unknown. Shape (h, w)."""
+    spacing_px: float
+    """Distance of neighbouring samples."""
+
+
+def flag_moving(
+    samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings | None = None
+) -> LocalLibrary:
+    """The library with `dynamic` and `motion` set for what moves against the rest of the chunk.
+
+    `camera` is that of the colour images, whose pixels `samples` number. What is already flagged stays flagged.
+    """
+    chosen = settings or MotionSettings()
+    shares = seen_through(samples, library, camera, chosen)
+    out = tuple(
+        replace(i, dynamic=True, motion=i.motion or motion_track(samples, i, chosen))
+        if i.dynamic or shares[k] >= chosen.least_share
+        else i
+        for k, i in enumerate(library.instances)
+    )
+    return replace(library, instances=out)
+
+
+def seen_through(
+    samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings | None = None
+) -> Floats:
+    """Share of each instance's points that other frames in which it is visible see through. Shape (I,).
+
+    A high quantile over pairs of frames; 0 where there are too few to judge.
+    """
+    chosen = settings or MotionSettings()
+    count = len(library.instances)
+    used = _choose(samples, library, camera, chosen)
+    if not count or len(used.frames) < 2:
+        return np.zeros(count)
+    size = len(used.frames)
+    grids = [_depth_grid(used, k, camera, chosen) for k in range(size)]
+    depth, cell = zip(*(_project(used, k, camera, chosen) for k in range(size)), strict=True)
+    step = _depth_steps(used, grids, depth, cell, chosen)
+    again, through = np.zeros((count, size, size)), np.zeros((count, size, size))
+    for k, grid in enumerate(grids):
+        seen = (cell[k][:, 0] >= 0) & (used.place != k) & (used.instance >= 0)
+        row, column = np.where(seen[:, None], cell[k], 0).T
+        z = depth[k]
+        behind = (
+            seen & np.isfinite(grid.nearest[row, column]) & (grid.nearest[row, column] > z * (1 + step[used.place, k]))
+        )
+        hidden = grid.farthest[row, column] < z * (1 - step[used.place, k])
+        behind &= ~_found_again(used, k, behind, z, grid, camera, chosen)
+        for mask, target in ((behind, through), (seen & ~hidden & ~behind, again)):
+            np.add.at(target, (used.instance[mask], used.place[mask], k), 1.0)
+    visible = np.zeros((count, size))
+    held = used.instance >= 0
+    np.add.at(visible, (used.instance[held], used.place[held]), 1.0)
+    return _judge(again, through, visible, chosen)
+
+
+def motion_track(
+    samples: FrameSamples, instance: LocalInstance, settings: MotionSettings | None = None
+) -> MotionTrack | None:
+    """Where the middle of what is seen of an instance was, frame by frame; None where it has no points.
+
+    Component-wise medians, steadied over neighbouring frames by how much of the thing each shows.
+    """
+    chosen = settings or MotionSettings()
+    mine = np.flatnonzero((samples.instance == instance.local_id) & np.isfinite(samples.points).all(axis=1))
+    if not len(mine):
+        return None
+    frames, _start, count = np.unique(samples.frame[mine], return_index=True, return_counts=True)
+    order = np.argsort(samples.frame[mine], kind="stable")
+    bounds = np.append(0, np.cumsum(count))
+    points = samples.points[mine[order]].astype(np.float64)
+    middle = np.array([np.median(points[a:b], axis=0) for a, b in itertools.pairwise(bounds)])
+    area = dict(zip(instance.track.frames.tolist(), instance.track.areas_px.tolist(), strict=True))
+    shown = np.array([float(area.get(int(f), n)) for f, n in zip(frames, count, strict=True)])
+    return MotionTrack(frames.astype(np.int64), _steadied(frames, middle, shown, chosen).astype(np.float32))
+
+
+def _steadied(frames: Ints, middle: Floats, shown: Floats, settings: MotionSettings) -> Floats:
+    """Local straight lines through the positions, weighed by the square of the area shown."""
+    out = middle.copy()
+    for k, frame in enumerate(frames):
+        near = np.abs(frames - frame) <= settings.smoothing_frames
+        if near.sum() < 3:
+            continue
+        t = (frames[near] - frame).astype(np.float64)
+        weight = (shown[near] / shown[near].max()) ** 2
+        design = np.column_stack([np.ones_like(t), t]) * np.sqrt(weight)[:, None]
+        out[k] = np.linalg.lstsq(design, middle[near] * np.sqrt(weight)[:, None], rcond=None)[0][0]
+    return out
+
+
+# ------------------------------------------------------------------------------------------------ parts
+
+
+def _choose(samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings) -> _Samples:
+    """The samples of at most `frames` frames, spread evenly."""
+    good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
+    frames = np.intersect1d(samples.camera_frames[good], samples.frame)
+    if len(frames) > settings.frames:
+        frames = frames[np.linspace(0, len(frames) - 1, settings.frames).round().astype(np.int64)]
+    usable = np.isin(samples.frame, frames) & np.isfinite(samples.points).all(axis=1) & (samples.confidence > 0)
+    row = {i.local_id: k for k, i in enumerate(library.instances)}
+    pixel = samples.pixel[usable].astype(np.int64)
+    cameras = {int(f): k for k, f in enumerate(samples.camera_frames)}
+    poses = samples.T_chunk_cam[[cameras[int(f)] for f in frames]]
+    ids, which = np.unique(samples.instance[usable], return_inverse=True)
+    rows = np.array([row.get(int(n), -1) for n in ids], np.int64)
+    return _Samples(
+        points=samples.points[usable].astype(np.float64),
+        place=np.searchsorted(frames, samples.frame[usable]).astype(np.int64),
+        instance=rows[which.ravel()],
+        xy=np.column_stack([pixel % camera.width, pixel // camera.width]).astype(np.float64),
+        T_cam_chunk=np.asarray(np.linalg.inv(poses), np.float64),
+        frames=frames.astype(np.int64),
+    )
+
+
+def _cells(xy: Floats, camera: Camera, settings: MotionSettings) -> Ints:
+    """Row and column of each pixel in the depth grid. Shape (S, 2)."""
+    columns, rows = settings.grid
+    return np.column_stack(
+        [
+            np.clip((xy[:, 1] + 0.5) * rows / camera.height, 0, rows - 1),
+            np.clip((xy[:, 0] + 0.5) * columns / camera.width, 0, columns - 1),
+        ]
+    ).astype(np.int64)
+
+
+def _depth_grid(used: _Samples, k: int, camera: Camera, settings: MotionSettings) -> _DepthGrid:
+    mine = used.place == k
+    T = used.T_cam_chunk[k]
+    z = used.points[mine] @ T[2, :3] + T[2, 3]
+    row, column = _cells(used.xy[mine], camera, settings).T
+    columns, rows = settings.grid
+    nearest, farthest = np.full((rows, columns), np.inf), np.zeros((rows, columns))
+    np.minimum.at(nearest, (row, column), z)
+    np.maximum.at(farthest, (row, column), z)
+    middle = np.where(np.isfinite(nearest), nearest, np.nan)
+    spacing = np.sqrt(rows * columns / max(1, int(np.isfinite(nearest).sum())))
+    reach = 2 * int(np.ceil(spacing)) + 1
+    return _DepthGrid(
+        minimum_filter(nearest, reach, mode="constant", cval=np.inf),
+        maximum_filter(farthest, reach, mode="constant", cval=0.0),
+        middle,
+        float(spacing * camera.width / columns),
+    )
+
+
+def _project(used: _Samples, k: int, camera: Camera, settings: MotionSettings) -> tuple[Floats, Ints]:
+    """Depth of all samples in frame k, and their cells there, -1 outside."""
+    T = used.T_cam_chunk[k]
+    cam = used.points @ T[:3, :3].T + T[:3, 3]
+    z = np.maximum(cam[:, 2], 1e-9)
+    xy = cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    inside = (cam[:, 2] > 1e-6) & (xy > -0.5).all(axis=1) & (xy < [camera.width - 0.5, camera.height - 0.5]).all(axis=1)
+    cell = _cells(np.where(inside[:, None], xy, 0.0), camera, settings)
+    return z, np.where(inside[:, None], cell, -1)
+
+
+def _depth_steps(
+    used: _Samples,
+    grids: list[_DepthGrid],
+    depth: tuple[Floats, ...],
+    cell: tuple[Ints, ...],
+    settings: MotionSettings,
+) -> Floats:
+    """Share of the depth by which frame k must see farther than points of frame a to see through them. (K, K).
+
+    From the 0.4 quantile of the static part's own disagreement, which movers over half of the picture do not reach.
+    """
+    size = len(grids)
+    out = np.full((size, size), settings.least_step)
+    for k, grid in enumerate(grids):
+        row, column = cell[k].T
+        off = np.abs(np.log(np.where(row >= 0, grid.middle[row, column], np.nan) / depth[k]))
+        for a in range(size):
+            mine = off[(used.place == a) & np.isfinite(off)]
+            if a != k and len(mine) >= 20:
+                out[a, k] = max(settings.least_step, settings.deviations * float(np.quantile(mine, 0.4)) / 0.524)
+    return out
+
+
+def _found_again(
+    used: _Samples, k: int, behind: Mask, z: Floats, grid: _DepthGrid, camera: Camera, settings: MotionSettings
+) -> Mask:
+    """Points near their own instance's points in frame k: thin things slip through the grid. Shape (S,)."""
+    out = np.zeros(len(behind), bool)
+    asked = np.flatnonzero(behind)
+    own = np.flatnonzero((used.place == k) & (used.instance >= 0))
+    if not len(asked) or not len(own):
+        return out
+    far = 1e3 * float(np.abs(used.points).max() + 1.0)
+    tree = cKDTree(np.column_stack([used.points[own], far * used.instance[own]]))
+    distance, _ = tree.query(np.column_stack([used.points[asked], far * used.instance[asked]]))
+    out[asked] = distance < settings.footprint * grid.spacing_px * z[asked] / camera.fx
+    return out
+
+
+def _judge(again: Floats, through: Floats, visible: Floats, settings: MotionSettings) -> Floats:
+    """Quantile over pairs of frames that both show the instance of the share seen through. Shape (I,)."""
+    total = again + through
+    both = (visible[:, :, None] >= 3) & (visible[:, None, :] >= 3) & (total >= settings.least_points)
+    share = through / np.maximum(total, 1.0)
+    return np.array(
+        [
+            float(np.quantile(share[k][both[k]], settings.pair_quantile))
+            if both[k].sum() >= settings.least_pairs
+            else 0.0
+            for k in range(len(share))
+        ]
+    )
