@@ -59,6 +59,13 @@ def test_the_other_side_of_the_room_is_not_shared() -> None:
     assert covisibility(depth, poses, CAMERA)[0, 1] == 0.0
 
 
+def test_the_back_of_a_thin_wall_is_not_its_front() -> None:
+    depth, poses = wall([(0, 0, 0), (0, 0, 4.05)])
+    poses[1, :3, :3] = rotation_exp(np.array([0, np.pi, 0]))
+    depth[1] = 2.0
+    assert covisibility(depth, poses, CAMERA)[0, 1] == 0.0
+
+
 def test_a_steep_floor_on_a_coarse_map_shares_itself() -> None:
     y = np.arange(48)[:, None] - 23.5
     depth = np.where(y > 2, 1.2 * 60 / np.maximum(y, 1e-3), 0).astype(np.float32) * np.ones((1, 64), np.float32)

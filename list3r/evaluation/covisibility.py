@@ -59,10 +59,11 @@ def covisibility(
 ) -> Shares:
     """Shares (F, F) from depth maps (F, h, w) along z, 0 where unknown, poses (F, 4, 4) and the camera of the maps.
 
-    A point of frame i is seen in frame j when it lies in j's picture and j's depth there agrees: within the tolerance
-    of the span of the four pixels around it, so that a steep surface on a coarse map is not lost. Where j has no depth
-    the point tells nothing and is left out, though at most half of them. Rows and columns of frames without a finite
-    pose or without depth are NaN. Raises `OptionError` for shapes that do not fit.
+    A point of frame i is seen in frame j when it lies in j's picture, on the same side of the surface, and j's depth
+    there agrees: within the tolerance of the span of the four pixels around it, so that a steep surface on a coarse
+    map is not lost. Where j has no depth the point tells nothing and is left out, though at most half of them.
+    Rows and columns of frames without a finite pose or without depth are NaN. Raises `OptionError` for shapes that do
+    not fit.
     """
     chosen = settings or CovisibilitySettings()
     maps, poses = np.asarray(depth), np.asarray(T_world_cam, dtype=np.float64)
@@ -81,8 +82,9 @@ def covisibility(
     share = np.full((len(maps), len(maps)), np.nan, dtype=np.float32)
     rows = np.flatnonzero(known)
     for i in rows:
-        world = grids[i] @ poses[i, :3, :3].T + poses[i, :3, 3]
-        share[i, rows] = _seen_shares(world, T_cam_world[rows], camera, low, high, rows, chosen.tolerance)
+        rays = grids[i] @ poses[i, :3, :3].T
+        world = rays + poses[i, :3, 3]
+        share[i, rows] = _seen_shares(world, rays, T_cam_world[rows], camera, low, high, rows, chosen.tolerance)
         share[i, i] = 1.0
     return share
 
@@ -109,6 +111,7 @@ def _spans(maps: NDArray[Any]) -> tuple[Shares, Shares]:
 
 def _seen_shares(
     world: Array,
+    rays: Array,
     T_cam_world: Array,
     camera: Camera,
     low: Shares,
@@ -116,10 +119,11 @@ def _seen_shares(
     rows: NDArray[np.int64],
     tolerance: float,
 ) -> Array:
-    """Share of world points (P, 3) that each of G frames sees. Shape (G,)."""
+    """Share of world points (P, 3), found along rays (P, 3), that each of G frames sees. Shape (G,)."""
     p = np.einsum("gij,pj->gpi", T_cam_world[:, :3, :3], world) + T_cam_world[:, None, :3, 3]
     z = p[..., 2]
-    ahead = z > 1e-9
+    facing = np.einsum("gij,pj,gpi->gp", T_cam_world[:, :3, :3], rays, p, optimize=True) > 0
+    ahead = (z > 1e-9) & facing
     safe = np.where(ahead, z, 1.0)
     x, y = camera.fx * p[..., 0] / safe + camera.cx, camera.fy * p[..., 1] / safe + camera.cy
     inside = ahead & (x > -0.5) & (x < camera.width - 0.5) & (y > -0.5) & (y < camera.height - 0.5)
