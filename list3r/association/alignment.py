@@ -12,17 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from list3r.association.alignment_covariance import measure_uncertainty
 from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, skew
+from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
 
 Array = NDArray[np.float64]
-
-_ROUNDING = 1e-7
-"""Relative error of points stored as float32."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +47,10 @@ class AlignmentSettings:
     """Standard deviation of an angle beyond which the rotation counts as open."""
     most_scale_sigma: float = 0.35
     """Standard deviation of the log scale beyond which the scale counts as open."""
+    bending_gain: float = 10.0
+    """Variance added for bending, in units of what the shared frames' own walk shows. In simulation 10 holds where the
+    bending goes together over a tenth to a third of the shared frames; what bends more slowly than the frames that
+    are shared cannot be seen in them and asks for more."""
     cells: int = 10
     """Cells across the spread of the points, for even coverage."""
     least_inliers: float = 0.3
@@ -110,23 +110,26 @@ def align(
     spread = _spread(pairs.v)
     start = _robust_start(pairs.thinned(chosen.start_pairs), metric, spread, chosen)
     S_v_u, trust, limit = _refine(pairs, start, metric, spread, chosen)
-    covariance, groups, bending = _covariance(pairs, S_v_u, trust, limit, metric)
-    _check_determined(covariance, metric, chosen)
+    scale, back = float(S_v_u.scale), S_v_u.inverse().apply(pairs.v)
+    known = measure_uncertainty(
+        pairs.u, back, pairs.weight, trust, limit / scale, pairs.group, metric, chosen.bending_gain
+    )
+    _check_determined(known.covariance, metric, chosen)
     residual = np.full(len(every.u), np.inf)
     residual[used] = pairs.residual(S_v_u)
     sigma = chosen.residual_scale * spread
     inside = residual < limit
     return Alignment(
         S_v_u=S_v_u,
-        covariance=covariance,
+        covariance=known.covariance,
         confidence=float((pairs.weight * np.exp(-residual[used] / sigma)).sum() / pairs.weight.sum()),
         residual=residual,
         inside=inside,
         rms=float(np.sqrt(np.mean(residual[inside] ** 2))),
         spread=spread,
         close=float((pairs.weight * (residual[used] < 3 * sigma)).sum() / pairs.weight.sum()),
-        groups=groups,
-        bending=bending,
+        groups=known.groups,
+        bending=known.bending,
     )
 
 
@@ -271,110 +274,6 @@ def _refine(
         if moved < 1e-8 * spread:
             break
     return S_v_u, trust, limit
-
-
-# ---------------------------------------------------------------------------------------------- its uncertainty
-
-
-def _covariance(pairs: _Pairs, S_v_u: Sim3, trust: Array, limit: float, metric: bool) -> tuple[Array, int, float]:
-    """Covariance of the tangent error (7, 7), number of groups that had a say, and the bending ratio."""
-    center, lever = _middle(pairs, trust)
-    size = 6 if metric else 7
-    information, score = _by_group(pairs, S_v_u, trust, limit, center, lever, size)
-    count = len(information)
-    scatter = _steadied(_left_out(information, score), information.sum(axis=0), count)
-    scatter, bending = _with_bending(scatter + _ROUNDING**2 * np.eye(size), information, score)
-    scatter *= _small_sample(size, count)
-    shift = np.eye(7)
-    shift[:3, 3:6], shift[:3, 6] = skew(center), -center
-    unit = np.array([lever] * 3 + [1.0] * 4)
-    covariance = np.zeros((7, 7))
-    covariance[:size, :size] = scatter
-    covariance = shift @ (covariance * unit[:, None] * unit) @ shift.T
-    return (covariance + covariance.T) / 2.0, count, bending
-
-
-def _middle(pairs: _Pairs, trust: Array) -> tuple[Array, float]:
-    """Centroid of u and its RMS radius."""
-    w = pairs.weight * trust
-    w = w / w.sum()
-    center = w @ pairs.u
-    return center, float(np.sqrt(w @ ((pairs.u - center) ** 2).sum(axis=1)))
-
-
-def _by_group(
-    pairs: _Pairs, S_v_u: Sim3, trust: Array, limit: float, center: Array, lever: float, size: int
-) -> tuple[Array, Array]:
-    """Information (G, D, D) and score (G, D) of each group that has a say, about the centre and in levers.
-
-    The estimating equations of the symmetric fit are those of least squares with the Jacobian at the middle of the two
-    noisy points; the information is the exact second derivative of the biweight.
-    """
-    other = S_v_u.inverse().apply(pairs.v)
-    order = np.argsort(pairs.group, kind="stable")
-    order = order[trust[order] > 0]
-    off = (pairs.u[order] - other[order]) / lever
-    middle = (pairs.u[order] + other[order]) / (2 * lever) - center / lever
-    jacobian = np.zeros((len(order), 3, 7))
-    jacobian[:, :, :3], jacobian[:, :, 3:6], jacobian[:, :, 6] = np.eye(3), -skew(middle), middle
-    jacobian = jacobian[:, :, :size]
-    w, t = pairs.weight[order], trust[order]
-    along = np.einsum("nij,ni->nj", jacobian, off)
-    bend = -4.0 * w * np.sqrt(t) * (lever * float(S_v_u.scale) / limit) ** 2
-    starts = np.flatnonzero(np.diff(pairs.group[order], prepend=np.iinfo(np.int64).min))
-    parts = [slice(a, b) for a, b in zip(starts, [*starts[1:], len(order)], strict=True)]
-    information = []
-    for part in parts:
-        rows = (jacobian[part] * np.sqrt(w * t)[part, None, None]).reshape(-1, size)
-        information.append(rows.T @ rows + (along[part] * bend[part, None]).T @ along[part])
-    return np.stack(information), np.add.reduceat(along * (w * t)[:, None], starts, axis=0)
-
-
-def _left_out(information: Array, score: Array) -> Array:
-    """Covariance by leaving out each of G groups in turn, one Newton step each (the delete-a-group jackknife, CR3)."""
-    count, size = score.shape
-    rest = information.sum(axis=0) - information + 1e-12 * np.trace(information.sum(axis=0)) * np.eye(size)
-    change = np.linalg.solve(rest, score[..., None])[..., 0]
-    return np.asarray((count - 1) / count * change.T @ change)
-
-
-def _steadied(scatter: Array, information: Array, count: int) -> Array:
-    """The scatter of G groups, drawn towards the shape of the inverse information the fewer groups there are."""
-    root, inverse_root = _roots(information)
-    white = root @ scatter @ root
-    size = len(scatter)
-    share = size / (size + count - 1)
-    white = (1 - share) * white + share * np.trace(white) / size * np.eye(size)
-    return np.asarray(inverse_root @ white @ inverse_root)
-
-
-def _with_bending(scatter: Array, information: Array, score: Array) -> tuple[Array, float]:
-    """Widened where thirds of the groups, in order, differ by more than the scatter of single groups explains."""
-    count, size = score.shape
-    if count < 6:
-        return scatter, 1.0
-    bounds = [0, round(count / 3), round(2 * count / 3)]
-    thirds = _left_out(np.add.reduceat(information, bounds, axis=0), np.add.reduceat(score, bounds, axis=0))
-    root, inverse_root = _roots(scatter)
-    walk = inverse_root @ thirds @ inverse_root
-    ratio = float(np.trace(walk)) / size
-    if ratio <= 1.0:
-        return scatter, ratio
-    excess = (1.0 - 1.0 / ratio) * (walk + ratio * np.eye(size)) / 2.0
-    return np.asarray(root @ (np.eye(size) + excess) @ root), ratio
-
-
-def _roots(matrix: Array) -> tuple[Array, Array]:
-    """Symmetric square root and its inverse of a symmetric positive matrix."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2.0)
-    root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-300)))
-    return (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
-
-
-def _small_sample(size: int, count: int) -> float:
-    """Ratio of Hotelling's T^2 to chi^2 at 95 %: a covariance from few groups is itself uncertain."""
-    freedom = max(size * (count - 1) / 2, 3.0)
-    return float(size * f_distribution.ppf(0.95, size, freedom) / chi2.ppf(0.95, size))
 
 
 def _check_determined(covariance: Array, metric: bool, settings: AlignmentSettings) -> None:
