@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.masks import decode_mask
 from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.descriptor import DescriptorSettings, frame_descriptor
@@ -32,10 +31,23 @@ class KeyframeSettings:
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """Which points of its frames a chunk keeps for alignment."""
+    """Which points of its frames a chunk keeps for alignment.
 
-    columns: int = 16
-    rows: int = 12
+    Three nested grids, fixed in the picture, so that two chunks that share a frame share pixels whatever each found in
+    it: every fourth column and row of the finest in frames of the interior, every second in frames near the ends,
+    which neighbouring chunks share, and one grid finer on small things.
+    """
+
+    columns: int = 64
+    """Columns of the finest grid."""
+    rows: int = 48
+    """Rows of the finest grid."""
+    end_frames: int = 30
+    """Frames at either end of the chunk that count as near it: the usual overlap."""
+    small_share: float = 0.02
+    """Share of the picture up to which a mask counts as a small thing's."""
+    resolution_bits: int = 15
+    """Points are rounded to 2^-bits of their extent (0.2 mm in 6 m), so that they compress."""
 
 
 def make_keyframes(
@@ -56,28 +68,42 @@ def make_keyframes(
 def frame_samples(
     reconstruction: Reconstruction, library: LocalLibrary | None = None, settings: SampleSettings | None = None
 ) -> FrameSamples:
-    """Points of all posed frames on one fixed pixel grid, with the instances whose masks hold them."""
+    """Points of all posed frames on fixed pixel grids, with the instances whose masks hold them."""
     chosen = settings or SampleSettings()
     positions = np.flatnonzero(reconstruction.posed)
     camera = reconstruction.camera
-    row, column = (g.ravel() for g in _pixel_grid(camera, chosen))
+    row, column, level = _pixel_grid(camera, chosen)
     depth = reconstruction.depth[positions][:, row, column]
     confidence = reconstruction.confidence[positions][:, row, column].astype(np.float32)
+    instance, small = _instances(library, reconstruction, positions, row, column, chosen)
+    last = len(reconstruction.frame_indices) - 1
+    near_end = np.minimum(positions, last - positions) < chosen.end_frames
+    wanted = level[None] <= near_end[:, None].astype(np.int64) + small
+    known = wanted & (depth > 0) & (confidence > 0)
+    place, cell = np.nonzero(known)
     rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
     T = reconstruction.T_chunk_cam[positions]
-    points = np.einsum("fij,fnj->fni", T[:, :3, :3], depth[..., None] * rays) + T[:, None, :3, 3]
-    known = (depth > 0) & (confidence > 0)
-    frame = np.broadcast_to(reconstruction.frame_indices[positions][:, None], depth.shape)
-    pixel = np.broadcast_to((row * camera.width + column)[None], depth.shape)
+    seen = depth[known][:, None] * rays[cell]
+    points = np.einsum("nij,nj->ni", T[place, :3, :3], seen) + T[place, :3, 3]
     return FrameSamples(
-        frame=frame[known].astype(np.int64),
-        pixel=pixel[known].astype(np.int32),
-        points=points[known].astype(np.float32),
-        confidence=confidence[known],
-        instance=_instances(library, reconstruction, positions, row, column)[known],
+        frame=reconstruction.frame_indices[positions][place].astype(np.int64),
+        pixel=(row * camera.width + column)[cell].astype(np.int32),
+        points=_rounded(points, chosen.resolution_bits),
+        confidence=(np.ceil(confidence[known] * 256) / 256).astype(np.float32),
+        instance=instance[known],
         camera_frames=reconstruction.frame_indices[positions].astype(np.int64),
         T_chunk_cam=T.astype(np.float64),
     )
+
+
+def _rounded(points: NDArray[np.float64], bits: int) -> NDArray[np.float32]:
+    """Points on multiples of a power of two, at most 2^-bits of their extent."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    extent = float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+    if not extent > 0:
+        return points.astype(np.float32)
+    step = 2.0 ** (np.floor(np.log2(extent)) - bits)
+    return np.asarray(np.round(points / step) * step, np.float32)
 
 
 def _instances(
@@ -86,27 +112,37 @@ def _instances(
     positions: NDArray[np.int64],
     row: NDArray[np.int64],
     column: NDArray[np.int64],
-) -> NDArray[np.int32]:
-    """Local id of the smallest mask at each grid pixel of each frame, -1 for none. Shape (G, N)."""
+    settings: SampleSettings,
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Local id of the smallest mask at each pixel of each frame, -1 for none, and whether it is small. (G, N)."""
     out = np.full((len(positions), len(row)), -1, np.int32)
     place = {int(reconstruction.frame_indices[p]): k for k, p in enumerate(positions)}
     area = np.full(out.shape, np.iinfo(np.int32).max, np.int32)
+    pixel = row * reconstruction.camera.width + column
     for instance in library.instances if library is not None else ():
         track = instance.track
         for index, mask, size in zip(track.frames, track.masks, track.areas_px, strict=True):
             k = place.get(int(index))
             if k is None:
                 continue
-            held = decode_mask(mask, track.image_size)[row, column] & (size < area[k])
+            held = (np.searchsorted(np.cumsum(mask.astype(np.int64)), pixel, side="right") % 2 == 1) & (size < area[k])
             out[k, held], area[k, held] = instance.local_id, size
-    return out
+    most = settings.small_share * reconstruction.camera.width * reconstruction.camera.height
+    return out, np.asarray(area <= most)
 
 
-def _pixel_grid(camera: Camera, settings: SampleSettings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    rows = ((np.arange(settings.rows) + 0.5) * camera.height / settings.rows).astype(np.int64)
-    columns = ((np.arange(settings.columns) + 0.5) * camera.width / settings.columns).astype(np.int64)
-    grid = np.meshgrid(rows, columns, indexing="ij")
-    return grid[0], grid[1]
+def _pixel_grid(
+    camera: Camera, settings: SampleSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the finest grid, and the level from which each pixel is used: 0 coarse to 2 fine."""
+    rows, columns = np.arange(settings.rows), np.arange(settings.columns)
+    level_y, level_x = (np.where(n % 4 == 2, 0, np.where(n % 2 == 0, 1, 2)) for n in (rows, columns))
+    y = ((rows + 0.5) * camera.height / settings.rows).astype(np.int64)
+    x = ((columns + 0.5) * camera.width / settings.columns).astype(np.int64)
+    grid = np.meshgrid(y, x, indexing="ij")
+    level = np.maximum(level_y[:, None], level_x[None, :])
+    _, first = np.unique(grid[0].ravel() * camera.width + grid[1].ravel(), return_index=True)
+    return grid[0].ravel()[first], grid[1].ravel()[first], level.ravel()[first]
 
 
 def _make_keyframe(
