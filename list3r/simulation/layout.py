@@ -42,13 +42,14 @@ class Room:
     x0: float
     x1: float
     depth: float
-    """It reaches from y = 0 to y = depth."""
+    """It reaches from y = y0 to y = y0 + depth."""
     mirrored: bool
     """Furniture laid out for y is set at depth - y."""
+    y0: float = 0.0
 
     def world_xy(self, x: float, y: float) -> tuple[float, float]:
         """Room coordinates to the world."""
-        return self.x0 + x, (self.depth - y if self.mirrored else y)
+        return self.x0 + x, self.y0 + (self.depth - y if self.mirrored else y)
 
 
 @dataclass

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.simulation.projection import NEAR_M, screen_rectangles
 from list3r.simulation.shading import ContactShadows, TextureAtlas, illumination, surface
 from list3r.simulation.things import BOX, CYLINDER, stack_solids
 from list3r.simulation.world import World
@@ -15,10 +16,8 @@ from list3r.simulation.world import World
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-_NEAR_M = 0.05
 _SUBPIXELS = np.array([[-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.125, 0.375]], np.float32)
 """Offsets of the rays within an edge pixel, px: the rotated grid."""
-_EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)])
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Renderer:
 
     def render(self, T_world_cam: Array) -> RenderedFrame:
         """The picture from a pose. Shape (4, 4)."""
-        rects = self._rectangles(T_world_cam)
+        rects = screen_rectangles(self._corners, T_world_cam, self._camera)
         depth, solid = self._cast(T_world_cam, *rects)
         shape = depth.shape
         hit = np.flatnonzero(solid.ravel() >= 0)
@@ -128,24 +127,6 @@ class Renderer:
         )
         color[row, column] = shades.reshape(-1, len(_SUBPIXELS), 3).mean(axis=1)
 
-    def _rectangles(self, T_world_cam: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Least depth (N,) and pixel rectangle [left, right) x [top, bottom) (N, 4) of every solid."""
-        camera = self._camera
-        local = (self._corners - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
-        a, b = local[:, _EDGES[:, 0]], local[:, _EDGES[:, 1]]
-        za, zb = a[..., 2], b[..., 2]
-        share = np.clip((_NEAR_M - za) / np.where(np.abs(zb - za) < 1e-12, 1e-12, zb - za), 0, 1)
-        cut = a + share[..., None] * (b - a)
-        points = np.concatenate([local, cut], axis=1)
-        ahead = points[..., 2] >= _NEAR_M * (1 - 1e-6)
-        z = np.where(ahead, points[..., 2], 1.0)
-        px, py = camera.fx * points[..., 0] / z + camera.cx, camera.fy * points[..., 1] / z + camera.cy
-        left, top = np.where(ahead, px, np.inf).min(axis=1), np.where(ahead, py, np.inf).min(axis=1)
-        right, bottom = np.where(ahead, px, -np.inf).max(axis=1), np.where(ahead, py, -np.inf).max(axis=1)
-        rects = np.stack([np.ceil(left), np.ceil(top), np.floor(right) + 1, np.floor(bottom) + 1], axis=1)
-        size = np.array([camera.width, camera.height, camera.width, camera.height])
-        return np.maximum(local[..., 2].min(axis=1), 0.0), np.clip(rects, 0, size).astype(np.int64)
-
     def _intersect(self, n: int, T_world_cam: Array, x: Floats, y: Floats) -> Floats:
         """Depth at which rays (x, y, 1) meet solid `n`, inf where they miss; x and y are broadcast."""
         solids = self._solids
@@ -165,7 +146,7 @@ class Renderer:
 
 def _hit_box(origin: Floats, rays: list[Floats], half: Floats) -> Floats:
     """Slab test (Kay and Kajiya, 1986)."""
-    enter = np.full(rays[0].shape, _NEAR_M, np.float32)
+    enter = np.full(rays[0].shape, NEAR_M, np.float32)
     leave = np.full(rays[0].shape, np.inf, np.float32)
     for o, d, h in zip(origin, rays, half, strict=True):
         inverse = 1.0 / d
@@ -183,11 +164,11 @@ def _hit_cylinder(origin: Floats, rays: list[Floats], half: Floats, open_top: bo
     best = np.full(dx.shape, np.inf, np.float32)
     for sign in (-1.0, 1.0) if open_top else (-1.0,):
         t = (-b + sign * root) / a
-        good = (np.abs(oz + t * dz) <= h) & (t > _NEAR_M)
+        good = (np.abs(oz + t * dz) <= h) & (t > NEAR_M)
         best = np.where(good & (t < best), t, best)
     for level in (-h,) if open_top else (-h, h):
         t = (level - oz) / dz
-        good = ((ox + t * dx) ** 2 + (oy + t * dy) ** 2 <= radius * radius) & (t > _NEAR_M)
+        good = ((ox + t * dx) ** 2 + (oy + t * dy) ** 2 <= radius * radius) & (t > NEAR_M)
         best = np.where(good & (t < best), t, best)
     return np.asarray(best, dtype=np.float32)
 
@@ -201,7 +182,7 @@ def _hit_sphere(origin: Floats, rays: list[Floats], radius: float, open_top: boo
     best = np.full(dx.shape, np.inf, np.float32)
     for sign in (-1.0, 1.0) if open_top else (-1.0,):
         t = (-b + sign * root) / a
-        good = t > _NEAR_M
+        good = t > NEAR_M
         if open_top:
             good &= origin[2] + t * dz <= 0
         best = np.where(good & (t < best), t, best)
