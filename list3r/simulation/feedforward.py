@@ -57,7 +57,9 @@ class FeedForwardSettings:
         """True geometry in a random gauge, whole tracks, full confidence."""
         return FeedForwardSettings(
             poses=PoseErrorSettings(bending=0, jitter_deg=0, jitter_shift=0, glitch_rate=0),
-            depth=DepthErrorSettings(noise=0, noise_per_m=0, bland=0, flying_share=0, focal=0, knowing=1, doubted_share=0),
+            depth=DepthErrorSettings(
+                noise=0, noise_per_m=0, bland=0, flying_share=0, focal=0, knowing=1, doubted_share=0
+            ),
             movers=MoverErrorSettings(lag_s=0, frozen_share=0, depth=0, least_confidence=1, pull=0),
             instances=InstanceErrorSettings(
                 small_px=1e-3, break_rate=0, gap_frames=10**6, merge_share=0, leak_rate=0, late_frames=0,
