@@ -1,17 +1,18 @@
-"""Pictures of a local library: masks with ids on frames, and tracks over time."""
+"""Pictures for `--debug`: masks with ids on frames, tracks over time, and what edges between chunks stand on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import Frame
+from list3r.association.edges import MeasuredEdge
+from list3r.frames.base import Camera, Frame
 from list3r.memory.masks import decode_mask
-from list3r.memory.records import LocalLibrary
+from list3r.memory.records import Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
 
@@ -77,6 +78,79 @@ def draw_tracks(library: LocalLibrary, frame_indices: NDArray[np.int64]) -> NDAr
             x = 40 + column * where[int(index)]
             out[top + 1 : top + row - 1, x : x + column] = 255 - (255 - color) * (0.3 + 0.7 * share)
     return out
+
+
+def write_support(
+    measured: MeasuredEdge, keyframes: Iterable[Keyframe], camera: Camera, out_dir: Path, name: str | None = None
+) -> Path:
+    """Write what an edge stands on to `out_dir`/edges/`name`.png (U-V for chunks U and V); returns the file.
+
+    `keyframes` are those of both chunks; the picture is the shared one in which most was removed, then most kept. Where
+    none of them is shared or has a picture, a grey one takes its place.
+    """
+    support = measured.support
+    pictures = {k.frame_index: k.jpeg for k in keyframes if k.jpeg}
+    frames = np.unique(support.frame)
+    shown = [f for f in frames.tolist() if f in pictures] or frames.tolist()
+    said = [
+        (int((support.removed & here).sum()), int((support.kept & here).sum())) for here in _in_frames(measured, shown)
+    ]
+    frame = shown[max(range(len(shown)), key=said.__getitem__)] if shown else -1
+    color = _decoded(pictures[frame]) if frame in pictures else None
+    if color is None or color.shape[:2] != (camera.height, camera.width):
+        color = np.full((camera.height, camera.width, 3), 96, np.uint8)
+    out = out_dir / "edges" / f"{name or f'{measured.edge.u}-{measured.edge.v}'}.png"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _write(out, draw_support(color, measured, frame))
+    return out
+
+
+def draw_support(frame_color: NDArray[np.uint8], measured: MeasuredEdge, frame: int) -> NDArray[np.uint8]:
+    """An overlap frame three times, as in the paper's figure of its supports. RGB, shape (h, w, 3).
+
+    Left the frame; in the middle yellow what confidence alone would take; right cyan what the edge stands on and red
+    what was removed because it moves. `frame` is the Frame.index of `frame_color` (H, W, 3).
+    """
+    support = measured.support
+    here = support.frame == frame
+    height, width = frame_color.shape[:2]
+    zoom = max(1, round(320 / width))
+    plain = np.ascontiguousarray(np.repeat(np.repeat(frame_color, zoom, axis=0), zoom, axis=1))
+    alone, ours = plain.copy(), plain.copy()
+    radius = max(1, round(zoom * width / 320))
+    _dots(alone, support.pixel[here & support.confident], width, zoom, radius, (255, 220, 0))
+    _dots(ours, support.pixel[here & support.kept], width, zoom, radius, (0, 230, 255))
+    _dots(ours, support.pixel[here & support.removed], width, zoom, radius, (255, 30, 30))
+    gap = np.full((height * zoom, 4, 3), 255, np.uint8)
+    row = np.concatenate([plain, gap, alone, gap, ours], axis=1)
+    strip = np.full((44, row.shape[1], 3), 255, np.uint8)
+    edge = measured.edge
+    verdict = "accepted" if edge.accepted else "rejected"
+    for line, text in enumerate((f"{edge.kind} {edge.u}-{edge.v}, frame {frame}: {verdict}", edge.reason)):
+        cv2.putText(strip, text, (6, 17 + 19 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.concatenate([row, strip])
+
+
+def _in_frames(measured: MeasuredEdge, frames: Iterable[int]) -> Iterable[NDArray[np.bool_]]:
+    return (measured.support.frame == frame for frame in frames)
+
+
+def _dots(
+    image: NDArray[np.uint8],
+    pixel: NDArray[np.int64],
+    width: int,
+    zoom: int,
+    radius: int,
+    color: tuple[int, int, int],
+) -> None:
+    for n in pixel.tolist():
+        middle = (int((n % width + 0.5) * zoom), int((n // width + 0.5) * zoom))
+        cv2.circle(image, middle, radius, color, -1, cv2.LINE_AA)
+
+
+def _decoded(jpeg: bytes) -> NDArray[np.uint8] | None:
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return None if image is None else np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
 
 
 def _inner_point(mask: NDArray[np.bool_]) -> tuple[int, int]:
