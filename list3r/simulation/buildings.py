@@ -129,7 +129,10 @@ def _corridor_plan(
     rows: list[tuple[PlacedRoom, ...]],
 ) -> RoomPlan:
     doors = [
-        Door(side, x) for side, row in zip(("north", "south"), rows, strict=True) for r in row for x, _ in r.doorways[:1]
+        Door(side, x)
+        for side, row in zip(("north", "south"), rows, strict=True)
+        for r in row
+        for x, _ in r.doorways[:1]
     ]
     for _ in range(settings.closed_doors):
         side, at = ("north", "south")[int(rng.integers(2))], float(rng.uniform(0.8, length - 0.8))

@@ -22,19 +22,25 @@ _FIRST = 24
 class Caster:
     """Casts depth and ids for one camera among things, some of which may have a pose of their own in every frame."""
 
-    def __init__(self, things: Sequence[Thing], camera: Camera) -> None:
+    def __init__(self, things: Sequence[Thing], camera: Camera, moving: Sequence[Thing] = ()) -> None:
         self._camera = camera
-        self._solids = stack_solids(things)
+        self._solids = stack_solids((*things, *moving))
         self._corners = self._solids.corners()
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
         self._x = np.tile(x, camera.height)
         self._y = np.repeat(y, camera.width)
-        cos, sin = np.cos(self._solids.yaw), np.sin(self._solids.yaw)
-        zero, one = np.zeros_like(cos), np.ones_like(cos)
-        rows = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], axis=1)
-        self._to_local = rows.reshape(-1, 3, 3)
-        self._size = np.prod(self._solids.half, axis=1)
+        self._to_local = _to_local(self._solids.yaw)
+        self._own = {t.id: (np.flatnonzero(self._solids.thing == t.id), stack_solids([t])) for t in moving}
+
+    def place(self, thing_id: int, T_world_object: Array) -> None:
+        """Put one of the `moving` things somewhere, upright; `T_world_object` (4, 4)."""
+        rows, home = self._own[thing_id]
+        yaw = float(np.arctan2(T_world_object[1, 0], T_world_object[0, 0]))
+        self._solids.center[rows] = home.center @ T_world_object[:3, :3].T + T_world_object[:3, 3]
+        self._solids.yaw[rows] = home.yaw + yaw
+        self._to_local[rows] = _to_local(self._solids.yaw[rows])
+        self._corners[rows] = home.corners() @ T_world_object[:3, :3].T + T_world_object[:3, 3]
 
     def cast(self, T_world_cam: Array) -> tuple[Floats, NDArray[np.int32]]:
         """Depth along z, metres, 0 where nothing is hit, and ids, both (H, W)."""
@@ -99,6 +105,12 @@ class Caster:
         for k in range(3):
             rays.append(rotation[:, 3 * k][n] * x + (rotation[:, 3 * k + 1][n] * y + rotation[:, 3 * k + 2][n]))
         return [origin[:, k][n] for k in range(3)], rays
+
+
+def _to_local(yaw: Array) -> Array:
+    """R_local_world of turns about z (N,). Shape (N, 3, 3)."""
+    cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+    return np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
 
 
 def _pixels(rects: Ints, width: int) -> tuple[Ints, Ints]:

@@ -289,7 +289,9 @@ def _some(g: Furnisher, *kinds: str) -> tuple[str, ...]:
     return tuple(kind for kind in kinds if g.p.rng.uniform() < g.plan.clutter)
 
 
-def _cabinet_group(label: str, width: float, depth: float, height: float, *tops: str) -> Callable[..., tuple[float, float]]:
+def _cabinet_group(
+    label: str, width: float, depth: float, height: float, *tops: str
+) -> Callable[..., tuple[float, float]]:
     def build(g: Furnisher) -> tuple[float, float]:
         w, h = width * g.p.rng.uniform(0.9, 1.1), height * g.p.rng.uniform(0.92, 1.08)
         parts = f.cabinet((w, depth, h), g.p.wood(), g.p.wood(0.6), max(1, round(w / 0.5)))
@@ -451,7 +453,10 @@ def _decorate(g: Furnisher, pictures: int) -> None:
     for _ in range(g.plan.windows):
         w, trim = float(g.p.rng.uniform(0.9, 1.4)), g.p.wood(0.5)
         pane = Material("plain", (176, 204, 232), (226, 238, 248), 1.0, int(g.p.rng.integers(1 << 16)))
-        parts = (f.block((w, 0.05, 1.1), (0, 0.025, 0.55), trim), f.block((w - 0.12, 0.01, 0.98), (0, 0.05, 0.55), pane))
+        parts = (
+            f.block((w, 0.05, 1.1), (0, 0.025, 0.55), trim),
+            f.block((w - 0.12, 0.01, 0.98), (0, 0.05, 0.55), pane),
+        )
         g.on_wall("window", parts, w, 0.95, ("north",))
     for _ in range(pictures):
         w, h = float(g.p.rng.uniform(0.5, 0.85)), float(g.p.rng.uniform(0.4, 0.6))

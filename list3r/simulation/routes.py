@@ -1,0 +1,260 @@
+"""Ways through a building: where one can walk, where the camera goes and what it looks at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from list3r.simulation.buildings import Building, PlacedRoom
+from list3r.simulation.things import Thing, stack_solids
+from list3r.simulation.walk import PathSettings, walk_duration
+from list3r.simulation.world import Stop
+
+Array = NDArray[np.float64]
+
+_CELL_M = 0.1
+_BODY_M = (0.3, 1.9)
+"""What stands between these heights is in the way."""
+_THROUGH_FURNITURE = 60.0
+"""Cost of a metre through furniture, against 1 in the open: taken only where nothing else is left."""
+_COMFORT_M = 0.3
+_STEP_M = 0.45
+_AHEAD_M = 1.8
+
+
+class FreeMap:
+    """The floor of a building as a grid of places to walk."""
+
+    def __init__(self, building: Building) -> None:
+        rooms = building.rooms()
+        low = np.array([min(r.x0 for r in rooms), min(r.y0 for r in rooms)]) - 0.5
+        high = np.array([max(r.x1 for r in rooms), max(r.y1 for r in rooms)]) + 0.5
+        self._origin = low
+        shape = tuple(np.ceil((high - low) / _CELL_M).astype(int)[::-1])
+        walls = [t for t in building.world.things if t.structure == "wall"]
+        others = [t for t in building.world.things if t.structure is None]
+        floor = np.zeros(shape, np.uint8)
+        for room in rooms:
+            self._fill(
+                floor, np.array([[room.x0, room.y0], [room.x1, room.y0], [room.x1, room.y1], [room.x0, room.y1]])
+            )
+        passage = cv2.dilate(floor, np.ones((3, 3), np.uint8)).astype(bool)
+        solid = self._occupied(walls, shape) | ~passage
+        self.clearance_m = distance_transform_edt(~(solid | self._occupied(others, shape))) * _CELL_M
+        """Distance from each cell to what is in the way, metres. Shape (rows along y, columns along x)."""
+        cost = 1 + 6 * np.exp(-((self.clearance_m / _COMFORT_M) ** 2)) + (self.clearance_m <= 0) * _THROUGH_FURNITURE
+        self._graph, self._passable = _grid_graph(np.where(solid, np.inf, cost)), ~solid
+
+    def _fill(self, image: NDArray[np.uint8], corners: Array) -> None:
+        hull = cv2.convexHull(((corners - self._origin) / _CELL_M - 0.5).astype(np.float32))
+        cv2.fillConvexPoly(image, np.rint(hull * 16).astype(np.int32), 1, shift=4)
+
+    def _occupied(self, things: list[Thing], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        image = np.zeros(shape, np.uint8)
+        for box in stack_solids(things).corners() if things else ():
+            if box[:, 2].max() > _BODY_M[0] and box[:, 2].min() < _BODY_M[1]:
+                self._fill(image, box[::2, :2])
+        return image.astype(bool)
+
+    def cells(self, xy: Array) -> NDArray[np.int64]:
+        """Rows and columns of places (N, 2), clipped to the grid. Shape (N, 2)."""
+        cell = np.floor((xy - self._origin) / _CELL_M).astype(np.int64)[..., ::-1]
+        return np.clip(cell, 0, np.array(self.clearance_m.shape) - 1)
+
+    def clearance(self, xy: Array) -> Array:
+        """Distance from places (N, 2) to what is in the way, metres. Shape (N,)."""
+        cell = self.cells(xy)
+        return np.asarray(self.clearance_m[cell[..., 0], cell[..., 1]])
+
+    def open_places(self, room: PlacedRoom, least_m: float) -> Array:
+        """Middles of a room's cells with that clearance, or the roomiest hundred. Shape (N, 2)."""
+        rows, columns = np.indices(self.clearance_m.shape)
+        x, y = (columns + 0.5) * _CELL_M + self._origin[0], (rows + 0.5) * _CELL_M + self._origin[1]
+        inside = (x > room.x0) & (x < room.x1) & (y > room.y0) & (y < room.y1)
+        places, clear = np.stack([x[inside], y[inside]], axis=1), self.clearance_m[inside]
+        enough = clear >= least_m
+        return places[enough] if enough.sum() >= 20 else places[np.argsort(-clear, kind="stable")[:100]]
+
+    def snap(self, xy: Array, least_m: float = 0.25) -> Array:
+        """The nearest places with some clearance. Shapes (N, 2) -> (N, 2)."""
+        good = np.argwhere(self._passable & (self.clearance_m >= least_m))
+        middles = (good[:, ::-1] + 0.5) * _CELL_M + self._origin
+        gap = np.linalg.norm(middles[None] - np.atleast_2d(xy)[:, None], axis=2)
+        near = middles[np.argmin(gap, axis=1)]
+        return np.where((self.clearance(np.atleast_2d(xy)) >= least_m)[:, None], np.atleast_2d(xy), near)
+
+    def path(self, start: Array, goal: Array) -> Array:
+        """A smooth way from one place to another, points 0.1 m apart. Shape (N, 2)."""
+        columns = self.clearance_m.shape[1]
+        a, b = (int(r * columns + c) for r, c in self.cells(np.stack([start, goal])))
+        _, before = dijkstra(self._graph, indices=a, return_predecessors=True)
+        trail = [b]
+        while trail[-1] != a:
+            step = int(before[trail[-1]])
+            assert step >= 0, "rooms of a building are joined"
+            trail.append(step)
+        row, column = np.divmod(np.array(trail[::-1]), columns)
+        way = np.stack([column + 0.5, row + 0.5], axis=1) * _CELL_M + self._origin
+        way[0], way[-1] = start, goal
+        if len(way) < 3:
+            return np.stack([start, goal])
+        smooth = gaussian_filter1d(np.concatenate([way[:1]] * 12 + [way] + [way[-1:]] * 12), 3.5, axis=0)
+        return np.asarray(smooth[6:-6])
+
+
+def _grid_graph(cost: Array) -> coo_matrix:
+    """Edges between neighbouring cells of finite cost."""
+    rows, columns = cost.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    heads, tails, weights = [], [], []
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = np.s_[: rows - dy, max(-dx, 0) : columns - max(dx, 0)]
+        b = np.s_[dy:, max(dx, 0) : columns + min(dx, 0)]
+        weight = (cost[a] + cost[b]) / 2 * np.hypot(dx, dy) * _CELL_M
+        ok = np.isfinite(weight)
+        heads.append(number[a][ok])
+        tails.append(number[b][ok])
+        weights.append(weight[ok])
+    i, j, w = np.concatenate(heads), np.concatenate(tails), np.concatenate(weights)
+    both = (np.concatenate([w, w]), (np.concatenate([i, j]), np.concatenate([j, i])))
+    return coo_matrix(both, shape=(cost.size, cost.size)).tocsr()
+
+
+@dataclass(frozen=True)
+class View:
+    """A place to stand and what to look at from there, world, metres."""
+
+    xy: tuple[float, float]
+    targets: tuple[tuple[float, float, float], ...]
+
+
+@dataclass
+class Director:
+    """Tells the camera where to go and where to look, and notes it as stops."""
+
+    building: Building
+    free: FreeMap
+    rng: np.random.Generator
+    path: PathSettings
+    eye_m: float = 1.5
+    stops: list[Stop] = field(default_factory=list)
+
+    def seconds(self) -> float:
+        """How long the stops so far take."""
+        return walk_duration(tuple(self.stops), self.path) if len(self.stops) > 1 else 0.0
+
+    def at(self) -> Array:
+        """Where the camera is. Shape (2,)."""
+        return np.array(self.stops[-1].eye[:2])
+
+    def plan_views(self, room: PlacedRoom, count: int, sweep_deg: float = 170.0, apart_m: float = 1.2) -> list[View]:
+        """Places in a room, apart from each other, with sweeps over what stands there."""
+        places = self.free.open_places(room, 0.45)
+        chosen: list[Array] = []
+        views = []
+        for _ in range(count):
+            drawn = places[self.rng.integers(len(places), size=24)]
+            if chosen:
+                gap = np.linalg.norm(drawn[:, None] - np.array(chosen)[None], axis=2).min(axis=1)
+                drawn = drawn[np.argsort(np.abs(gap - apart_m), kind="stable")]
+            chosen.append(drawn[0])
+            views.append(self._view(room, drawn[0], sweep_deg))
+        return views
+
+    def _view(self, room: PlacedRoom, xy: Array, sweep_deg: float) -> View:
+        points = self._targets(room)
+        offset = points[:, :2] - xy
+        far = np.linalg.norm(offset, axis=1)
+        points, offset = points[far > 1.0], offset[far > 1.0]
+        bearing = np.arctan2(offset[:, 1], offset[:, 0])
+        start = float(self.rng.uniform(-np.pi, np.pi))
+        turn = (bearing - start) % (2 * np.pi)
+        order = [k for k in np.argsort(turn, kind="stable") if turn[k] <= np.deg2rad(sweep_deg)]
+        picked, last = [], -1.0
+        for k in order:
+            if turn[k] - last > np.deg2rad(18):
+                picked.append(k)
+                last = float(turn[k])
+        if len(picked) < 2:
+            picked = list(np.argsort(turn, kind="stable")[:2])
+        if self.rng.uniform() < 0.5:
+            picked.reverse()
+        return View((float(xy[0]), float(xy[1])), tuple(_triple(points[k]) for k in picked))
+
+    def _targets(self, room: PlacedRoom) -> Array:
+        """What there is to look at in a room: its things, and its corners. Shape (N, 3)."""
+        wanted = set(room.things)
+        things = [t.box() for t in self.building.world.things if t.id in wanted and t.structure is None]
+        points = [box.center for box in things if box.center[2] < 1.7 and box.size.max() > 0.3]
+        corners = [np.array([x, y, 0.8]) for x in (room.x0, room.x1) for y in (room.y0, room.y1)]
+        return np.array([np.array([p[0], p[1], 0.35 + 0.55 * p[2]]) for p in points] + corners)
+
+    def begin(self, xy: tuple[float, float], target: tuple[float, float, float]) -> None:
+        """Put the camera somewhere."""
+        self.stops.append(Stop((*xy, self.eye_m), target))
+
+    def walk_to(self, xy: tuple[float, float], *, look_round: float = 0.35) -> None:
+        """Walk along a free way and look ahead, now and then aside by up to 50 degrees."""
+        way = self.free.path(self.at(), np.array(xy))
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        count = max(2, round(along[-1] / _STEP_M) + 1)
+        aside = 0.0
+        for s in np.linspace(0, along[-1], count)[1:]:
+            here = _along(way, along, s)
+            there = _along(way, along, min(s + _AHEAD_M, along[-1]))
+            heading = there - here if np.linalg.norm(there - here) > 0.3 else here - _along(way, along, max(s - 0.6, 0))
+            if np.linalg.norm(heading) < 1e-6:
+                continue
+            if self.rng.uniform() < look_round:
+                aside = float(np.deg2rad(self.rng.uniform(-50, 50)))
+            else:
+                aside *= 0.5
+            yaw = float(np.arctan2(heading[1], heading[0])) + aside
+            ahead = here + 2.5 * np.array([np.cos(yaw), np.sin(yaw)])
+            self.stops.append(Stop((*_pair(here), self.eye_m), (*_pair(ahead), self.eye_m - 0.45)))
+
+    def look(self, view: View) -> None:
+        """Stand and look at a view's targets one after another, with a small step between them."""
+        here = np.array(view.xy)
+        for target in view.targets:
+            step = here + self.rng.uniform(-0.15, 0.15, 2)
+            if self.free.clearance(step[None])[0] > 0.25:
+                here = step
+            self.stops.append(Stop((*_pair(here), self.eye_m), target))
+
+    def film(self, views: list[View], *, look_round: float = 0.35) -> None:
+        """Walk from view to view and look at each."""
+        for view in views:
+            if self.stops:
+                self.walk_to(view.xy, look_round=look_round)
+            self.look(view)
+
+
+def mapped_view(view: View, source: PlacedRoom, target: PlacedRoom) -> View:
+    """The same view in the twin of a room."""
+    turn = target.turn - source.turn
+    c, s = float(np.cos(turn)), float(np.sin(turn))
+    (ax, ay), (bx, by) = source.center(), target.center()
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return bx + c * (x - ax) - s * (y - ay), by + s * (x - ax) + c * (y - ay)
+
+    return View(place(*view.xy), tuple((*place(x, y), z) for x, y, z in view.targets))
+
+
+def _along(way: Array, along: Array, s: float) -> Array:
+    return np.array([np.interp(s, along, way[:, 0]), np.interp(s, along, way[:, 1])])
+
+
+def _pair(xy: Array) -> tuple[float, float]:
+    return float(xy[0]), float(xy[1])
+
+
+def _triple(xyz: Array) -> tuple[float, float, float]:
+    return float(xyz[0]), float(xyz[1]), float(xyz[2])
