@@ -24,7 +24,7 @@ class CloudErrors:
     """Mean distance from the truth's points to the estimate."""
     completeness_median_cm: float
     chamfer_cm: float
-    """Mean of accuracy and completeness."""
+    """Mean of accuracy and completeness, as in the paper's tables."""
     normal_consistency: float | None
     """Mean |cosine| between normals of nearest points, both ways, in [0, 1]; None without normals."""
     threshold_cm: float
@@ -40,6 +40,20 @@ class CloudErrors:
         return asdict(self)
 
 
+@dataclass(frozen=True)
+class CloudDistances:
+    """From every point of one cloud to the nearest of the other, metres."""
+
+    to_truth: Array
+    """Of the estimate's points (N,)."""
+    nearest_truth: NDArray[np.int64]
+    """Row of the truth's point. Shape (N,)."""
+    to_estimate: Array
+    """Of the truth's points (M,)."""
+    nearest_estimate: NDArray[np.int64]
+    """Row of the estimate's point. Shape (M,)."""
+
+
 def evaluate_cloud(
     truth: ArrayLike,
     estimate: ArrayLike,
@@ -47,15 +61,19 @@ def evaluate_cloud(
     estimate_normals: ArrayLike | None = None,
     threshold_m: float = 0.05,
     truncate_m: float | None = None,
+    distances: CloudDistances | None = None,
 ) -> CloudErrors:
-    """Compare two clouds (N, 3) and (M, 3) of one frame of reference, metres; normals, if any, of unit length.
+    """Compare two clouds (M, 3) and (N, 3) of one frame of reference, metres; normals, if any, of unit length.
 
-    `truncate_m` caps single distances, where parts of the truth were never in view; None leaves them. Raises
-    `OptionError` for an empty cloud and for points that are not finite.
+    `truncate_m` caps single distances, where parts of the truth were never in view; None leaves them. `distances` are
+    those of `cloud_distances` where they are known already. Raises `OptionError` for an empty cloud, for points that
+    are not finite and for a threshold that is no length.
     """
     a, b = _points(truth, "truth"), _points(estimate, "estimate")
-    to_truth, row_truth = _nearest(a, b)
-    to_estimate, row_estimate = _nearest(b, a)
+    if not threshold_m > 0 or not (truncate_m is None or truncate_m > 0):
+        raise OptionError(f"threshold {threshold_m} m, greatest distance {truncate_m} m: both must be above 0")
+    found = distances or cloud_distances(a, b)
+    to_truth, to_estimate = found.to_truth, found.to_estimate
     precision, recall = float(np.mean(to_truth <= threshold_m)), float(np.mean(to_estimate <= threshold_m))
     if truncate_m is not None:
         to_truth, to_estimate = np.minimum(to_truth, truncate_m), np.minimum(to_estimate, truncate_m)
@@ -64,8 +82,8 @@ def evaluate_cloud(
         n, m = np.asarray(truth_normals, dtype=np.float64), np.asarray(estimate_normals, dtype=np.float64)
         if n.shape != a.shape or m.shape != b.shape:
             raise OptionError(f"normals of shape {n.shape} and {m.shape} for points of shape {a.shape} and {b.shape}")
-        there = np.abs(np.einsum("nk,nk->n", n[row_truth], m)).mean()
-        back = np.abs(np.einsum("nk,nk->n", n, m[row_estimate])).mean()
+        there = np.abs(np.einsum("nk,nk->n", n[found.nearest_truth], m)).mean()
+        back = np.abs(np.einsum("nk,nk->n", n, m[found.nearest_estimate])).mean()
         consistency = float((there + back) / 2)
     return CloudErrors(
         accuracy_cm=100 * float(to_truth.mean()),
@@ -81,9 +99,15 @@ def evaluate_cloud(
     )
 
 
+def cloud_distances(truth: ArrayLike, estimate: ArrayLike) -> CloudDistances:
+    """Nearest neighbours both ways of two clouds (M, 3) and (N, 3). Raises as `evaluate_cloud`."""
+    a, b = _points(truth, "truth"), _points(estimate, "estimate")
+    return CloudDistances(*_nearest(a, b), *_nearest(b, a))
+
+
 def _nearest(targets: Array, points: Array) -> tuple[Array, NDArray[np.int64]]:
     """Distance to the nearest target of each point, and its row."""
-    distance, row = cKDTree(targets).query(points)
+    distance, row = cKDTree(targets, balanced_tree=False).query(points, workers=-1)
     return np.asarray(distance, dtype=np.float64), np.asarray(row, dtype=np.int64)
 
 

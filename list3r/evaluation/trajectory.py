@@ -1,4 +1,4 @@
-"""Trajectory errors: ATE after SE(3) and Sim(3) alignment, RPE at a stated delta.
+"""Trajectory errors: ATE after SE(3) and Sim(3) alignment, RPE at a stated delta, and what was not covered.
 
 The conventions are those of evo and of the TUM RGB-D benchmark (Sturm et al., "A benchmark for the evaluation of RGB-D
 SLAM systems", 2012): poses are associated by time, the alignment is Umeyama's over all associated positions.
@@ -6,6 +6,7 @@ SLAM systems", 2012): poses are associated by time, the alignment is Umeyama's o
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,52 @@ class Statistics:
 
 
 @dataclass(frozen=True)
+class Delta:
+    """How far apart the poses are that RPE relates."""
+
+    value: float = 1.0
+    unit: str = "frames"
+    """frames (associated poses), m (along the true path), s."""
+
+    def __post_init__(self) -> None:
+        whole = self.unit != "frames" or float(self.value).is_integer()
+        if self.unit not in _DELTA_UNITS or not (np.isfinite(self.value) and self.value > 0) or not whole:
+            raise OptionError(f"delta {self.value:g} {self.unit}: want at least 1 frame, or metres or seconds above 0")
+
+    @staticmethod
+    def parse(text: str) -> Delta:
+        """`10` or `10f` is frames, `0.5m` metres, `2s` seconds. Raises `OptionError` for anything else."""
+        found = re.fullmatch(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(f|m|s)?\s*", text)
+        try:
+            value = float(found.group(1)) if found else float("nan")
+        except ValueError:
+            value = float("nan")
+        if found is None or not np.isfinite(value):
+            raise OptionError(f"delta {text!r}: want frames, metres or seconds, such as 10, 0.5m or 2s")
+        return Delta(value, {"m": "m", "s": "s"}.get(found.group(2) or "f", "frames"))
+
+    def __str__(self) -> str:
+        return f"{self.value:g} {'frame' if self == Delta() else self.unit}"
+
+
+_DELTA_UNITS = ("frames", "m", "s")
+_DELTA_TOLERANCE = 0.1
+"""Greatest difference of a distance in metres or seconds from what is wanted, as a share of it (as in evo)."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What part of the truth the estimate has poses for."""
+
+    truth: float
+    """Share of the time that the truth lasts in which the estimate has poses."""
+    gaps: int
+    """Stretches inside the estimate without poses: over three times its usual step."""
+    longest_gap_s: float
+    """Of those, and of what is missing at the beginning and the end; 0 where nothing is missing."""
+
+
+@dataclass(frozen=True)
 class TrajectoryErrors:
     """How far an estimated trajectory is from the truth."""
 
@@ -61,16 +108,19 @@ class TrajectoryErrors:
     """Associated poses."""
     coverage: float
     """Associated share of the estimated poses."""
+    covered: Coverage
     ate_se3_m: Statistics
     """Distance of positions after rigid alignment, units of the truth."""
     ate_sim3_m: Statistics
     """The same with the scale free."""
     scale: float
     """Factor of the Sim(3) alignment from the estimate to the truth; 1 for a perfect metric estimate."""
-    delta_frames: int
-    """Distance of the poses that RPE relates, in associated poses."""
+    delta: Delta
+    """Distance of the poses that RPE relates."""
     rpe_translation_m: Statistics
     """Length of the translation of the relative error, no alignment."""
+    rpe_translation_sim3_m: Statistics
+    """The same after the estimate was brought to the scale of the Sim(3) alignment."""
     rpe_rotation_deg: Statistics
     """Angle of the relative error."""
 
@@ -147,35 +197,75 @@ def associate(truth_time_s: Array, time_s: Array, tolerance_s: float = 0.01) -> 
 
 
 def evaluate_trajectory(
-    truth: Trajectory, estimate: Trajectory, tolerance_s: float = 0.01, delta_frames: int = 1
+    truth: Trajectory,
+    estimate: Trajectory,
+    tolerance_s: float = 0.01,
+    delta_frames: int = 1,
+    delta: Delta | None = None,
 ) -> TrajectoryErrors:
     """Errors of an estimate against the truth.
 
-    RPE relates associated poses that lie `delta_frames` apart, all of them, overlapping. Raises `OptionError` when
-    the two share too few moments, `DegenerateError` when the positions do not determine an alignment.
+    RPE relates associated poses that lie `delta` apart (None: `delta_frames` frames), all of them, overlapping. Raises
+    `OptionError` when the two share too few moments, `DegenerateError` when the positions do not determine an
+    alignment.
     """
-    if delta_frames < 1:
-        raise OptionError(f"delta {delta_frames}: RPE needs a distance of at least 1 frame")
-    rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
-    if len(rows) < max(3, delta_frames + 1):
-        raise OptionError(
-            f"{len(rows)} poses within {tolerance_s} s of each other: the truth covers {_span(truth)}, the estimate "
-            f"{_span(estimate)}; use one clock, a greater tolerance, or a smaller delta"
-        )
-    a, b = truth.at(rows_truth), estimate.at(rows)
+    apart = delta or Delta(delta_frames)
+    a, b = associated(truth, estimate, tolerance_s)
     rigid = align(a, b, with_scale=False)
     similar = align(a, b, with_scale=True)
-    translation, rotation_deg = relative_errors(a, b, delta_frames)
+    start, end = delta_pairs(a, apart)
+    translation, rotation_deg = relative_errors(a, b, start, end)
+    scaled, _ = relative_errors(a, scaled_by(b, float(similar.scale)), start, end)
     return TrajectoryErrors(
-        pairs=len(rows),
-        coverage=len(rows) / len(estimate.time_s),
-        ate_se3_m=statistics(np.linalg.norm(rigid.apply(b.positions()) - a.positions(), axis=1)),
-        ate_sim3_m=statistics(np.linalg.norm(similar.apply(b.positions()) - a.positions(), axis=1)),
+        pairs=len(a.time_s),
+        coverage=len(a.time_s) / len(estimate.time_s),
+        covered=coverage(truth, estimate),
+        ate_se3_m=statistics(position_errors(a, b, rigid)),
+        ate_sim3_m=statistics(position_errors(a, b, similar)),
         scale=float(similar.scale),
-        delta_frames=delta_frames,
+        delta=apart,
         rpe_translation_m=statistics(translation),
+        rpe_translation_sim3_m=statistics(scaled),
         rpe_rotation_deg=statistics(rotation_deg),
     )
+
+
+def associated(truth: Trajectory, estimate: Trajectory, tolerance_s: float = 0.01) -> tuple[Trajectory, Trajectory]:
+    """Truth and estimate at the moments that both have. Raises `OptionError` when these are fewer than three."""
+    rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
+    if len(rows) < 3:
+        raise OptionError(
+            f"{len(rows)} poses within {tolerance_s} s of each other: the truth covers {_span(truth)}, the estimate "
+            f"{_span(estimate)}; use one clock or a greater tolerance"
+        )
+    return truth.at(rows_truth), estimate.at(rows)
+
+
+def coverage(truth: Trajectory, estimate: Trajectory) -> Coverage:
+    """How much of the truth's time the estimate has poses for."""
+    start, end = float(truth.time_s[0]), float(truth.time_s[-1])
+    inside = estimate.time_s[(estimate.time_s >= start) & (estimate.time_s <= end)]
+    if len(inside) < 2 or end <= start:
+        return Coverage(0.0, 0, end - start)
+    steps = np.diff(inside)
+    usual = float(np.median(np.diff(estimate.time_s)))
+    ends = np.array([inside[0] - start, end - inside[-1]])
+    missing, gaps = ends[ends > 3 * usual], steps[steps > 3 * usual]
+    lost = float(missing.sum() + gaps.sum())
+    longest = float(max([*missing, *gaps], default=0.0))
+    return Coverage(1.0 - lost / (end - start), len(gaps), longest)
+
+
+def position_errors(truth: Trajectory, estimate: Trajectory, S_truth_estimate: Sim3) -> Array:
+    """Distances of aligned positions of two associated trajectories. Shape (P,)."""
+    return np.asarray(np.linalg.norm(S_truth_estimate.apply(estimate.positions()) - truth.positions(), axis=1))
+
+
+def scaled_by(trajectory: Trajectory, scale: float) -> Trajectory:
+    """The same views from positions that are so many times further apart."""
+    poses = trajectory.T_world_cam.copy()
+    poses[:, :3, 3] *= scale
+    return Trajectory(trajectory.time_s, poses)
 
 
 def align(truth: Trajectory, estimate: Trajectory, *, with_scale: bool) -> Sim3:
@@ -186,18 +276,45 @@ def align(truth: Trajectory, estimate: Trajectory, *, with_scale: bool) -> Sim3:
         raise DegenerateError(f"the trajectories cannot be aligned: {error}") from error
 
 
-def relative_errors(truth: Trajectory, estimate: Trajectory, delta: int) -> tuple[Array, Array]:
-    """E_i = (A_i^-1 A_i+d)^-1 (B_i^-1 B_i+d) for truth A and estimate B: translation (P,) and angle in degrees (P,)."""
-    a, b = Sim3.from_matrix(truth.T_world_cam), Sim3.from_matrix(estimate.T_world_cam)
-    error = (_step(a, delta).inverse() @ _step(b, delta)).as_matrix()
+def delta_pairs(truth: Trajectory, delta: Delta) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the poses that lie `delta` apart, two of shape (P,). Raises `OptionError` when there are none.
+
+    Metres count along the true path and seconds on the clock: each pose is paired with the later one whose distance is
+    nearest to what is wanted, if it is within a tenth of it (evo's all pairs, with pairs from the reference).
+    """
+    count = len(truth.time_s)
+    if delta.unit == "frames":
+        start = np.arange(max(count - int(delta.value), 0))
+        end = start + int(delta.value)
+    else:
+        steps = np.linalg.norm(np.diff(truth.positions(), axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(steps)]) if delta.unit == "m" else truth.time_s
+        wanted = along + delta.value
+        start = np.arange(count - 1)
+        right = np.clip(np.searchsorted(along, wanted[:-1]), start + 1, count - 1)
+        left = np.maximum(right - 1, start + 1)
+        end = np.where(np.abs(along[left] - wanted[:-1]) <= np.abs(along[right] - wanted[:-1]), left, right)
+        near = np.abs(along[end] - wanted[:-1]) <= _DELTA_TOLERANCE * delta.value
+        start, end = start[near], end[near]
+    if len(start) == 0:
+        raise OptionError(f"no two of {count} associated poses lie {delta} apart: give a smaller delta")
+    return start.astype(np.int64), end.astype(np.int64)
+
+
+def relative_errors(
+    truth: Trajectory, estimate: Trajectory, start: NDArray[np.int64], end: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """E = (A_i^-1 A_j)^-1 (B_i^-1 B_j) for truth A, estimate B, rows i, j: translation and angle in degrees, (P,)."""
+    a, b = (_steps(t, start, end) for t in (truth, estimate))
+    error = (a.inverse() @ b).as_matrix()
     angle = np.linalg.norm(rotation_log(error[:, :3, :3]), axis=1)
     return np.linalg.norm(error[:, :3, 3], axis=1), np.rad2deg(angle)
 
 
-def _step(poses: Sim3, delta: int) -> Sim3:
-    ones = np.ones(len(poses.scale) - delta)
-    start = Sim3(ones, poses.rotation[:-delta], poses.translation[:-delta])
-    return start.inverse() @ Sim3(ones, poses.rotation[delta:], poses.translation[delta:])
+def _steps(trajectory: Trajectory, start: NDArray[np.int64], end: NDArray[np.int64]) -> Sim3:
+    poses, ones = Sim3.from_matrix(trajectory.T_world_cam), np.ones(len(start))
+    before = Sim3(ones, poses.rotation[start], poses.translation[start])
+    return before.inverse() @ Sim3(ones, poses.rotation[end], poses.translation[end])
 
 
 def statistics(errors: Array) -> Statistics:
