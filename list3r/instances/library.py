@@ -10,6 +10,7 @@ import numpy as np
 from list3r.frames.base import Frame
 from list3r.instances.base import Discoverer, Proposals, Tracker
 from list3r.instances.discovery import GeometricDiscoverer
+from list3r.instances.movers import with_movers
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking import ReprojectionTracker
 from list3r.instances.views import chunk_views, forget_views
@@ -29,7 +30,8 @@ def build_library(
     """Find the things of a chunk and follow them through it.
 
     `frames` are the chunk's frames in the order of the reconstruction. Without a discoverer and a tracker the ones
-    that need no weights are used.
+    that need no weights are used. What the reconstruction found to move of its own is added as instances that are
+    `dynamic`; the others do not see it, for it has no depth there.
     """
     settings = settings or InstanceSettings()
     discoverer = discoverer or GeometricDiscoverer(settings)
@@ -38,7 +40,8 @@ def build_library(
         anchors = chunk_views(frames, reconstruction, settings).anchors
         proposals = [discoverer(frames, reconstruction, position) for position in anchors]
         prompts = [select_prompts(p, settings) for p in proposals]
-        return tracker(frames, reconstruction, prompts, discoverer.feature_space)
+        library = tracker(frames, reconstruction, prompts, discoverer.feature_space)
+        return with_movers(library, frames, reconstruction)
     finally:
         forget_views()
 

@@ -46,7 +46,7 @@ def collect_supports(
         mine = order[bounds[number] : bounds[number + 1]]
         flat = len(mine) > 0 and np.isfinite(bases[number]).all()
         places = _press(xyz[mine], sigma[mine], bases[number]) if flat else xyz[mine]
-        support = _thin(places, colors[mine], sure[mine], views.unit, max_points)
+        support = thin(places, colors[mine], sure[mine], views.unit, max_points)
         out.append(_set_on(support, bases[number]) if flat else support)
     return out
 
@@ -71,14 +71,14 @@ def _set_on(support: Support, base: NDArray[np.float64]) -> Support:
     )
 
 
-def _thin(
+def thin(
     points: NDArray[np.float32],
     rgb: NDArray[np.uint8],
     confidence: NDArray[np.float32],
     unit: float,
     max_points: int,
 ) -> Support:
-    """One mean point in each voxel: 5 mm for small things, larger so that at most `max_points` are left."""
+    """Support of one mean point in each voxel: 5 mm for small things, larger so that at most `max_points` are left."""
     if not len(points):
         return Support(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8))
     voxel = 0.005 * unit

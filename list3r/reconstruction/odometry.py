@@ -137,6 +137,11 @@ class Tracker:
             self._views[position] = make_view(frame.color, frame.depth, self.small, self.settings.noise)
         return self._views[position]
 
+    @property
+    def moving(self) -> dict[int, Mask]:
+        """What was left out of each frame as moving of its own, by position, at working resolution."""
+        return {position: mask for position, mask in sorted(self._moving.items()) if mask.any()}
+
     def features(self, position: int) -> Features:
         """The frame's local features, found once."""
         if position not in self._features:

@@ -6,9 +6,10 @@ together (`odometry`, `registration`, `surfels`); local features find frames aga
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.confidence import ConfidenceSettings, depth_confidence
+from list3r.reconstruction.follow import FollowSettings, follow_movers
+from list3r.reconstruction.moving import MovingSettings, SmallFrames, find_moving
 from list3r.reconstruction.odometry import OdometrySettings, Tracker
 
 
@@ -25,6 +28,8 @@ class RgbdSettings:
 
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+    moving: MovingSettings = field(default_factory=MovingSettings)
+    follow: FollowSettings = field(default_factory=FollowSettings)
 
 
 @dataclass(frozen=True)
@@ -51,12 +56,14 @@ class RgbdReconstructor:
         """
         if not any(frame.depth is not None for frame in frames):
             raise TrackingError("the frames have no depth; the rgbd reconstruction needs it")
+        hints: Mapping[int, NDArray[np.bool_]] = {}
         if self.poses == "given":
             T, posed, keyframes = self._given(frames, camera)
         else:
-            T, posed, keyframes = self._estimate(frames, camera)
+            T, posed, keyframes, hints = self._estimate(frames, camera)
         shape = (camera.height, camera.width)
         depth = np.stack([np.zeros(shape, np.float32) if f.depth is None else f.depth for f in frames])
+        moving = self._moving(frames, depth, T, posed, camera, hints)
         return Reconstruction(
             frame_indices=np.array([frame.index for frame in frames], np.int64),
             posed=posed,
@@ -66,12 +73,38 @@ class RgbdReconstructor:
             confidence=np.stack([depth_confidence(d, camera, self.settings.confidence) for d in depth]),
             scale_kind="metric",
             keyframes=np.array(keyframes, np.int64),
+            moving=moving,
         )
+
+    def _moving(
+        self,
+        frames: Sequence[Frame],
+        depth: NDArray[np.float32],
+        T_chunk_cam: NDArray[np.float64],
+        posed: NDArray[np.bool_],
+        camera: Camera,
+        hints: Mapping[int, NDArray[np.bool_]],
+    ) -> NDArray[np.uint8] | None:
+        """Number what moves, and take it out of `depth`, in place: what is left is the scene that stays."""
+        small = SmallFrames.of([f.depth for f in frames], T_chunk_cam, posed, camera, self.settings.moving.width)
+        masks = find_moving(small, hints, self.settings.moving)
+        if masks is None:
+            return None
+        times_s = np.array([f.time_s for f in frames])
+        moving = follow_movers(masks, [f.color for f in frames], times_s, small, self.settings.follow)
+        if moving is None:
+            return None
+        for position in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
+            rim = cv2.dilate((moving[position] > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+            full = cv2.resize(rim, None, fx=small.stride, fy=small.stride, interpolation=cv2.INTER_NEAREST)
+            depth[position][full[: camera.height, : camera.width] > 0] = 0.0
+        return moving
 
     def _estimate(
         self, frames: Sequence[Frame], camera: Camera
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int]]:
-        segments = Tracker(frames, camera, self.settings.odometry).run()
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], Mapping[int, NDArray[np.bool_]]]:
+        tracker = Tracker(frames, camera, self.settings.odometry)
+        segments = tracker.run()
         if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
             raise TrackingError(
                 f"no two of the {len(frames)} frames from {frames[0].index} to {frames[-1].index} can be related; "
@@ -81,7 +114,7 @@ class RgbdReconstructor:
         for position, pose in segments[0].T_segment_cam.items():
             T[position], posed[position] = pose, True
         T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
-        return T, posed, segments[0].keyframes
+        return T, posed, segments[0].keyframes, tracker.moving
 
     def _given(
         self, frames: Sequence[Frame], camera: Camera
