@@ -1,151 +1,200 @@
-"""Find places seen before: frame descriptors propose, geometry verifies (paper 3.2 and A.2, first part).
+"""Find places seen before (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
 
-What the paper adds by instances (their semantic and layout agreement, s_sem and s_rel) is to rank the proposals
-between `propose` and `verify`; chunks without metric scale need a joint window for an edge and get none here.
+Frame descriptors propose with a relaxed threshold (`frame_search`); the two chunks' instances add s_sem and s_rel
+(`instance_cues`); what s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel) holds likely is verified by the keyframes'
+features and depth where they have them (`verification`), else by a joint window (`joint_window`); and nothing is
+believed that the way the camera went contradicts (`chain`). Every candidate becomes an edge, accepted or not, with its
+scores and the reason.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from list3r.association.chain import ChainSettings, predict
+from list3r.association.cross_check import Side
+from list3r.association.frame_search import Candidate, DescriptorStore, SearchSettings, find_candidates
+from list3r.association.instance_cues import (
+    NO_CUES,
+    CueSettings,
+    InstanceCues,
+    compare_instances,
+    instance_set,
+    loop_score,
+)
+from list3r.association.joint_window import JointReconstructor, Place, WindowSettings, joint_edge, no_edge
 from list3r.association.verification import VerificationSettings, verify
-from list3r.memory.records import ChunkRow, Edge, Keyframe
+from list3r.frames.base import Camera
+from list3r.memory.chunk_verbs import LocalNode
+from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 
-Floats = NDArray[np.float32]
-
-_FAISS_FROM = 20_000
-"""Stored descriptors from which an index pays for its import."""
+STRICT = 0.85
+"""s_det from which frame similarity alone is believed (VGGT-Long)."""
 
 
 @dataclass(frozen=True)
 class RevisitSettings:
-    """How revisits are proposed."""
+    """How revisits are found."""
 
-    least_cosine: float = 0.05
-    """Least cosine of two frames, after the mean of all stored descriptors is taken out."""
-    exclude_chunks: int = 1
-    """Chunks just before in the same video that are not revisits but neighbours."""
-    suppress_frames: int = 20
-    """A proposal within so many frames of a better one, on both sides, is the same revisit."""
-    per_chunk: int = 12
-    """Most proposals verified for a new chunk."""
-    per_pair: int = 2
-    """Most proposals between two chunks."""
+    instance_cues: bool = True
+    """False: frame similarity alone, at its strict threshold."""
+    verified: bool = True
+    """False: every relation that can be measured is accepted, as in VGGT-Long."""
+    lambda_: float = 0.5
+    """Weight of frame similarity in s_loop (the paper gives none)."""
+    least_score: float = 0.8
+    """Least s_loop of a candidate that is verified, unless its frames alone are alike enough."""
+    verify: int = 12
+    """Most candidates of a chunk that are verified."""
     enough: int = 6
-    """Accepted edges after which no further proposal of a chunk is verified."""
+    """Accepted edges after which no further candidate of a chunk is verified."""
+    search: SearchSettings = field(default_factory=SearchSettings)
+    cues: CueSettings = field(default_factory=CueSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
+    window: WindowSettings = field(default_factory=WindowSettings)
+    chain: ChainSettings = field(default_factory=ChainSettings)
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """Two keyframes that look alike."""
-
-    new: int
-    """Row of the new chunk's keyframe."""
-    stored: int
-    """Row of the stored one."""
-    cosine: float
-
-
-class KeyframeStore(Protocol):
+class KeyframeStore(DescriptorStore, Protocol):
     """What of the memory is read here."""
-
-    def chunks(self, session_id: int | None = None) -> list[ChunkRow]: ...
-
-    def keyframes(self, chunk_id: int) -> list[Keyframe]: ...
 
     def keyframe(self, chunk_id: int, frame_index: int) -> Keyframe: ...
 
-    def keyframe_descriptors(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]: ...
+    def frame_samples(self, chunk_id: int) -> FrameSamples: ...
+
+    def local_nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]: ...
+
+    def feature_space(self, chunk_id: int) -> str: ...
+
+    def edges(self) -> list[Edge]: ...
 
 
-def find_loops(store: KeyframeStore, chunk_id: int, settings: RevisitSettings | None = None) -> list[Edge]:
-    """Loop edges, accepted or rejected, between a chunk and those stored before it."""
+@dataclass(frozen=True)
+class _Scored:
+    """A candidate with what the instances say of it."""
+
+    candidate: Candidate
+    cues: InstanceCues
+    score: float
+    """s_loop."""
+
+
+def find_loops(
+    store: KeyframeStore,
+    chunk_id: int,
+    joint: JointReconstructor | None = None,
+    settings: RevisitSettings | None = None,
+) -> list[Edge]:
+    """Loop edges, accepted or rejected, between a chunk and those stored before it.
+
+    `joint` reconstructs frames of both places together; without one, chunks are compared by their keyframes alone.
+    """
     chosen = settings or RevisitSettings()
-    rows = {c.chunk_id: c for c in store.chunks()}
-    keys, descriptors = store.keyframe_descriptors()
-    if not len(keys):
+    candidates = find_candidates(store, chunk_id, chosen.search)
+    if not candidates:
         return []
-    here = rows[chunk_id]
-    new = keys[:, 0] == chunk_id
-    old = np.array([_is_revisit(here, rows.get(int(k)), chosen) for k in keys[:, 0]], dtype=bool)
-    if not new.any() or not old.any():
-        return []
-    proposals = propose(descriptors[new], keys[new], descriptors[old], keys[old], chosen)
-    keyframes = {k.frame_index: k for k in store.keyframes(chunk_id)}
+    look = _Lookout(store, chunk_id, chosen)
     edges: list[Edge] = []
-    for proposal in proposals:
-        u, frame_u = (int(n) for n in keys[old][proposal.stored])
-        metric = here.scale_kind == rows[u].scale_kind == "metric"
-        keyframe_v = keyframes[int(keys[new][proposal.new][1])]
-        edge = verify(store.keyframe(u, frame_u), keyframe_v, u, chunk_id, metric, chosen.verification)
-        edge.scores["cosine"] = proposal.cosine
-        edges.append(edge)
-        if sum(e.accepted for e in edges) >= chosen.enough:
-            break
+    for n, scored in enumerate(_ranked(candidates, look, chosen)):
+        alone = scored.candidate.s_det >= STRICT
+        if not alone and (scored.score < chosen.least_score or not chosen.instance_cues):
+            edge = look.refused(scored, f"frames and instances are not alike enough (s_loop {scored.score:.2f})")
+        elif n >= chosen.verify or sum(e.accepted for e in edges) >= chosen.enough:
+            edge = look.refused(scored, "not tried: enough better candidates of this chunk were")
+        else:
+            edge = look.verified(scored, joint, [e for e in edges if e.accepted])
+        edges.append(_with_scores(edge, scored))
     return edges
 
 
-def propose(
-    new: Floats,
-    new_keys: NDArray[np.int64],
-    stored: Floats,
-    stored_keys: NDArray[np.int64],
-    settings: RevisitSettings,
-) -> list[Proposal]:
-    """Pairs of frames that look alike, best first: mutual suppression in time, a quota for each pair of chunks.
-
-    Descriptors have shape (N, D), keys (N, 2): chunk id and Frame.index.
-    """
-    mean = stored.mean(axis=0) if len(stored) >= 8 else np.zeros(stored.shape[1], np.float32)
-    rows, columns, cosines = _nearest(_centred(new, mean), _centred(stored, mean), settings)
-    kept: list[Proposal] = []
-    pairs: dict[int, int] = {}
-    for k in np.lexsort((columns, rows, -cosines)):
-        n, s, chunk = int(rows[k]), int(columns[k]), int(stored_keys[columns[k], 0])
-        if cosines[k] < settings.least_cosine or len(kept) >= settings.per_chunk:
-            break
-        if pairs.get(chunk, 0) >= settings.per_pair or any(
-            stored_keys[p.stored, 0] == chunk
-            and abs(int(new_keys[p.new, 1] - new_keys[n, 1])) <= settings.suppress_frames
-            and abs(int(stored_keys[p.stored, 1] - stored_keys[s, 1])) <= settings.suppress_frames
-            for p in kept
-        ):
-            continue
-        kept.append(Proposal(n, s, float(cosines[k])))
-        pairs[chunk] = pairs.get(chunk, 0) + 1
-    return kept
+def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSettings) -> list[_Scored]:
+    """Candidates in order of s_loop, the best of each pair of chunks first."""
+    out = []
+    for candidate in candidates:
+        cues = look.cues(candidate.u) if settings.instance_cues else NO_CUES
+        score = loop_score(candidate.s_det, cues, settings.lambda_) if settings.instance_cues else candidate.s_det
+        out.append(_Scored(candidate, cues, score))
+    return sorted(out, key=lambda s: (-s.score, s.candidate.u, s.candidate.frame_u, s.candidate.frame_v))
 
 
-def _is_revisit(here: ChunkRow, there: ChunkRow | None, settings: RevisitSettings) -> bool:
-    if there is None or there.chunk_id >= here.chunk_id:
-        return False
-    return there.session_id != here.session_id or here.index - there.index > settings.exclude_chunks
+def _with_scores(edge: Edge, scored: _Scored) -> Edge:
+    scores = {
+        "cosine": scored.candidate.cosine,
+        "s_det": scored.candidate.s_det,
+        "s_sem": scored.cues.s_sem,
+        "s_rel": scored.cues.s_rel,
+        "s_loop": scored.score,
+        "pairs": float(len(scored.cues.pairs)),
+    }
+    return replace(edge, scores=edge.scores | scores)
 
 
-def _nearest(
-    new: Floats, stored: Floats, settings: RevisitSettings
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-    """Rows, columns and cosines of the best matches of each new descriptor."""
-    count = min(len(stored), 8 * settings.per_chunk)
-    if len(stored) >= _FAISS_FROM:
-        import faiss
+class _Lookout:
+    """The new chunk, and the stored ones it is compared with, read once each."""
 
-        index = faiss.IndexFlatIP(stored.shape[1])
-        index.add(np.ascontiguousarray(stored))
-        cosines, columns = index.search(np.ascontiguousarray(new), count)
-    else:
-        all_cosines = new @ stored.T
-        columns = np.argsort(-all_cosines, axis=1, kind="stable")[:, :count]
-        cosines = np.take_along_axis(all_cosines, columns, axis=1)
-    rows = np.repeat(np.arange(len(new)), count)
-    return rows, columns.ravel(), cosines.ravel()
+    def __init__(self, store: KeyframeStore, chunk_id: int, settings: RevisitSettings) -> None:
+        self._store = store
+        self._id = chunk_id
+        self._settings = settings
+        self._rows = {c.chunk_id: c for c in store.chunks()}
+        self._sides: dict[int, Side] = {}
+        self._cues: dict[int, InstanceCues] = {}
+        self._edges = store.edges()
 
+    def cues(self, u: int) -> InstanceCues:
+        """How the instances of a stored chunk agree with those of the new one."""
+        if u not in self._cues:
+            here, there = self._side(self._id).instances, self._side(u).instances
+            self._cues[u] = compare_instances(there, here, self._settings.cues)
+        return self._cues[u]
 
-def _centred(descriptors: Floats, mean: Floats) -> Floats:
-    moved = descriptors - mean
-    return np.asarray(moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), np.float32(1e-9)))
+    def refused(self, scored: _Scored, reason: str) -> Edge:
+        """An edge that is kept only for the record."""
+        return no_edge(self._id_of(scored), (self._id, scored.candidate.frame_v), reason)
+
+    def verified(self, scored: _Scored, joint: JointReconstructor | None, found: Sequence[Edge]) -> Edge:
+        """The edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
+        edge = self._measured(scored, joint)
+        if not edge.accepted or not self._settings.verified:
+            return edge
+        way = predict([*self._edges, *found], edge.u, edge.v, self._settings.chain)
+        if way is None:
+            return edge
+        off = way.deviations(edge.S_v_u)
+        edge = replace(edge, scores=edge.scores | {"way": off})
+        if off <= self._settings.chain.most_deviations:
+            return edge
+        reason = f"the way between the chunks contradicts it by {off:.0f} deviations ({edge.reason})"
+        return replace(edge, accepted=False, weight=0.0, reason=reason)
+
+    def _measured(self, scored: _Scored, joint: JointReconstructor | None) -> Edge:
+        c = scored.candidate
+        u, v = self._rows[c.u], self._rows[self._id]
+        edge = None
+        keyframe_u, keyframe_v = self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
+        if all(k.depth_small.size and len(k.keypoints_xy) for k in (keyframe_u, keyframe_v)):
+            metric = u.scale_kind == v.scale_kind == "metric"
+            edge = verify(keyframe_u, keyframe_v, c.u, self._id, metric, self._settings.verification)
+        if joint is None or (edge is not None and edge.accepted):
+            return edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
+        place_u, place_v = self._place(u, c.frame_u), self._place(v, c.frame_v)
+        return joint_edge(joint, place_u, place_v, scored.cues, self._settings.verified, self._settings.window)
+
+    def _place(self, row: ChunkRow, frame: int) -> Place:
+        return Place(row.chunk_id, row.session_id, frame, row.scale_kind == "metric", self._side(row.chunk_id))
+
+    def _side(self, chunk_id: int) -> Side:
+        if chunk_id not in self._sides:
+            row = self._rows[chunk_id]
+            samples, nodes = self._store.frame_samples(chunk_id), self._store.local_nodes([chunk_id])
+            space = self._store.feature_space(chunk_id)
+            instances = instance_set(nodes, samples.T_chunk_cam, space, self._settings.cues)
+            height, width = row.image_size
+            moving = frozenset(n.local_id for n in nodes if n.dynamic)
+            self._sides[chunk_id] = Side(samples, Camera(width, height, *row.intrinsics), instances, moving)
+        return self._sides[chunk_id]
+
+    def _id_of(self, scored: _Scored) -> tuple[int, int]:
+        return scored.candidate.u, scored.candidate.frame_u

@@ -341,11 +341,22 @@ class ChunkVerbs(Connection):
             raise MemoryFileError(f"{self.path} has no keyframe {frame_index} in chunk {chunk_id}")
         return read_keyframe(chunk_id, *rows[0])
 
-    def keyframe_descriptors(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """All keyframes: (chunk id, Frame.index) of shape (K, 2) and descriptors of shape (K, D)."""
-        rows = self._rows("SELECT chunk_id, frame_index, descriptor FROM keyframes ORDER BY chunk_id, frame_index")
+    def keyframe_descriptors(
+        self, chunk_ids: Sequence[int] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Keyframes of some chunks or of all: (chunk id, Frame.index) of shape (K, 2), descriptors of shape (K, D).
+
+        A descriptor of another length than the first one's is left as zeros.
+        """
+        where = "" if chunk_ids is None else f"WHERE chunk_id IN ({','.join(str(int(k)) for k in chunk_ids)})"
+        query = f"SELECT chunk_id, frame_index, descriptor FROM keyframes {where} ORDER BY chunk_id, frame_index"
+        rows = self._rows(query)
         keys = np.array([(r[0], r[1]) for r in rows], dtype=np.int64).reshape(-1, 2)
-        return keys, np.array([np.frombuffer(r[2], "<f4") for r in rows], dtype=np.float32)
+        out = np.zeros((len(rows), len(rows[0][2]) // 4 if rows else 0), np.float32)
+        for k, row in enumerate(rows):
+            if len(row[2]) == 4 * out.shape[1]:
+                out[k] = np.frombuffer(row[2], "<f4")
+        return keys, out
 
     # ------------------------------------------------------------------ local instances
 

@@ -1,0 +1,120 @@
+"""What the edges known so far say of how two chunks lie, and how sure that is: a gate for supposed revisits.
+
+Copies of one room differ in nothing but their place, so no comparison of what was seen tells them apart; the way the
+camera went does. The way is as uncertain as its edges and as each chunk on it is bent; a relation that lies far outside
+of that is refused.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import Sim3, skew
+from list3r.memory.records import Edge
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """How far a chain of edges can be trusted. The deviations are of one chunk on the way, bending included."""
+
+    shift: float = 0.04
+    """Deviation of a shift, as a share of the spread of the edge's points."""
+    turn_deg: float = 2.0
+    log_scale: float = 0.03
+    """Deviation of the logarithm of the scale; none where everything is metric."""
+    most_deviations: float = 6.0
+    """Distance, in deviations, beyond which a relation is refused."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A relation of two chunks by the edges between them."""
+
+    S_v_u: Sim3
+    covariance: Array
+    """Of x in S_true = S_v_u exp(x), u's units. Shape (7, 7)."""
+    hops: int
+
+    def deviations(self, S_v_u: Sim3) -> float:
+        """How many standard deviations away a measured relation is (Mahalanobis distance)."""
+        off = (self.S_v_u.inverse() @ S_v_u).log()
+        return float(np.sqrt(max(float(off @ np.linalg.solve(self.covariance, off)), 0.0)))
+
+
+def predict(edges: Sequence[Edge], u: int, v: int, settings: ChainSettings) -> Prediction | None:
+    """The relation of two chunks along the surest path of accepted edges; None where there is no path."""
+    near: dict[int, list[tuple[int, Edge]]] = {}
+    for edge in sorted((e for e in edges if e.accepted), key=lambda e: (e.u, e.v, e.kind, e.frames or (0, 0))):
+        near.setdefault(edge.u, []).append((edge.v, edge))
+        near.setdefault(edge.v, []).append((edge.u, edge))
+    path = _path(near, u, v)
+    if path is None:
+        return None
+    S, covariance = Sim3.identity(), np.zeros((7, 7))
+    here = u
+    for edge in path:
+        step, noise = _step(edge, here, settings)
+        moved = adjoint(S.inverse())
+        covariance = covariance + moved @ noise @ moved.T
+        S = step @ S
+        here = edge.v if edge.u == here else edge.u
+    return Prediction(S, covariance + 1e-12 * np.eye(7), len(path))
+
+
+def adjoint(S: Sim3) -> Array:
+    """The matrix with S exp(x) S^-1 = exp(Ad x), tangents (rho, omega, sigma). Shape (7, 7)."""
+    out = np.eye(7)
+    out[:3, :3] = S.scale * S.rotation
+    out[:3, 3:6] = skew(S.translation) @ S.rotation
+    out[:3, 6] = -S.translation
+    out[3:6, 3:6] = S.rotation
+    return out
+
+
+def _path(near: dict[int, list[tuple[int, Edge]]], u: int, v: int) -> list[Edge] | None:
+    """The path with the least sum of 1 / confidence (Dijkstra)."""
+    queue: list[tuple[float, int, int]] = [(0.0, u, u)]
+    done: dict[int, int] = {}
+    by: dict[tuple[int, int], Edge] = {}
+    cost = {u: 0.0}
+    while queue:
+        so_far, here, before = heapq.heappop(queue)
+        if here in done:
+            continue
+        done[here] = before
+        if here == v:
+            break
+        for other, edge in near.get(here, []):
+            new = so_far + 1.0 / max(edge.confidence, 0.05)
+            if other not in done and new < cost.get(other, np.inf):
+                cost[other], by[here, other] = new, edge
+                heapq.heappush(queue, (new, other, here))
+    if v not in done:
+        return None
+    out: list[Edge] = []
+    while v != u:
+        out.append(by[done[v], v])
+        v = done[v]
+    return out[::-1]
+
+
+def _step(edge: Edge, here: int, settings: ChainSettings) -> tuple[Sim3, Array]:
+    """The similarity across an edge from the chunk `here`, and its covariance with the bending of one chunk."""
+    spread_v = edge.scores.get("spread", 1.0)
+    spread_u = spread_v / float(edge.S_v_u.scale)
+    forth = here == edge.u
+    spread = spread_u if forth else spread_v
+    weak = 1.0 / max(edge.confidence, 0.2)
+    deviation = np.array([settings.shift * spread] * 3 + [np.deg2rad(settings.turn_deg)] * 3 + [settings.log_scale])
+    noise = np.diag((weak * deviation) ** 2)
+    if edge.covariance is not None:
+        flip = np.eye(7) if forth else adjoint(edge.S_v_u)
+        noise = noise + flip @ edge.covariance @ flip.T
+    return (edge.S_v_u if forth else edge.S_v_u.inverse()), noise
