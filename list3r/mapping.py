@@ -6,43 +6,92 @@ as one that was never interrupted.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
-from list3r.association.alignment import align_overlap
-from list3r.association.pose_graph import optimize
-from list3r.association.revisits import find_loops
+from list3r.association.edges import EdgeSettings, measure_edge
+from list3r.association.joint_window import JointReconstructor
+from list3r.association.pose_graph import GraphSettings, optimize
+from list3r.association.revisits import RevisitSettings, find_loops
+from list3r.frames.base import Camera
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import estimate_gravity, world_from_graph
-from list3r.memory.records import ChunkResult, Edge
+from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.store import Store
 
 
-def add_chunk(store: Store, session_id: int, result: ChunkResult) -> int:
-    """Add one chunk to the memory, all of it or nothing; its id."""
+@dataclass(frozen=True)
+class AssociationSettings:
+    """How chunks become one world."""
+
+    revisits: RevisitSettings = field(default_factory=RevisitSettings)
+    edges: EdgeSettings = field(default_factory=EdgeSettings)
+    graph: GraphSettings = field(default_factory=GraphSettings)
+
+
+def add_chunk(
+    store: Store,
+    session_id: int,
+    result: ChunkResult,
+    joint: JointReconstructor | None = None,
+    settings: AssociationSettings | None = None,
+    *,
+    library: bool = True,
+) -> int:
+    """Add one chunk to the memory, all of it or nothing; its id.
+
+    `joint` makes joint windows of frames of two places, for revisits of chunks without metric scale. Without `library`
+    the chunks are only placed.
+    """
+    chosen = settings or AssociationSettings()
     with store.transaction():
         chunk_id = store.add_chunk(session_id, result)
-        given = store.get_value("poses") == "given"
-        store.add_edges(_edge_of_given_poses(store, session_id) if given else _adjacent_edge(store, session_id, result))
-        if not given:
-            store.add_edges(find_loops(store, chunk_id))
-        place_chunks(store)
-        consolidate(store, chunk_id)
+        if store.get_value("poses") == "given":
+            store.add_edges(_edge_of_given_poses(store, session_id))
+        else:
+            store.add_edges(_adjacent_edge(store, session_id, chosen.edges))
+            store.add_edges(find_loops(store, chunk_id, joint, chosen.revisits))
+        place_chunks(store, chosen.graph)
+        if library:
+            consolidate(store, chunk_id)
     return chunk_id
 
 
-def _adjacent_edge(store: Store, session_id: int, result: ChunkResult) -> list[Edge]:
-    """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it."""
+def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings) -> list[Edge]:
+    """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it.
+
+    What moved between the two is flagged on the way.
+    """
     chunks = store.chunks(session_id)
     if len(chunks) < 2:
         return []
     u, v = chunks[-2], chunks[-1]
     metric = u.scale_kind == v.scale_kind == "metric"
     try:
-        return [align_overlap(store.frame_samples(u.chunk_id), result.samples, u.chunk_id, v.chunk_id, metric=metric)]
+        found = measure_edge(
+            store.frame_samples(u.chunk_id),
+            store.frame_samples(v.chunk_id),
+            u.chunk_id,
+            v.chunk_id,
+            _camera(v),
+            metric,
+            settings,
+            dynamic_u=store.dynamic_locals(u.chunk_id),
+            dynamic_v=store.dynamic_locals(v.chunk_id),
+        )
     except DegenerateError:
         return []
+    for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):
+        store.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
+    return [found.edge]
+
+
+def _camera(chunk: ChunkRow) -> Camera:
+    height, width = chunk.image_size
+    return Camera(width, height, *chunk.intrinsics)
 
 
 def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
@@ -54,13 +103,13 @@ def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
     return [Edge(u, v, "adjacent", Sim3.identity(), 1.0, 1.0, 0, 0.0, True, "both lie in the source's own world")]
 
 
-def place_chunks(store: Store) -> None:
+def place_chunks(store: Store, settings: GraphSettings | None = None) -> None:
     """Optimise the graph, find which way is up, and write where every chunk lies."""
     chunks = store.chunks()
     edges = store.edges()
     metric = all(c.scale_kind == "metric" for c in chunks)
     initial = _graph_poses(store)
-    graph = optimize([c.chunk_id for c in chunks], edges, initial, metric=metric)
+    graph = optimize([c.chunk_id for c in chunks], edges, initial, metric=metric, settings=settings)
     store.add_edges(graph.edges)
     store.place_chunks(graph.S_graph_chunk, graph.components)
     store.set_value("T_world_graph", np.eye(4).tolist())
@@ -69,6 +118,18 @@ def place_chunks(store: Store) -> None:
     store.set_value("T_world_graph", T_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
     store.place_chunks({k: T_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components)
+
+
+def finish_session(
+    store: Store, session_id: int, settings: AssociationSettings | None = None, *, library: bool = True
+) -> None:
+    """Place all chunks once more by all edges, derive the library from that, and mark the session as complete."""
+    chosen = settings or AssociationSettings()
+    with store.transaction():
+        place_chunks(store, chosen.graph)
+        if library:
+            consolidate(store)
+        store.complete_session(session_id)
 
 
 def _graph_poses(store: Store) -> dict[int, Sim3]:
