@@ -86,6 +86,10 @@ class SceneMemory:
         """Surface points of an instance, world coordinates."""
         return self.store.support(instance_id)
 
+    def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a moving (`dynamic`) instance was: seconds (V,) and places in the world (V, 3); nothing for others."""
+        return self.store.track(instance_id)
+
     def nearest(self, target: str | int | Sequence[float] | NDArray[Any], k: int = 5, **filters: Any) -> list[Match]:
         """The k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
 

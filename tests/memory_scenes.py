@@ -82,6 +82,7 @@ def node(
         session_id=1,
         stability=0.9,
         structure=structure,
+        dynamic=False,
         plane=None if plane is None else np.asarray(plane, float),
         feature=(unit / np.linalg.norm(unit)).astype(np.float32),
         support=Support(points, np.full(len(points), 0.8, np.float32), np.tile(np.uint8(rgb), (len(points), 1))),

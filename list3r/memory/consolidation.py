@@ -11,15 +11,16 @@ import numpy as np
 
 from list3r.memory.bodies import Body, aabb_gap
 from list3r.memory.colors import Reference, color_words, main_color
-from list3r.memory.derive import DeriveSettings, Member, Thing, derive_thing, with_agreement
+from list3r.memory.derive import DeriveSettings, Member, Thing, derive_mover, derive_thing, with_agreement
 from list3r.memory.describe import describe
 from list3r.memory.evidence import Evidence, EvidenceSettings, contested, weigh
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.gravity import floor_height
 from list3r.memory.identities import Identities, assign_ids
 from list3r.memory.merging import Key, MergeSettings, PairScores, merge_nodes, pair_scores
+from list3r.memory.moving import Mover, MovingSettings, Tracks, join_movers, without_moving
 from list3r.memory.planes import place_planes
-from list3r.memory.records import ChunkRow, Instance, MergeDecision, Observation, Relation
+from list3r.memory.records import ChunkRow, Instance, MergeDecision, MotionTrack, Observation, Relation
 from list3r.memory.relation_scene import Measured, RelationSettings
 from list3r.memory.relations import relations
 from list3r.memory.settling import Settled, SettlingSettings, settle
@@ -33,6 +34,7 @@ class ConsolidationSettings:
     """How the library is derived from the chunks."""
 
     merging: MergeSettings = field(default_factory=MergeSettings)
+    moving: MovingSettings = field(default_factory=MovingSettings)
     derive: DeriveSettings = field(default_factory=DeriveSettings)
     structure: StructureSettings = field(default_factory=StructureSettings)
     relations: RelationSettings = field(default_factory=RelationSettings)
@@ -71,8 +73,13 @@ def consolidate(
         return ConsolidationReport(0, 0, (), (), 0)
     settled = settle(store, summaries, s.settling)
     chunks = settled.chunks
-    pairs = _known_pairs(store, settled, summaries)
+    motions = {(k, n): track for k, v in summaries.items() for n, track in v.motions.items()}
+    pairs = without_moving(
+        _known_pairs(store, settled, summaries), {k: v.shapes for k, v in summaries.items()}, motions
+    )
     groups, decisions = _partition(chunks, summaries, pairs, s.merging)
+    groups, movers, joined = _with_movers(store, groups, chunks, summaries, motions, s)
+    decisions += joined
     before = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     evidence = weigh(groups, {k: v.shapes for k, v in summaries.items()}, pairs, s.evidence)
     weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
@@ -80,7 +87,7 @@ def consolidate(
     shown = [e.shown(s.evidence, posed) for e in evidence]
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
-    things = _things(store, groups, ids, evidence, chunks, summaries, s)
+    things = _things(store, groups, ids, evidence, chunks, summaries, s, movers)
     things = _with_structure(store, things, chunks, summaries, s)
     _write(store, things, groups, ids, summaries, settled)
     store.replace_relations(None, _relations(store, things, chunks, summaries, s))
@@ -123,12 +130,35 @@ def _partition(
     return sorted(groups), decisions
 
 
+def _with_movers(
+    store: Store,
+    groups: list[list[Key]],
+    chunks: Sequence[ChunkRow],
+    summaries: Mapping[int, ChunkSummary],
+    motions: Mapping[Key, MotionTrack | None],
+    s: ConsolidationSettings,
+) -> tuple[list[list[Key]], dict[Key, Mover], list[MergeDecision]]:
+    """The groups with those that move joined over time, and what is known of them by their first member."""
+    if not motions:
+        return groups, {}, []
+    times = {(f.session_id, f.frame_index): f.time_s for f in store.frames()}
+    return join_movers(
+        groups,
+        {k: v.shapes for k, v in summaries.items()},
+        {c.chunk_id: c.S_world_chunk for c in chunks},
+        {c.chunk_id: c.component for c in chunks},
+        [((k, int(a)), (k, int(b))) for k, v in summaries.items() for a, b in v.cannot_link],
+        Tracks(motions, times),
+        s.moving,
+    )
+
+
 def _known_pairs(
     store: Store, settled: Settled, summaries: Mapping[int, ChunkSummary]
 ) -> dict[tuple[int, int], PairScores]:
     """Scores of all pairs of chunks of one component that lie near each other; what stays is not compared again."""
     known = _scored.setdefault(store, {})
-    checks = {k: crc.to_bytes(4, "big") for k, crc in store.chunk_checksums().items()}
+    checks = {k: crc.to_bytes(4, "big") for k, crc in store.node_checksums().items()}
     chunks = settled.chunks
     slack = 0.5 * _FAR_M * world_unit(chunks, summaries)
     extent = {c.chunk_id: _extent(summaries[c.chunk_id], c.S_world_chunk, slack) for c in chunks}
@@ -175,10 +205,11 @@ def _things(
     chunks: Sequence[ChunkRow],
     summaries: Mapping[int, ChunkSummary],
     s: ConsolidationSettings,
+    movers: Mapping[Key, Mover],
 ) -> list[Thing]:
     rows = {c.chunk_id: c for c in chunks}
     placed = {c.chunk_id: c.S_world_chunk for c in chunks}
-    checks = store.chunk_checksums()
+    checks = store.node_checksums()
     upright = _gravity_known(store)
     first = min(c.component for c in chunks)
     shapes = {k: v.shapes for k, v in summaries.items()}
@@ -194,9 +225,16 @@ def _things(
         members = [Member(shapes[k], _at(summaries, (k, n)), placed[k], dropped[k]) for k, n in group]
         poses = tuple((checks[k], placed[k].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
         cuts = b"".join(np.packbits(m.dropped[slice(*m.span)]).tobytes() for m in members)
-        key: tuple[object, ...] = (instance_id, component, up, tuple(group), poses, cuts)
+        mover = movers.get(group[0])
+        key: tuple[object, ...] = (instance_id, component, up, tuple(group), poses, cuts, mover)
         if key not in before:
-            thing = derive_thing(instance_id, members, component, upright=up, settings=s.derive)
+            if mover is None:
+                thing = derive_thing(instance_id, members, component, upright=up, settings=s.derive)
+            else:
+                last = [m for m, k in zip(members, group, strict=True) if k in mover.last]
+                thing = derive_mover(
+                    instance_id, members, last, component, resting=mover.resting, upright=up, settings=s.derive
+                )
             known[key] = replace(thing, body=replace(thing.body, stamp=next(_stamps)))
         else:
             known[key] = before[key]
@@ -216,7 +254,7 @@ def _with_structure(
     kinds: dict[int, str | None] = {}
     for component in sorted({c.component for c in chunks}):
         inside = [c for c in chunks if c.component == component]
-        bodies = [t.body for t in things if t.body.component == component]
+        bodies = [t.body for t in things if t.body.component == component and not t.dynamic]
         if _gravity_known(store) and component == min(c.component for c in chunks):
             unit = world_unit(inside, summaries)
             cameras = cameras_of(store, inside).translation
@@ -226,7 +264,7 @@ def _with_structure(
         else:
             found = flagged_only(bodies)
         kinds.update(zip((b.id for b in bodies), found, strict=True))
-    return [replace(t, body=replace(t.body, structure=kinds[t.body.id])) for t in things]
+    return [replace(t, body=replace(t.body, structure=kinds.get(t.body.id))) for t in things]
 
 
 def _relations(
@@ -241,7 +279,7 @@ def _relations(
     out: list[Relation] = []
     cache = Measured(_measured.get(store, {}))
     for component in sorted({c.component for c in chunks}):
-        bodies = [t.body for t in things if t.body.component == component]
+        bodies = [t.body for t in things if t.body.component == component and t.resting]
         vertical = _gravity_known(store) and component == first
         out += relations(bodies, gravity_known=vertical, unit=unit, settings=s.relations, measured=cache)
     _measured[store] = cache.used
@@ -301,6 +339,7 @@ def _record(
     name, rgb = main_color(thing.swatches, light)
     color = color_words(thing.swatches, light)
     words = describe(thing.shape, color, body.box.size, unit, metric=metric, structure=body.structure)
+    words = words if thing.resting else f"moving {words}"
     return Instance(
         id=body.id,
         label=label,
@@ -318,6 +357,7 @@ def _record(
         color_name=name,
         component=body.component,
         best_view=thing.best_view,
+        dynamic=thing.dynamic,
     )
 
 

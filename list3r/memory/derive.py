@@ -77,6 +77,10 @@ class Thing:
     """Its shape in a word, see `memory.describe`."""
     swatches: tuple[Swatch, ...]
     """Its colours, the commonest first."""
+    dynamic: bool = False
+    """Whether it was seen moving; its body is then where it was last."""
+    resting: bool = True
+    """Whether it stands still there, so that it has relations."""
 
 
 def derive_thing(
@@ -123,6 +127,22 @@ def derive_thing(
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
     return Thing(body, unit_feature, tuple(frames), view, certainty, anchor, shape, colors)
+
+
+def derive_mover(
+    instance_id: int,
+    members: Sequence[Member],
+    last: Sequence[Member],
+    component: int,
+    *,
+    resting: bool,
+    upright: bool,
+    settings: DeriveSettings,
+) -> Thing:
+    """The same of a thing that moves: all that was seen of it, at the place that its `last` members show."""
+    whole = derive_thing(instance_id, members, component, upright=upright, settings=settings)
+    now = derive_thing(instance_id, last, component, upright=upright, settings=settings)
+    return replace(whole, body=now.body, anchor=now.anchor, shape=now.shape, dynamic=True, resting=resting)
 
 
 def _metre(members: Sequence[Member]) -> float:

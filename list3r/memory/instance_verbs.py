@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.chunk_verbs import ChunkVerbs
 from list3r.memory.codec import dequantise, raw_array, to_json
 from list3r.memory.errors import UnknownIdError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import BestView, Instance, MergeDecision, Observation, Relation, Support
 
 _COLUMNS = (
@@ -121,21 +121,63 @@ class InstanceVerbs(ChunkVerbs):
             np.concatenate([s.rgb for _, s in parts]) if parts else np.zeros((0, 3), np.uint8),
         )
 
+    def node_checksums(self) -> dict[int, int]:
+        """A checksum, by chunk id, of what each chunk measured and of which of its local instances move."""
+        out = self.chunk_checksums()
+        query = (
+            "SELECT chunk_id, local_id, length(motion) FROM local_instances WHERE dynamic ORDER BY chunk_id, local_id"
+        )
+        for chunk_id, local_id, length in self._rows(query):
+            out[chunk_id] = (out[chunk_id] * 31 + 7919 * (local_id + 1) + (length or 0)) & 0xFFFFFFFF
+        return out
+
+    def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a moving instance was: seconds of shape (V,) and places in the world of shape (V, 3), in order of time.
+
+        Frames that two chunks saw count once, at the mean of what they say. In frames in which it stood still for a
+        whole chunk the middle of its surface is its place. Nothing for an instance that was never seen moving.
+        """
+        resolved = self.resolve(instance_id)
+        empty = np.zeros(0), np.zeros((0, 3))
+        if not self.instance(resolved).dynamic:
+            return empty
+        chunks = {c.chunk_id: c for c in self.chunks()}
+        moving: dict[tuple[int, int], list[NDArray[np.float64]]] = {}
+        still: dict[tuple[int, int], list[NDArray[np.float64]]] = {}
+        for o in self.observations(resolved):
+            chunk, motion = chunks[o.chunk_id], self.motion_track(o.chunk_id, o.local_id)
+            if motion is not None and len(motion.frames):
+                frames, places, found = motion.frames, chunk.S_world_chunk.apply(motion.positions), moving
+            else:
+                frames = self.mask_track(o.chunk_id, o.local_id).frames
+                places, found = np.tile(self._middle(o, chunk.S_world_chunk), (len(frames), 1)), still
+            for frame, place in zip(frames.tolist(), places, strict=True):
+                found.setdefault((chunk.session_id, frame), []).append(place)
+        seen = {**still, **moving}
+        times = {(f.session_id, f.frame_index): f.time_s for f in self.frames()}
+        keys = [k for k in sorted(seen) if k in times]
+        if not keys:
+            return empty
+        return np.array([times[k] for k in keys]), np.array([np.mean(seen[k], axis=0) for k in keys])
+
+    def _middle(self, observation: Observation, S_world_chunk: Sim3) -> NDArray[np.float64]:
+        """Middle of the surface of one local instance, world. Shape (3,)."""
+        query = (
+            "SELECT chunk_id, local_id, count, grid, points, confidence, rgb FROM supports"
+            " WHERE chunk_id = ? AND local_id = ?"
+        )
+        rows = self._rows(query, (observation.chunk_id, observation.local_id))
+        points = _support_part(rows[0])[1].points if rows else np.zeros((0, 3), np.float32)
+        if len(points) == 0:
+            return np.full(3, np.nan)
+        return np.asarray(np.quantile(S_world_chunk.apply(points), [0.02, 0.98], axis=0).mean(axis=0))
+
     def _support_parts(self, instance_id: int) -> list[tuple[int, Support]]:
         query = (
             "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb FROM observations o"
             " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
         )
-        parts = []
-        for chunk_id, local_id, count, grid, points, weight, rgb in self._rows(query, (instance_id,)):
-            where = f"the support of local instance {chunk_id}:{local_id}"
-            support = Support(
-                dequantise(grid, points, count, where),
-                raw_array(weight, "u1", (count,), where).astype(np.float32) / 255.0,
-                raw_array(rgb, "u1", (count, 3), where).copy(),
-            )
-            parts.append((chunk_id, support))
-        return parts
+        return [_support_part(row) for row in self._rows(query, (instance_id,))]
 
     # ------------------------------------------------------------------ embeddings
 
@@ -204,6 +246,18 @@ class InstanceVerbs(ChunkVerbs):
         """The merge log, oldest first."""
         query = "SELECT kind, a, b, scores, reason FROM merges ORDER BY entry"
         return [MergeDecision(r[0], r[1], r[2], json.loads(r[3]), r[4]) for r in self._rows(query)]
+
+
+def _support_part(row: tuple[Any, ...]) -> tuple[int, Support]:
+    """(chunk id, support in chunk coordinates) of a row of `supports`."""
+    chunk_id, local_id, count, grid, points, weight, rgb = row
+    where = f"the support of local instance {chunk_id}:{local_id}"
+    support = Support(
+        dequantise(grid, points, count, where),
+        raw_array(weight, "u1", (count,), where).astype(np.float32) / 255.0,
+        raw_array(rgb, "u1", (count, 3), where).copy(),
+    )
+    return chunk_id, support
 
 
 def _instance_row(instance: Instance) -> tuple[object, ...]:

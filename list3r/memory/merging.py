@@ -243,11 +243,11 @@ def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
         at_u, at_v = np.flatnonzero(frames_u == frame), np.flatnonzero(frames_v == frame)
         cell = np.ix_(owner_u[at_u], owner_v[at_v])
         count[cell] += 1
-        total[cell] += _box_iou(boxes_u[at_u], boxes_v[at_v])
+        total[cell] += box_iou(boxes_u[at_u], boxes_v[at_v])
     return count, total / np.maximum(count, 1)
 
 
-def _box_iou(a: Array, b: Array) -> Array:
+def box_iou(a: Array, b: Array) -> Array:
     """IoU of boxes xyxy. Shape (A, 4), (B, 4) -> (A, B)."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])

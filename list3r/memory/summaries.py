@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from list3r.memory.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.planes import Planes, chunk_planes
-from list3r.memory.records import ChunkRow
+from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.shapes import ChunkShapes, ShapeSettings, chunk_shapes
 from list3r.memory.store import Store
 
@@ -36,6 +36,8 @@ class ChunkSummary:
     """What a metre is in chunk units: 1 for a metric chunk."""
     lab: Array
     """Colours of a sample of all its points, CIE L*a*b*. Shape (C, 3)."""
+    motions: dict[int, MotionTrack | None]
+    """The local instances that move, by local id, and where they were; what bounds a room never does."""
 
 
 _cache: WeakKeyDictionary[Store, dict[int, tuple[int, ChunkSummary]]] = WeakKeyDictionary()
@@ -43,7 +45,7 @@ _cache: WeakKeyDictionary[Store, dict[int, tuple[int, ChunkSummary]]] = WeakKeyD
 
 def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> dict[int, ChunkSummary]:
     """The summaries of all chunks by id. They depend on what the chunks measured, not on where they are placed."""
-    checks = store.chunk_checksums()
+    checks = store.node_checksums()
     known = _cache.setdefault(store, {})
     for chunk_id in [k for k, (crc, _) in known.items() if checks.get(k) != crc]:
         del known[chunk_id]
@@ -59,7 +61,9 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
     lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
-    return ChunkSummary(shapes, planes, store.cannot_links(chunk.chunk_id), unit, lab)
+    moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
+    motions = {n: store.motion_track(chunk.chunk_id, n) for n in moves}
+    return ChunkSummary(shapes, planes, store.cannot_links(chunk.chunk_id), unit, lab, motions)
 
 
 def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
