@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from list3r.simulation.layout import Placer, Room
-from list3r.simulation.rooms import HALF_WALL_M, Door, RoomPlan, make_catalogue, make_room, moved
+from list3r.simulation.rooms import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, make_room, moved
 from list3r.simulation.things import Thing
 from list3r.simulation.world import World
 
@@ -159,16 +159,10 @@ def _place(
         origin, turn = (x, corridor_width + _GAP_M), 0.0
     offset = len(things)
     placed = [moved(thing, *origin, turn, offset) for thing in parts]
-    things += [replace(t, structure=p.structure) for t, p in zip(placed, parts, strict=True)]
+    things += placed
     sign = -1.0 if south else 1.0
     corners = sorted([origin[0], origin[0] + sign * plan.width]), sorted([origin[1], origin[1] + sign * plan.depth])
-    middles = {
-        "south": lambda at: (at, -HALF_WALL_M),
-        "north": lambda at: (at, plan.depth + HALF_WALL_M),
-        "west": lambda at: (-HALF_WALL_M, at),
-        "east": lambda at: (plan.width + HALF_WALL_M, at),
-    }
-    local = [middles[door.side](door.at) for door in plan.doors if not door.closed]
+    local = [door_middle(plan, door) for door in plan.doors if not door.closed]
     doorways = tuple((origin[0] + sign * a, origin[1] + sign * b) for a, b in local)
     kind, _, twin = name.partition("#")
     (x0, x1), (y0, y1) = corners

@@ -19,16 +19,17 @@ Floats = NDArray[np.float32]
 class DepthErrorSettings:
     """Errors of depth as shares of it, and confidence."""
 
-    noise: float = 0.008
+    noise: float = 0.006
     """Deviation of depth near the camera."""
-    noise_per_m: float = 0.004
+    noise_per_m: float = 0.005
     """Growth of the deviation with depth, 1/m."""
     patch_share: float = 0.7
     """Share of the noise's deviation that comes in patches over the picture and lasts over frames; the rest is the
     pixel's own."""
     bland: float = 0.025
-    """Deviation of an error in wide patches over walls, floors and ceilings, which offer little to match, and of which
-    the confidence knows nothing."""
+    """Deviation of an error in wide patches over walls, floors and ceilings, which offer little to match."""
+    bland_known: float = 0.4
+    """Share of that error that the confidence goes by: it is mostly wrong and confident."""
     flying_share: float = 0.35
     """Share of the pixels beside a jump of depth that float between its sides."""
     jump: float = 0.05
@@ -39,11 +40,11 @@ class DepthErrorSettings:
     """Deviation of the logarithm of the focal length that goes with a chunk."""
     half_error: float = 0.03
     """Relative error at which confidence is one half."""
-    knowing: float = 0.5
+    knowing: float = 0.6
     """Share in the confidence of the true error; the rest comes from the error to be expected there."""
     confidence_noise: float = 0.35
     """Deviation of the logarithm of the error that the confidence goes by."""
-    doubted_share: float = 0.45
+    doubted_share: float = 0.35
     """Share of the things in a chunk that are right and yet doubted (chairs and tables from a new side)."""
     doubted_factor: tuple[float, float] = (0.08, 0.8)
     """Median and deviation of the logarithm of the factor on their confidence."""
@@ -66,10 +67,10 @@ def wrong_depth(
     floating, at_jump = _floating(depth, settings, rng)
     error = np.where(floating != 0, floating, error)
     expected = np.where(at_jump, 2 * settings.jump, sigma)
-    bland = settings.bland * patches(frames, depth.shape[1:], (3, 4), settings, rng)
-    factor = np.maximum(1 + error, 0.2) * np.where(structure_mask(video, frames), np.exp(bland), 1.0)
+    bland = settings.bland * patches(frames, depth.shape[1:], (3, 4), settings, rng) * structure_mask(video, frames)
+    factor = np.maximum(1 + error, 0.2) * np.exp(bland)
     mist = patches(frames, depth.shape[1:], (6, 8), settings, rng)
-    felt = settings.knowing * np.abs(error) + (1 - settings.knowing) * expected
+    felt = settings.knowing * np.abs(error + settings.bland_known * bland) + (1 - settings.knowing) * expected
     felt = felt * np.exp(settings.confidence_noise * mist)
     confidence = 1 / (1 + (felt / settings.half_error) ** 2) * _doubt(video, frames, settings, rng)
     return factor.astype(np.float32), np.where(depth > 0, confidence, 0).astype(np.float32)

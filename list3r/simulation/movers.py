@@ -17,6 +17,10 @@ from list3r.simulation.things import Thing
 
 Array = NDArray[np.float64]
 
+_DECIDE_S = 0.4
+_HASTE_M_S = 1.3
+"""Speed above which a person does not like to walk."""
+
 
 @dataclass(frozen=True)
 class Mover:
@@ -38,7 +42,9 @@ def make_movers(
     person = Mover(Thing(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw))
     size = (float(rng.uniform(0.36, 0.46)), float(rng.uniform(0.28, 0.36)), float(rng.uniform(0.26, 0.36)))
     carton = f.carton(size, p.bright("stripes", 0.4), p.bright("plain", 0.3))
-    return person, Mover(Thing(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(xy, yaw, fps, rng))
+    return person, Mover(
+        Thing(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(free, T_world_cam, xy, yaw, fps, rng)
+    )
 
 
 def upright_poses(xy: Array, z: Array, yaw: Array) -> Array:
@@ -72,30 +78,72 @@ def _slow(rng: np.random.Generator, frames: int, period: float) -> Array:
 
 
 def _stroll(free: FreeMap, T_world_cam: Array, fps: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Place and turn of a person who keeps before the camera most of the time. Shapes (F, 2) and (F,)."""
+    """Place and turn of a person who keeps before the camera most of the time. Shapes (F, 2) and (F,).
+
+    Every 0.4 s the person can be at places of some bearings and distances before the camera; the way through them
+    that strays least from a slowly changing wish, without haste and not through walls, is found by Viterbi's method.
+    """
     frames = len(T_world_cam)
-    forward = T_world_cam[:, :2, 2]
-    heading = gaussian_filter1d(np.unwrap(np.arctan2(forward[:, 1], forward[:, 0])), 0.8 * fps, mode="nearest")
-    bearing = heading + np.deg2rad(20) * _slow(rng, frames, 3 * fps)
-    away = np.clip(1.9 + 0.45 * _slow(rng, frames, 4 * fps), 1.15, 3.2)
-    wish = T_world_cam[:, :2, 3] + away[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    xy = free.snap(gaussian_filter1d(wish, 0.5 * fps, axis=0, mode="nearest"))
-    xy = gaussian_filter1d(xy, 0.4 * fps, axis=0, mode="nearest")
-    step = np.gradient(gaussian_filter1d(xy, 0.5 * fps, axis=0, mode="nearest"), axis=0)
+    every = max(1, round(_DECIDE_S * fps))
+    keys = np.unique(np.append(np.arange(0, frames, every), frames - 1))
+    eye, forward = T_world_cam[keys, :2, 3], T_world_cam[keys, :2, 2]
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    wish = np.stack([np.deg2rad(16) * _slow(rng, len(keys), 8), 1.55 + 0.4 * _slow(rng, len(keys), 10)], axis=1)
+    bearing, away = np.meshgrid(np.deg2rad(np.arange(-60, 61, 12)), np.arange(1.0, 3.3, 0.25))
+    bearing, away = bearing.ravel(), away.ravel()
+    angle = heading[:, None] + bearing
+    places = eye[:, None] + away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    strays = ((bearing - wish[:, :1]) / 0.25) ** 2 + ((away - wish[:, 1:]) / 0.4) ** 2
+    blocked = free.crosses_wall(eye[:, None], places)
+    tight = np.maximum(0.3 - free.clearance(places), 0) / 0.1
+    chosen = _viterbi(free, places, strays + 60.0 * blocked + 4 * tight**2, np.diff(keys) / fps)
+    xy = np.stack([np.interp(np.arange(frames), keys, chosen[:, k]) for k in range(2)], axis=1)
+    xy = gaussian_filter1d(xy, 0.35 * fps, axis=0, mode="nearest")
+    step = np.gradient(gaussian_filter1d(xy, 0.4 * fps, axis=0, mode="nearest"), axis=0)
     yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0])) - np.pi / 2
     return np.asarray(xy), gaussian_filter1d(yaw, 0.4 * fps, mode="nearest")
 
 
-def _carried(xy: Array, yaw: Array, fps: float, rng: np.random.Generator) -> Array:
-    """A carton that stands on the floor until the person lifts it, and is then carried before the body."""
+def _viterbi(free: FreeMap, places: Array, cost: Array, seconds: Array) -> Array:
+    """The cheapest way through one place of each row. `places` (K, S, 2), `cost` (K, S), `seconds` (K - 1,)."""
+    total, back = cost[0], []
+    for k in range(1, len(places)):
+        a, b = places[k - 1][:, None], places[k][None]
+        haste = np.linalg.norm(b - a, axis=2) / seconds[k - 1]
+        move = 2.0 * haste**2 + 40.0 * np.maximum(haste - _HASTE_M_S, 0) + 200.0 * free.crosses_wall(a, b)
+        through = total[:, None] + move
+        back.append(through.argmin(axis=0))
+        total = through.min(axis=0) + cost[k]
+    state = [int(total.argmin())]
+    for choice in reversed(back):
+        state.append(int(choice[state[-1]]))
+    return np.asarray(places[np.arange(len(places)), state[::-1]])
+
+
+def _carried(free: FreeMap, T_world_cam: Array, xy: Array, yaw: Array, fps: float, rng: np.random.Generator) -> Array:
+    """A carton that stands on the floor, is lifted by the person before the camera, carried, and set down elsewhere."""
     frames = len(xy)
-    lift = int(frames * rng.uniform(0.35, 0.55))
-    reach = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * 0.34
-    held = xy + reach
+    held = xy + np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * 0.34
+    lifts = np.arange(int(0.25 * frames), int(0.6 * frames), 10)
+    shown = [_views(free, T_world_cam[max(0, k - 200) : k + 1 : 4], held[k]) for k in lifts]
+    best = np.argsort(-np.array(shown), kind="stable")[:5]
+    lift = int(lifts[best[rng.integers(len(best))]])
+    put = min(lift + int(rng.integers(16, 30) * fps), frames - 1)
     share = np.clip((np.arange(frames) - lift) / (0.8 * fps), 0, 1)
+    share = share * np.clip((put - np.arange(frames)) / (0.8 * fps), 0, 1)
     share = share * share * (3 - 2 * share)
-    place = held[lift] + share[:, None] * (held - held[lift])
-    return upright_poses(place, 0.95 * share, np.where(share > 0, yaw, yaw[lift]))
+    moment = np.clip(np.arange(frames), lift, put)
+    return upright_poses(held[moment], 0.95 * share, yaw[moment])
+
+
+def _views(free: FreeMap, T_world_cam: Array, xy: Array) -> int:
+    """How many of the cameras see a place on the floor, as far as walls tell."""
+    offset = xy - T_world_cam[:, :2, 3]
+    away = np.linalg.norm(offset, axis=1)
+    along = np.einsum("nk,nk->n", offset, T_world_cam[:, :2, 2])
+    across = np.abs(offset[:, 0] * T_world_cam[:, 1, 2] - offset[:, 1] * T_world_cam[:, 0, 2])
+    ahead = (along > 1.6) & (across < 0.45 * along) & (away < 4.5)
+    return int((ahead & ~free.crosses_wall(T_world_cam[:, :2, 3], xy[None])).sum())
 
 
 def moved_thing(mover: Mover, frame: int) -> Thing:

@@ -12,16 +12,19 @@ from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
 from list3r.simulation.buildings import Building, BuildingSettings, appearance_classes, make_building
 from list3r.simulation.casting import Caster
+from list3r.simulation.covisibility import shared_view
 from list3r.simulation.movers import Mover, make_movers
 from list3r.simulation.routes import Director, FreeMap, View, mapped_view
 from list3r.simulation.video import MoverTruth, SimulatedVideo
-from list3r.simulation.walk import PathSettings, camera_path
+from list3r.simulation.walk import PathSettings, camera_path, looking_at
 from list3r.simulation.world import Stop
 
 Array = NDArray[np.float64]
 
 _FURNISHED = ("living room", "bedroom", "office", "kitchen", "meeting room", "storage")
 _FPS = 12.5
+_BEFORE_CUT = (1, 10, 20)
+"""Frames before a cut whose views must share nothing with the view after it."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,10 @@ class _Take:
         director.path = self.path
 
 
+_SOMETIMES_FAST = ("loop", "kidnap", "twins")
+"""Presets of which every third seed has a camera that turns nearly twice as fast."""
+
+
 def preset_names() -> tuple[str, ...]:
     """Names that `make_video` knows."""
     return tuple(_PRESETS)
@@ -86,6 +93,8 @@ def make_shot(preset: str, seed: int, movers: bool = True) -> Shot:
     path = replace(
         pace, speed_m_s=pace.speed_m_s * rng.uniform(0.85, 1.15), turn_deg_s=pace.turn_deg_s * rng.uniform(0.8, 1.3)
     )
+    if preset in _SOMETIMES_FAST and rng.uniform() < 0.35:
+        path = replace(path, turn_deg_s=1.9 * path.turn_deg_s)
     take = _Take(building, FreeMap(building), rng, path, float(rng.uniform(1.35, 1.6)))
     film(take)
     poses = np.concatenate(take.poses)
@@ -157,8 +166,9 @@ def _big_rooms(rng: np.random.Generator) -> BuildingSettings:
 
 
 def _ring(rng: np.random.Generator) -> BuildingSettings:
-    kinds = _kinds(rng, 6)
-    return BuildingSettings(tuple(kinds[:3]), tuple(kinds[3:]), linked=True)
+    north, south = ((3, 3), (4, 2), (3, 2), (4, 3), (4, 0), (5, 0))[int(rng.integers(6))]
+    kinds = _kinds(rng, north + south)
+    return BuildingSettings(tuple(kinds[:north]), tuple(kinds[north:]), linked=True)
 
 
 def _floor(rng: np.random.Generator) -> BuildingSettings:
@@ -215,7 +225,7 @@ def _film_calm(take: _Take) -> None:
 def _film_loop(take: _Take) -> None:
     """Through one row of rooms, back through the other and the corridor, then once more where the way began."""
     rows = [take.building.north, take.building.south]
-    if take.rng.integers(2):
+    if take.rng.integers(2) and rows[1]:
         rows.reverse()
     there, back = rows[0], rows[1][::-1]
     if take.rng.integers(2):
@@ -245,37 +255,67 @@ def _film_kidnap(take: _Take) -> None:
     director, k = take.director(), 0
     for run, length in enumerate(lengths):
         if run:
-            director = _jump(take, rooms)
+            director = _jump(take)
         while director.seconds() * take.path.fps < length:
             director.film(director.plan_views(rooms[k % len(rooms)], 2, 140.0))
             k += 1
         take.shoot(director, length)
 
 
-def _jump(take: _Take, rooms: tuple[object, ...]) -> Director:
-    """A director who begins where the camera was at least 250 frames ago, in another room than now, near that view."""
+def _jump(take: _Take) -> Director:
+    """A director who begins near a view filmed at least 250 frames ago that shares nothing with the present view."""
     poses = np.concatenate(take.poses)
-    building, director = take.building, take.director()
-    now = building.room_at(*poses[-1, :2, 3])
-    earlier = [
-        int(f)
-        for f in take.rng.permutation(max(len(poses) - 250, 1))
-        if (r := building.room_at(*poses[f, :2, 3])) is not None and r is not now and r.kind != "corridor"
-    ]
-    frame = earlier[0]
-    room = building.room_at(*poses[frame, :2, 3])
+    glimpse = _Glimpse(take)
+    now = poses[[-k for k in _BEFORE_CUT]]
+    director, best = take.director(), None
+    for frame in take.rng.permutation(len(poses) - 250):
+        view = _near_view(take, director, poses, int(frame))
+        if view is None:
+            continue
+        then = looking_at((*view.xy, take.eye_m), view.targets[0])[None]
+        if glimpse.common(then, now).max() > 0:
+            continue
+        best = best or view
+        if glimpse.common(then, poses[[frame]])[0, 0] > 0.4:
+            best = view
+            break
+    assert best is not None, "some room other than the present one has been filmed"
+    room = take.building.room_at(*best.xy)
     assert room is not None
-    seen = [
-        _looked_at(poses[g], room.x0, room.x1, room.y0, room.y1)
-        for g in (frame, min(frame + 12, len(poses) - 1), min(frame + 24, len(poses) - 1))
-    ]
+    director.look(best)
+    director.film(director.plan_views(room, 1, 140.0))
+    return director
+
+
+class _Glimpse:
+    """Small pictures of a building, to tell which views overlap."""
+
+    def __init__(self, take: _Take) -> None:
+        self._camera = preset_camera((32, 24))
+        self._caster = Caster(take.building.world.things, self._camera)
+
+    def common(self, T_world_a: Array, T_world_b: Array) -> NDArray[np.float32]:
+        """Share of the picture that views have in common, the lesser of both directions. Shape (A, B)."""
+        depth_a, depth_b = (np.stack([self._caster.cast(T)[0] for T in poses]) for poses in (T_world_a, T_world_b))
+        forth = shared_view(depth_a, T_world_a, depth_b, T_world_b, self._camera)
+        back = shared_view(depth_b, T_world_b, depth_a, T_world_a, self._camera)
+        return np.minimum(forth, back.T)
+
+
+def _near_view(take: _Take, director: Director, poses: Array, frame: int) -> View | None:
+    """What was looked at from some frame on, from another place in that room; None in corridors and doorways."""
+    room = take.building.room_at(*poses[frame, :2, 3])
+    if room is None or room.kind == "corridor":
+        return None
+    later = [min(frame + k, len(poses) - 1) for k in (0, 12, 24)]
+    seen = [_looked_at(poses[g], room.x0, room.x1, room.y0, room.y1) for g in later]
     places = director.free.open_places(room, 0.35)
     gap = np.linalg.norm(places - poses[frame, :2, 3], axis=1)
     good = places[(gap > 0.3) & (gap < 1.3) & (np.linalg.norm(places - np.array(seen[0][:2]), axis=1) > 1.2)]
-    spot = good[take.rng.integers(len(good))] if len(good) else director.free.snap(poses[frame, :2, 3])[0]
-    director.look(View((float(spot[0]), float(spot[1])), tuple(seen)))
-    director.film(director.plan_views(room, 1, 140.0))
-    return director
+    if not len(good):
+        return None
+    spot = good[take.rng.integers(len(good))]
+    return View((float(spot[0]), float(spot[1])), tuple(seen))
 
 
 def _looked_at(pose: Array, x0: float, x1: float, y0: float, y1: float) -> tuple[float, float, float]:

@@ -48,6 +48,17 @@ class RoomPlan:
     windows: int = 1
 
 
+def door_middle(plan: RoomPlan, door: Door) -> tuple[float, float]:
+    """The middle of an opening on the outer face of its wall, in the room's coordinates."""
+    t = HALF_WALL_M
+    return {
+        "south": (door.at, -t),
+        "north": (door.at, plan.depth + t),
+        "west": (-t, door.at),
+        "east": (plan.width + t, door.at),
+    }[door.side]
+
+
 @dataclass(frozen=True)
 class Catalogue:
     """What a building has bought many of: these things look alike wherever they stand."""
@@ -184,12 +195,19 @@ def moved(thing: Thing, x: float, y: float, yaw: float, id_offset: int = 0) -> T
     """The thing after a turn about the origin and a shift; its id and those it names rise by `id_offset`."""
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     px, py, pz = thing.position
-    links = {
-        name: None if getattr(thing, name) is None else getattr(thing, name) + id_offset
-        for name in ("support", "container", "attached")
-    }
     at = (x + c * px - s * py, y + s * px + c * py, pz)
-    return replace(thing, id=thing.id + id_offset, position=at, yaw=float(thing.yaw + yaw), **links)
+    support, container, attached = (
+        None if other is None else other + id_offset for other in (thing.support, thing.container, thing.attached)
+    )
+    return replace(
+        thing,
+        id=thing.id + id_offset,
+        position=at,
+        yaw=float(thing.yaw + yaw),
+        support=support,
+        container=container,
+        attached=attached,
+    )
 
 
 def _footprint(x: float, y: float, yaw_deg: float, width: float, depth: float) -> tuple[float, float, float, float]:

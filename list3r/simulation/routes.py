@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from list3r.simulation.buildings import Building, PlacedRoom
@@ -72,6 +72,15 @@ class FreeMap:
         cell = self.cells(xy)
         return np.asarray(self.clearance_m[cell[..., 0], cell[..., 1]])
 
+    def crosses_wall(self, a: Array, b: Array) -> NDArray[np.bool_]:
+        """Whether the straight way between places is barred. Shapes (..., 2), broadcast -> (...)."""
+        a, b = np.broadcast_arrays(a, b)
+        barred = np.zeros(a.shape[:-1], dtype=bool)
+        for share in np.linspace(0, 1, 9):
+            cell = self.cells(a + share * (b - a))
+            barred |= ~self._passable[cell[..., 0], cell[..., 1]]
+        return barred
+
     def open_places(self, room: PlacedRoom, least_m: float) -> Array:
         """Middles of a room's cells with that clearance, or the roomiest hundred. Shape (N, 2)."""
         rows, columns = np.indices(self.clearance_m.shape)
@@ -93,7 +102,7 @@ class FreeMap:
         """A smooth way from one place to another, points 0.1 m apart. Shape (N, 2)."""
         columns = self.clearance_m.shape[1]
         a, b = (int(r * columns + c) for r, c in self.cells(np.stack([start, goal])))
-        _, before = dijkstra(self._graph, indices=a, return_predecessors=True)
+        _, before = dijkstra(self._graph, directed=True, indices=a, return_predecessors=True)
         trail = [b]
         while trail[-1] != a:
             step = int(before[trail[-1]])
@@ -108,7 +117,7 @@ class FreeMap:
         return np.asarray(smooth[6:-6])
 
 
-def _grid_graph(cost: Array) -> coo_matrix:
+def _grid_graph(cost: Array) -> csr_matrix:
     """Edges between neighbouring cells of finite cost."""
     rows, columns = cost.shape
     number = np.arange(rows * columns).reshape(rows, columns)

@@ -42,19 +42,19 @@ class FrameDescriptorSettings:
     """Descriptors of frames."""
 
     size: int = 64
-    content: float = 0.55
+    content: float = 0.7
     """Length of what is seen, wherever in the picture."""
-    arrangement: float = 0.75
+    arrangement: float = 0.62
     """Length of what is seen where in the picture and from which side."""
-    common: float = 0.45
+    common: float = 0.4
     """Length of what all indoor pictures share."""
-    noise: float = 0.16
+    noise: float = 0.14
     """Length of the noise that lasts over frames (blur, exposure, people)."""
     noise_frame: float = 0.05
     """Length of each frame's own noise."""
     structure_weight: float = 0.5
     """Weight of walls, floors and ceilings, which look bland, against things of the same area."""
-    side_part: float = 0.6
+    side_part: float = 0.5
     """Part of a thing's appearance in the arrangement that depends on the side it is seen from, of unit length."""
 
 

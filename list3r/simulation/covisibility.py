@@ -1,0 +1,81 @@
+"""Which frames show the same surface: the truth for revisits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from list3r.frames.base import Camera
+from list3r.simulation.video import SimulatedVideo
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_TOLERANCE = 0.03
+"""Relative difference of depth up to which a point is seen, beyond what lies within a pixel of it."""
+_POINTS = 320
+"""About how many pixels of a frame are asked after."""
+
+
+def covisibility(video: SimulatedVideo, frames_a: Sequence[int], frames_b: Sequence[int]) -> Floats:
+    """Share of the picture that two frames have in common, the lesser of both directions. Shape (A, B), in [0, 1].
+
+    Only what stands still counts: pixels of movers are left out on both sides, and what a mover hides is not seen.
+    """
+    a, b = np.asarray(frames_a, dtype=np.int64), np.asarray(frames_b, dtype=np.int64)
+    return np.minimum(seen_share(video, a, b), seen_share(video, b, a).T)
+
+
+def seen_share(
+    video: SimulatedVideo, frames_a: Sequence[int] | NDArray[np.int64], frames_b: Sequence[int] | NDArray[np.int64]
+) -> Floats:
+    """Share of the static pixels of each frame a whose points are seen in each frame b. Shape (A, B), in [0, 1]."""
+    a, b = np.asarray(frames_a, dtype=np.int64), np.asarray(frames_b, dtype=np.int64)
+    moving = [mover.id for mover in video.movers]
+    depth_a = np.where(np.isin(video.ids[a], moving), 0, video.depth[a]) if moving else video.depth[a]
+    depth_b = np.where(np.isin(video.ids[b], moving), 0, video.depth[b]) if moving else video.depth[b]
+    return shared_view(depth_a, video.T_world_cam[a], depth_b, video.T_world_cam[b], video.camera)
+
+
+def shared_view(depth_a: Floats, T_world_a: Array, depth_b: Floats, T_world_b: Array, camera: Camera) -> Floats:
+    """Share of the pixels with depth in each picture a whose points are seen in each picture b. Shape (A, B).
+
+    `depth_a` (A, H, W) and `depth_b` (B, H, W), metres, 0 for what does not count; `T_world_a` (A, 4, 4) and
+    `T_world_b` (B, 4, 4). A point is seen where its depth in b lies between the least and the greatest depth of the
+    3x3 pixels about it, 3 % added on either side.
+    """
+    step = max(1, int(np.sqrt(camera.width * camera.height / _POINTS)))
+    rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step].reshape(2, -1)
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(rows))], axis=1)
+    rays = rays.astype(np.float32)
+    lower = minimum_filter(np.where(depth_b > 0, depth_b, np.inf), (1, 3, 3)) * (1 - _TOLERANCE)
+    upper = maximum_filter(depth_b, (1, 3, 3)) * (1 + _TOLERANCE)
+    lower, upper = lower.astype(np.float32), upper.astype(np.float32)
+    lower, upper = lower.reshape(len(depth_b), -1), upper.reshape(len(depth_b), -1)
+    T_b_world = np.linalg.inv(T_world_b)
+    out = np.zeros((len(depth_a), len(depth_b)), np.float32)
+    for k, T_world_cam in enumerate(T_world_a):
+        z = depth_a[k, rows, columns]
+        known = z > 0
+        if not known.any():
+            continue
+        T_b_a = (T_b_world @ T_world_cam).astype(np.float32)
+        points = rays[known] * z[known, None]
+        local = np.matmul(T_b_a[:, :3, :3], points.T) + T_b_a[:, :3, 3:]
+        out[k] = _seen(local, lower, upper, camera).mean(axis=1)
+    return out
+
+
+def _seen(local: Floats, lower: Floats, upper: Floats, camera: Camera) -> NDArray[np.bool_]:
+    """Whether points (B, 3, N) in the cameras' frames meet the depth that the pictures have there. Shape (B, N)."""
+    x, y, z = local[:, 0], local[:, 1], local[:, 2]
+    safe = np.where(z > 0.05, z, np.float32(1))
+    u = np.rint(np.float32(camera.fx) * x / safe + np.float32(camera.cx))
+    v = np.rint(np.float32(camera.fy) * y / safe + np.float32(camera.cy))
+    inside = (z > 0.05) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixel = np.where(inside, v * camera.width + u, 0).astype(np.int64)
+    low, high = np.take_along_axis(lower, pixel, 1), np.take_along_axis(upper, pixel, 1)
+    return np.asarray(inside & (z >= low) & (z <= high))
