@@ -133,6 +133,21 @@ def align(
     )
 
 
+def robust_start(
+    p_u: ArrayLike,
+    p_v: ArrayLike,
+    weight: ArrayLike,
+    group: ArrayLike,
+    metric: bool,
+    settings: AlignmentSettings | None = None,
+) -> Sim3:
+    """The transform that `align` starts from: by few of the pairs, not exact, but spoilt neither by scattered outliers
+    nor by up to about half of the frames being misplaced together. Raises `DegenerateError`."""
+    chosen = settings or AlignmentSettings()
+    pairs, _ = _usable(_Pairs.build(p_u, p_v, weight, group), chosen)
+    return _robust_start(pairs.thinned(chosen.start_pairs), metric, _spread(pairs.v), chosen)
+
+
 @dataclass(frozen=True)
 class _Pairs:
     """Corresponding points, N of them."""
@@ -212,7 +227,7 @@ def _fit(pairs: _Pairs, weight: Array, metric: bool, symmetric: bool) -> Sim3:
     rotation = (left * sign) @ right
     scale = 1.0
     if not metric:
-        u2 = float(np.einsum("n,ni,ni->", w, du, du))
+        u2 = float(w @ np.einsum("ni,ni->n", du, du))
         v2 = float(np.einsum("ni,ni->", weighted, dv))
         scale = float(np.sqrt(v2 / u2)) if symmetric else max(float((size * sign).sum()) / u2, 1e-12)
     return Sim3(np.asarray(scale), rotation, mean_v - scale * rotation @ mean_u)
@@ -228,15 +243,15 @@ def _robust_start(pairs: _Pairs, metric: bool, spread: float, settings: Alignmen
 
 
 def _least_absolute(pairs: _Pairs, metric: bool, spread: float, settings: AlignmentSettings) -> Sim3:
-    S_v_u = _fit(pairs, pairs.weight, metric, symmetric=False)
+    S_v_u, corners = _fit(pairs, pairs.weight, metric, symmetric=False), _corners(pairs.u)
     for _ in range(settings.start_iterations):
         residual = pairs.residual(S_v_u)
         limit = max(float(np.quantile(residual, settings.huber_quantile)), 1e-9 * spread)
         trust = np.minimum(1.0, limit / np.maximum(residual, limit))
         S_new = _fit(pairs, pairs.weight * trust, metric, symmetric=False)
-        moved = _moved(S_new, S_v_u, pairs)
+        moved = _moved(S_new, S_v_u, corners)
         S_v_u = S_new
-        if moved < 1e-6 * spread:
+        if moved < 1e-4 * spread:
             break
     return S_v_u
 
@@ -251,10 +266,13 @@ def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
     return [_fit(part, part.weight, metric, symmetric=True) for part in rows]
 
 
-def _moved(S_a: Sim3, S_b: Sim3, pairs: _Pairs) -> float:
-    """How far the two transforms carry the points apart: exact at the corners of the points' box."""
-    low, high = pairs.u.min(axis=0), pairs.u.max(axis=0)
-    corners = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
+def _corners(points: Array) -> Array:
+    """Corners of the points' box: what two transforms do there bounds what they do inside. Shape (8, 3)."""
+    return np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, points.min(axis=0), points.max(axis=0))
+
+
+def _moved(S_a: Sim3, S_b: Sim3, corners: Array) -> float:
+    """How far two transforms carry the points apart."""
     return float(np.abs(S_a.apply(corners) - S_b.apply(corners)).max())
 
 
@@ -262,16 +280,16 @@ def _refine(
     pairs: _Pairs, start: Sim3, metric: bool, spread: float, settings: AlignmentSettings
 ) -> tuple[Sim3, Array, float]:
     """The fit under Tukey's biweight: transform, trust in each pair (N,), and the residual beyond which it is none."""
-    S_v_u = start
+    S_v_u, corners = start, _corners(pairs.u)
     for k in range(settings.iterations):
         residual = pairs.residual(S_v_u)
         if k < settings.iterations // 2:
             limit = max(settings.kernel * float(np.median(residual)), 1e-9 * spread)
         trust = np.maximum(0.0, 1.0 - (residual / limit) ** 2) ** 2
         S_new = _fit(pairs, pairs.weight * trust, metric, symmetric=True)
-        moved = _moved(S_new, S_v_u, pairs)
+        moved = _moved(S_new, S_v_u, corners)
         S_v_u = S_new
-        if moved < 1e-8 * spread:
+        if moved < 1e-7 * spread:
             break
     return S_v_u, trust, limit
 
@@ -352,3 +370,15 @@ def coverage(points: Array, cells: int) -> Array:
     cell = np.floor(points / (_spread(points) / cells)).astype(np.int64)
     _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     return np.asarray(1.0 / np.sqrt(count[which.ravel()]))
+
+
+def coverage_rank(points: Array, weight: Array, cells: int) -> NDArray[np.int64]:
+    """Place of each point in its cell, the heaviest first, `cells` of them across the spread. Taking points in order of
+    it gives each cell a like share. Shape (N,)."""
+    cell = np.floor((points - points.min(axis=0)) / (_spread(points) / cells)).astype(np.int64)
+    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    order = np.lexsort((-weight, key))
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    rank = np.empty(len(points), np.int64)
+    rank[order] = np.arange(len(points)) - np.repeat(starts, np.diff([*starts, len(points)]))
+    return rank
