@@ -268,7 +268,8 @@ def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
 
 def _corners(points: Array) -> Array:
     """Corners of the points' box: what two transforms do there bounds what they do inside. Shape (8, 3)."""
-    return np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, points.min(axis=0), points.max(axis=0))
+    low, high = points.min(axis=0), points.max(axis=0)
+    return np.asarray(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high))
 
 
 def _moved(S_a: Sim3, S_b: Sim3, corners: Array) -> float:
