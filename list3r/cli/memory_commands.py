@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -123,11 +125,11 @@ def list_instances(
             _triple(i.box.size),
             i.confidence,
             i.observations,
-            i.structure or "",
+            i.structure or ("dynamic" if i.dynamic else ""),
         ]
         for i in kept
     ]
-    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "structure"])
+    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind"])
 
 
 def _triple(values: Any) -> str:
@@ -150,11 +152,12 @@ def show(
         relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
         names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
         aliases = [old for old, _ in scene.store.aliases().items() if scene.store.resolve(old) == instance.id]
+        track = scene.track(instance.id) if instance.dynamic else None
         parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations(instance.id)]
         units = scene.units
     if json:
         related = [vars(r) for r in relations]
-        print_json({**instance_dict(instance), "relations": related, "aliases": aliases, "observed_as": parts})
+        print_json({**instance_dict(instance, track), "relations": related, "aliases": aliases, "observed_as": parts})
         return
     print(f"{instance.id}  {instance.label or instance.description}")
     for key, value in (
@@ -166,6 +169,7 @@ def show(
         ),
         ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
         ("aliases", ", ".join(map(str, aliases)) or "none"),
+        *(() if track is None else _track_lines(*track, units)),
     ):
         print(f"  {key:11} {value}")
     for r in relations:
@@ -175,8 +179,20 @@ def show(
         )
 
 
-def instance_dict(instance: Instance) -> dict[str, Any]:
-    """An instance in the words of the scene JSON."""
+def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:
+    """What is told of a moving thing: when, how far, from where to where."""
+    if not len(times_s):
+        return [("moved", "seen moving; where it was is not known")]
+    way = sum(math.dist(a, b) for a, b in itertools.pairwise(places.tolist()))
+    return [
+        ("moved", f"{times_s[0]:.2f} s to {times_s[-1]:.2f} s, {way:.2f} {units} in {len(times_s)} frames"),
+        ("from", f"{_triple(places[0])} {units}"),
+        ("to", f"{_triple(places[-1])} {units}"),
+    ]
+
+
+def instance_dict(instance: Instance, track: tuple[Any, Any] | None = None) -> dict[str, Any]:
+    """An instance in the words of the scene JSON, with its track where it is given."""
     from list3r.exporters.scene_json import instance_entry
 
-    return instance_entry(instance)
+    return instance_entry(instance, track=track)

@@ -53,6 +53,8 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
     sheet = _Sheet(frame, layout, settings)
     sheet.picture(component, supports)
     sheet.boxes(things, {i.id for i in tagged})
+    moved = {i.id: store.track(i.id)[1] for i in component.instances if i.dynamic}
+    sheet.tracks({n: places[np.isfinite(places).all(axis=1)] for n, places in moved.items()})
     sheet.camera_path(component)
     sheet.tags(tagged)
     sheet.scale_bar(units(store))
@@ -168,6 +170,23 @@ class _Sheet:
             side_px = _area(outline) ** 0.5 / _OVERSAMPLING
             self.draw.polygon(outline, fill=(*color, int(np.interp(side_px, [20, 120], [60, 14]))))
             self.draw.line([*outline, outline[0], outline[1]], fill=(*color, 255), width=2 * _OVERSAMPLING)
+
+    def tracks(self, tracks: dict[int, NDArray[np.float64]]) -> None:
+        """Where moving things went, in their colours: a dot where each was seen first, an arrow where last."""
+        k = _OVERSAMPLING
+        for instance_id, places in sorted(tracks.items()):
+            xy, color = self.px(places), instance_color(instance_id)
+            points = [(float(x), float(y)) for x, y in xy]
+            if len(points) < 2:
+                continue
+            self.draw.line(points, fill=(*color, 230), width=3 * k, joint="curve")
+            (x, y), end = points[0], xy[-1]
+            self.draw.ellipse((x - 4 * k, y - 4 * k, x + 4 * k, y + 4 * k), fill=color)
+            back = xy[max(0, len(xy) - 1 - len(xy) // 5)] - end
+            back = back / max(float(np.linalg.norm(back)), 1e-9)
+            for side in (-0.5, 0.5):
+                turn = np.array([back[0] - side * back[1], back[1] + side * back[0]])
+                self._stroke(end, end + 12 * k * turn, color, 3)
 
     def camera_path(self, component: Component) -> None:
         """Where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""

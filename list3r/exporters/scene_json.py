@@ -61,7 +61,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
         },
         "sessions": _sessions(store),
         "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
-        "instances": [instance_entry(i, decimals) for i in instances],
+        "instances": [instance_entry(i, decimals, store.track(i.id) if i.dynamic else None) for i in instances],
         "relations": [_relation(r, decimals) for r in relations],
         "aliases": [{"id": k, "instance": v} for k, v in store.aliases().items()],
     }
@@ -86,11 +86,16 @@ def _vector(values: ArrayLike, decimals: int) -> list[float] | None:
     return [float(v) + 0.0 for v in np.round(flat, decimals)] if np.isfinite(flat).all() else None
 
 
-def instance_entry(instance: Instance, decimals: int = _METRIC_DECIMALS) -> dict[str, Any]:
-    """One entry of `instances`; lengths rounded to so many decimals."""
+def instance_entry(
+    instance: Instance, decimals: int = _METRIC_DECIMALS, track: tuple[ArrayLike, ArrayLike] | None = None
+) -> dict[str, Any]:
+    """One entry of `instances`; lengths rounded to so many decimals.
+
+    `track` are the seconds (V,) and places (V, 3) of a thing that moves; without them the entry has none.
+    """
     box, view = instance.box, instance.best_view
     low, high = _vector(instance.aabb[0], decimals), _vector(instance.aabb[1], decimals)
-    return {
+    entry: dict[str, Any] = {
         "id": instance.id,
         "label": instance.label,
         "description": instance.description,
@@ -115,7 +120,16 @@ def instance_entry(instance: Instance, decimals: int = _METRIC_DECIMALS) -> dict
         "best_view": None
         if view is None
         else {"session": view.session_id, "frame": view.frame_index, "box_xyxy": _vector(view.box_xyxy, 1)},
+        "dynamic": instance.dynamic,
+        "position_sigma": None
+        if instance.position_sigma_m is None
+        else _number(instance.position_sigma_m, max(decimals, _METRIC_DECIMALS)),
     }
+    if track is not None:
+        places = zip(np.asarray(track[0], dtype=np.float64), np.asarray(track[1], dtype=np.float64), strict=True)
+        rows = [(_number(float(t), 6), _vector(place, decimals)) for t, place in places]
+        entry["track"] = [[t, *place] for t, place in rows if t is not None and place is not None]
+    return entry
 
 
 def _relation(relation: Relation, decimals: int) -> dict[str, Any]:

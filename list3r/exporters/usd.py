@@ -53,9 +53,9 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
     """The stage in memory: z up, metersPerUnit 1 (arbitrary units in a relative memory, `customLayerData` says so).
 
     `/World/Instances/instance_12` is the box's own frame (translate, orient), with the points in it and the box as a
-    guide; floor, walls and the like are under `/World/Structure`; time codes of cameras are frame numbers of the
-    source. A component that was not placed against the main one is under `/World/component_7`, invisible, so that it
-    is not overlaid.
+    guide; what moves has a sample of its translation for each frame that saw it. Floor, walls and the like are under
+    `/World/Structure`; time codes are frame numbers of the source. A component that was not placed against the main
+    one is under `/World/component_7`, invisible, so that it is not overlaid.
     """
     settings = settings or UsdSettings()
     components = read_components(store)
@@ -68,6 +68,8 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
             limit = settings.points_per_structure if instance.structure else settings.points_per_instance
             support = thinned_support(store, instance, limit)
             paths[instance.id] = _add_instance(stage, scope.GetPath(), instance, support)
+            if instance.dynamic and has_box(instance):
+                _animate(stage.GetPrimAtPath(paths[instance.id]), instance, store)
         add_cameras(stage, scope.GetPath(), component)
     set_time_range(stage, components, store)
     _add_relations(stage, store, paths)
@@ -131,6 +133,17 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
     return path
 
 
+def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:
+    """Samples of a moving thing's place, as it is turned where it was last; time codes are frame numbers."""
+    keys, _, places = store.track_frames(instance.id)
+    if not len(keys):
+        return
+    translate = UsdGeom.Xformable(prim).GetOrderedXformOps()[0]
+    for (_, frame), place in zip(keys.tolist(), instance.box.center + places - places[-1], strict=True):
+        if np.isfinite(place).all():
+            translate.Set(Gf.Vec3d(*place.tolist()), frame)
+
+
 def _add_box(stage: Usd.Stage, path: Sdf.Path, instance: Instance) -> None:
     cube = UsdGeom.Cube.Define(stage, path.AppendChild("box"))
     cube.CreateSizeAttr(1.0)
@@ -190,6 +203,7 @@ def _set_facts(prim: Usd.Prim, instance: Instance) -> None:
         "firstSeen": float(instance.first_seen_s),
         "lastSeen": float(instance.last_seen_s),
         "state": instance.state,
+        "dynamic": int(instance.dynamic),
         "structure": instance.structure or "",
         "colorName": instance.color_name,
         "component": instance.component,

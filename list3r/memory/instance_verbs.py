@@ -110,16 +110,22 @@ class InstanceVerbs(ChunkVerbs):
         return [Observation(*r) for r in self._rows(query, arguments)]
 
     def support(self, instance_id: int) -> Support:
-        """All surface points of an instance, in the world as it is placed now."""
+        """All surface points of an instance, in the world as it is placed now; of what moves, where it was last."""
         chunks = {c.chunk_id: c.S_world_chunk for c in self.chunks()}
-        parts = self._support_parts(self.resolve(instance_id))
-        return Support(
+        instance = self.instance(instance_id)
+        parts = self._support_parts(instance.id)
+        found = Support(
             np.concatenate([chunks[k].apply(s.points) for k, s in parts]).astype(np.float32)
             if parts
             else np.zeros((0, 3), np.float32),
             np.concatenate([s.confidence for _, s in parts]) if parts else np.zeros(0, np.float32),
             np.concatenate([s.rgb for _, s in parts]) if parts else np.zeros((0, 3), np.uint8),
         )
+        if not instance.dynamic:
+            return found
+        slack = 0.05 * float(np.linalg.norm(np.ptp(instance.aabb, axis=0)))
+        here = np.all((found.points >= instance.aabb[0] - slack) & (found.points <= instance.aabb[1] + slack), axis=1)
+        return Support(found.points[here], found.confidence[here], found.rgb[here])
 
     def node_checksums(self) -> dict[int, int]:
         """A checksum, by chunk id, of what each chunk measured and of which of its local instances move."""
@@ -137,8 +143,13 @@ class InstanceVerbs(ChunkVerbs):
         Frames that two chunks saw count once, at the mean of what they say. In frames in which it stood still for a
         whole chunk the middle of its surface is its place. Nothing for an instance that was never seen moving.
         """
+        _, times_s, places = self.track_frames(instance_id)
+        return times_s, places
+
+    def track_frames(self, instance_id: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """`track` with the frames it comes from: (session id, Frame.index) (V, 2), seconds (V,), places (V, 3)."""
         resolved = self.resolve(instance_id)
-        empty = np.zeros(0), np.zeros((0, 3))
+        empty = np.zeros((0, 2), np.int64), np.zeros(0), np.zeros((0, 3))
         if not self.instance(resolved).dynamic:
             return empty
         chunks = {c.chunk_id: c for c in self.chunks()}
@@ -158,7 +169,8 @@ class InstanceVerbs(ChunkVerbs):
         keys = [k for k in sorted(seen) if k in times]
         if not keys:
             return empty
-        return np.array([times[k] for k in keys]), np.array([np.mean(seen[k], axis=0) for k in keys])
+        places = np.array([np.mean(seen[k], axis=0) for k in keys])
+        return np.array(keys, np.int64), np.array([times[k] for k in keys]), places
 
     def _middle(self, observation: Observation, S_world_chunk: Sim3) -> NDArray[np.float64]:
         """Middle of the surface of one local instance, world. Shape (3,)."""
