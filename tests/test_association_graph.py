@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.pose_graph import GraphSettings, edge_weights, optimize
+from list3r.association.edge_information import WeightSettings, edge_weights
+from list3r.association.pose_graph import optimize
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -124,7 +125,7 @@ def test_loops_alone_can_join_what_chains_do_not() -> None:
 
 
 def test_weights_keep_the_papers_ratios_with_the_strongest_at_one() -> None:
-    weights = edge_weights(np.array([1.0, 0.25]), GraphSettings(least_weight=0.0))
+    weights = edge_weights(np.array([1.0, 0.25]), WeightSettings())
     assert weights[0] == 1.0
     assert 1.0 / weights[1] == pytest.approx(2300, rel=0.05)
 

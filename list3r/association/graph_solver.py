@@ -7,18 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix, diags
-from scipy.sparse.linalg import splu
 
+from list3r.association.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
 from list3r.memory.geometry import Sim3, skew
-from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
+
+_CONVERGED = 1e-12
+"""Relative gain of a step at which the cost has settled."""
 
 
 @dataclass(frozen=True)
 class GraphProblem:
-    """K chunks and E edges, as arrays."""
+    """K chunks and E edges, as arrays: minimise the sum of e^T W e, e = log(S_u_v S_world_v^-1 S_world_u)."""
 
     u: NDArray[np.int64]
     """Row of each edge's chunk u. Shape (E,)."""
@@ -26,137 +27,169 @@ class GraphProblem:
     """Row of each edge's chunk v. Shape (E,)."""
     S_u_v: Sim3
     """Inverses of the measured S_v_u. Shape (E,)."""
-    weight: Array
-    """Shape (E,)."""
+    information: Array
+    """W, of the tangent error in u's units. Shape (E, D, D), D = 6 for rigid graphs, else 7."""
     fixed: NDArray[np.bool_]
     """True for the first chunk of each component. Shape (K,)."""
-    ids: tuple[int, ...]
-    unit: Array
-    """Divisor of each tangent component: the lever for translations, 1 for angles and log scale. Shape (D,)."""
+    turned: Array
+    """Adjoints of S_u_v. Shape (E, D, D)."""
+    free: NDArray[np.int64]
+    """Number of each chunk among those that are not fixed, -1 for fixed ones. Shape (K,)."""
+    inner: NDArray[np.bool_]
+    """True for edges between two chunks that are not fixed. Shape (E,)."""
+    pattern: BlockPattern
 
     @staticmethod
     def build(
-        ids: Sequence[int],
-        edges: Sequence[Edge],
-        component: Mapping[int, int],
-        weight: Array,
-        metric: bool,
-        lever: float,
+        u: NDArray[np.int64], v: NDArray[np.int64], S_v_u: Sim3, information: Array, fixed: NDArray[np.bool_]
     ) -> GraphProblem:
-        """Lay out a graph; rigid (D = 6) when `metric`, else D = 7."""
-        row = {chunk: k for k, chunk in enumerate(ids)}
-        return GraphProblem(
-            u=np.array([row[e.u] for e in edges], np.int64),
-            v=np.array([row[e.v] for e in edges], np.int64),
-            S_u_v=_stack([e.S_v_u for e in edges]).inverse(),
-            weight=weight,
-            fixed=np.array([component[chunk] == chunk for chunk in ids]),
-            ids=tuple(ids),
-            unit=np.array([lever] * 3 + [1.0] * (3 if metric else 4)),
-        )
+        """Lay out a graph."""
+        S_u_v, size = S_v_u.inverse(), information.shape[1]
+        free = np.where(fixed, -1, np.cumsum(~fixed) - 1)
+        inner = (free[u] >= 0) & (free[v] >= 0)
+        pattern = BlockPattern.analyse(int((~fixed).sum()), free[u][inner], free[v][inner], size)
+        return GraphProblem(u, v, S_u_v, information, fixed, adjoint(S_u_v)[:, :size, :size], free, inner, pattern)
 
-    def stack(self, poses: Mapping[int, Sim3]) -> Sim3:
-        """Poses in order of chunk id, batched."""
-        return _stack([poses[chunk] for chunk in self.ids])
+    @property
+    def size(self) -> int:
+        """Degrees of freedom of a chunk, D."""
+        return int(self.information.shape[1])
 
-    def unstack(self, poses: Sim3) -> list[Sim3]:
-        """One similarity for each chunk."""
-        return [Sim3(poses.scale[k], poses.rotation[k], poses.translation[k]) for k in range(len(self.ids))]
+    def residuals(self, poses: Sim3) -> Array:
+        """Tangent error of each edge. Shape (E, D)."""
+        apart = self.S_u_v @ take(poses, self.v).inverse() @ take(poses, self.u)
+        return np.asarray(apart.log()[:, : self.size])
 
-    def norms(self, poses: Sim3 | Sequence[Sim3]) -> Array:
-        """Length of each edge's residual, in levers. Shape (E,)."""
-        batch = poses if isinstance(poses, Sim3) else _stack(poses)
-        return np.asarray(np.linalg.norm(self._residuals(batch), axis=1))
+    def squares(self, poses: Sim3) -> Array:
+        """e^T W e of each edge. Shape (E,)."""
+        e = self.residuals(poses)
+        return np.asarray(np.einsum("ei,eij,ej->e", e, self.information, e, optimize=True))
 
     def solve(self, poses: Sim3, trust: Array, iterations: int) -> Sim3:
-        """Poses that minimise the weighted squares, by damped Gauss-Newton from `poses`."""
-        weight = self.weight * trust
-        damping, cost = 1e-6, self._cost(poses, weight)
+        """Poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`. Shape of trust (E,)."""
+        if len(self.u) == 0 or not (~self.fixed).any():
+            return poses
+        damping = 0.0
+        e = self.residuals(poses)
+        cost = self._cost(e, trust)
+        system = self._normal_equations(e, trust)
         for _ in range(iterations):
-            information, gradient = self._normal_equations(poses, weight)
-            step = splu((information + diags(damping * information.diagonal() + 1e-12)).tocsc()).solve(-gradient)
-            tried = self._moved(poses, step.reshape(len(self.ids), -1))
-            new_cost = self._cost(tried, weight)
-            if new_cost > cost * (1 + 1e-12):
-                damping *= 10.0
+            tried = self._step(poses, system, damping)
+            new = None if tried is None else self.residuals(tried)
+            new_cost = np.inf if new is None else self._cost(new, trust)
+            if tried is None or new is None or not new_cost <= cost * (1 + _CONVERGED):
+                damping = max(damping * 10.0, 1e-6)
                 if damping > 1e6:
                     break
                 continue
-            gain, poses, cost, damping = cost - new_cost, tried, new_cost, max(damping / 10.0, 1e-9)
-            if gain <= 1e-10 * cost + 1e-18:
+            gain, poses, cost = cost - new_cost, tried, new_cost
+            damping = 0.0 if damping <= 1e-6 else damping / 10.0
+            if gain <= _CONVERGED * cost + 1e-18:
                 break
+            system = self._normal_equations(new, trust)
         return poses
 
-    def _residuals(self, poses: Sim3) -> Array:
-        apart = self.S_u_v @ _take(poses, self.v).inverse() @ _take(poses, self.u)
-        return np.asarray(apart.log()[:, : len(self.unit)] / self.unit)
+    def factor(self, poses: Sim3, trust: Array) -> BlockFactor:
+        """The factor of the information matrix of all chunks that are not fixed. Raises `NotPositiveError`."""
+        diagonal, off, _ = self._normal_equations(self.residuals(poses), trust)
+        return BlockFactor.of(self.pattern, diagonal, off)
 
-    def _cost(self, poses: Sim3, weight: Array) -> float:
-        return float((weight[:, None] * self._residuals(poses) ** 2).sum())
+    def _cost(self, e: Array, trust: Array) -> float:
+        return float(trust @ np.einsum("ei,eij,ej->e", e, self.information, e, optimize=True))
 
-    def _moved(self, poses: Sim3, step: Array) -> Sim3:
-        full = np.zeros((len(step), 7))
-        full[:, : step.shape[1]] = step
-        full[self.fixed] = 0.0
+    def _step(self, poses: Sim3, system: tuple[Array, Array, Array], damping: float) -> Sim3 | None:
+        diagonal, off, gradient = system
+        if damping > 0.0:
+            diagonal = diagonal + damping * diagonal * np.eye(self.size)
+        try:
+            step = BlockFactor.of(self.pattern, diagonal, off).solve(-gradient)
+        except NotPositiveError:
+            return None
+        full = np.zeros((len(self.fixed), 7))
+        full[~self.fixed, : self.size] = step
         return poses @ Sim3.exp(full)
 
-    def _normal_equations(self, poses: Sim3, weight: Array) -> tuple[csc_matrix, Array]:
-        """For right-hand steps; the inverse Jacobians of log are taken to first order, I +- ad(e)/2."""
-        d = len(self.unit)
-        residual = self._residuals(poses)
-        e = np.zeros((len(residual), 7))
-        e[:, :d] = residual * self.unit
-        half = 0.5 * _ad(e)
-        to_u = (np.eye(7) + half)[:, :d, :d] / self.unit[:, None]
-        to_v = -((np.eye(7) - half) @ _adjoint(self.S_u_v))[:, :d, :d] / self.unit[:, None]
-        blocks = [(self.u, to_u), (self.v, to_v)]
-        count = len(self.ids) * d
-        gradient = np.zeros((len(self.ids), d))
-        rows, columns, values = [], [], []
-        for a, Ja in blocks:
-            weighted = Ja * weight[:, None, None]
-            np.add.at(gradient, a, np.einsum("eij,ei->ej", weighted, residual))
-            for b, Jb in blocks:
-                rows.append((a[:, None, None] * d + np.arange(d)[None, :, None]).repeat(d, axis=2))
-                columns.append((b[:, None, None] * d + np.arange(d)[None, None, :]).repeat(d, axis=1))
-                values.append(np.einsum("eij,eik->ejk", weighted, Jb))
-        information = coo_matrix(
-            (np.concatenate(values).ravel(), (np.concatenate(rows).ravel(), np.concatenate(columns).ravel())),
-            shape=(count, count),
-        ).tocsc()
-        held = np.repeat(self.fixed, d).astype(np.float64)
-        gradient[self.fixed] = 0.0
-        return information + diags(held * 1e9), gradient.ravel()
+    def _normal_equations(self, e: Array, trust: Array) -> tuple[Array, Array, Array]:
+        """Diagonal blocks, off-diagonal blocks of the inner edges, and the gradient, for right-hand steps."""
+        d = self.size
+        to_u, to_v = self.jacobians(e)
+        both = np.concatenate([to_u, to_v], axis=2)
+        weighted = (self.information * trust[:, None, None]) @ both
+        blocks = np.swapaxes(both, 1, 2) @ weighted
+        push = np.einsum("eji,ej->ei", weighted, e)
+        count = self.pattern.count
+        diagonal, gradient = np.zeros((count, d, d)), np.zeros((count, d))
+        for chunk, part in ((self.u, slice(0, d)), (self.v, slice(d, 2 * d))):
+            here = self.free[chunk]
+            moving = here >= 0
+            diagonal += _gathered(here[moving], blocks[moving, part, part], count)
+            gradient += _gathered(here[moving], push[moving, part], count)
+        return diagonal, blocks[self.inner, :d, d:], gradient
+
+    def jacobians(self, e: Array) -> tuple[Array, Array]:
+        """Derivatives of the errors by right-hand steps of u and of v. Shapes (E, D, D).
+
+        The inverse Jacobian of log is the Bernoulli series I + ad/2 + ad^2/12 - ad^4/720 + ad^6/30240, good to 1e-7
+        for turns up to one radian.
+        """
+        ad = _ad(e)
+        square = ad @ ad
+        even = np.eye(self.size) + square / 12.0
+        if len(e) and np.abs(e[:, 3:]).max() > 0.1:
+            fourth = square @ square
+            even += square @ fourth / 30240.0 - fourth / 720.0
+        return even + 0.5 * ad, -(even - 0.5 * ad) @ self.turned
 
 
-def _stack(poses: Sequence[Sim3]) -> Sim3:
+def stack(poses: Sequence[Sim3]) -> Sim3:
+    """One batched similarity of many. Shape (K,)."""
     return Sim3(
         np.array([float(p.scale) for p in poses]),
-        np.stack([p.rotation for p in poses]),
-        np.stack([p.translation for p in poses]),
+        np.array([p.rotation for p in poses]).reshape(-1, 3, 3),
+        np.array([p.translation for p in poses]).reshape(-1, 3),
     )
 
 
-def _take(poses: Sim3, rows: NDArray[np.int64]) -> Sim3:
+def take(poses: Sim3, rows: NDArray[np.int64]) -> Sim3:
+    """Some of a batch."""
     return Sim3(poses.scale[rows], poses.rotation[rows], poses.translation[rows])
 
 
-def _adjoint(S: Sim3) -> Array:
+def unstack(poses: Sim3, names: Sequence[int]) -> dict[int, Sim3]:
+    """One similarity for each name."""
+    return {n: Sim3(poses.scale[k], poses.rotation[k], poses.translation[k]) for k, n in enumerate(names)}
+
+
+def adjoint(S: Sim3) -> Array:
     """Matrices with S exp(x) S^-1 = exp(Ad x), tangents (rho, omega, sigma). Shape (E, 7, 7)."""
-    out = np.zeros((len(S.scale), 7, 7))
-    out[:, :3, :3] = S.scale[:, None, None] * S.rotation
-    out[:, :3, 3:6] = skew(S.translation) @ S.rotation
-    out[:, :3, 6] = -S.translation
-    out[:, 3:6, 3:6] = S.rotation
-    out[:, 6, 6] = 1.0
+    out = np.zeros((*S.scale.shape, 7, 7))
+    out[..., :3, :3] = S.scale[..., None, None] * S.rotation
+    out[..., :3, 3:6] = skew(S.translation) @ S.rotation
+    out[..., :3, 6] = -S.translation
+    out[..., 3:6, 3:6] = S.rotation
+    out[..., 6, 6] = 1.0
     return out
 
 
 def _ad(e: Array) -> Array:
-    """The adjoint's derivative: ad(e) x = [e, x]. Shape (E, 7) -> (E, 7, 7)."""
-    out = np.zeros((len(e), 7, 7))
-    out[:, :3, :3] = skew(e[:, 3:6]) + e[:, 6, None, None] * np.eye(3)
+    """The adjoint's derivative: ad(e) x = [e, x]. Shape (E, D) -> (E, D, D), D = 6 or 7."""
+    size = e.shape[1]
+    out = np.zeros((len(e), size, size))
+    out[:, :3, :3] = skew(e[:, 3:6])
     out[:, :3, 3:6] = skew(e[:, :3])
-    out[:, :3, 6] = -e[:, :3]
     out[:, 3:6, 3:6] = skew(e[:, 3:6])
+    if size == 7:
+        out[:, :3, :3] += e[:, 6, None, None] * np.eye(3)
+        out[:, :3, 6] = -e[:, :3]
     return out
+
+
+def _gathered(where: NDArray[np.int64], values: Array, count: int) -> Array:
+    """Sums of rows by number. Shape (N, ...) -> (count, ...)."""
+    flat = values.reshape(len(values), -1)
+    order = np.argsort(where, kind="stable")
+    out = np.zeros((count, flat.shape[1]))
+    if len(order):
+        starts = np.flatnonzero(np.diff(where[order], prepend=-1))
+        out[where[order][starts]] = np.add.reduceat(flat[order], starts, axis=0)
+    return out.reshape(count, *values.shape[1:])

@@ -1,22 +1,25 @@
 """The graph of chunks: all edges together decide where every chunk lies (paper A.4).
 
-Minimises sum w |log(S_v_u^-1 S_v_world S_world_u)|^2 by Levenberg-Marquardt (`graph_solver`). Loop edges are under a
-Geman-McClure kernel that is tightened from convex (graduated non-convexity: Yang et al., "Graduated non-convexity for
-robust spatial perception", 2020), so that a false loop is switched off rather than bending the map. The start is
-always the chain of adjacent edges from each component's first chunk, so the result does not depend on the order in
-which chunks arrived.
+Minimises the sum of e^T W e, e = log(S_v_u^-1 S_v_world S_world_u), by Levenberg-Marquardt (`graph_solver`), W from each
+edge's covariance and the bending of chunks (`edge_information`); false loops are switched off (`loop_trust`), and every
+chunk gets a covariance (`marginals`). The start is always the chain of adjacent edges from each component's first
+chunk, so the result does not depend on the order in which chunks arrived.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.graph_solver import GraphProblem
+from list3r.association.edge_information import WeightSettings, information, plain_information
+from list3r.association.graph_solver import GraphProblem, stack, take, unstack
+from list3r.association.loop_trust import Believed, Tree, TrustSettings, judge
+from list3r.association.marginals import widening
+from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -25,23 +28,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """How the graph is weighted and solved."""
+    """How the graph is weighted and solved. Without `weighted` and `robust`: plain least squares, as VGGT-Long."""
 
-    alpha: float = 0.30
-    """The paper's alpha of the edge weight."""
-    sharpness: float = 6.0
-    """The paper's exponent g of the edge weight."""
-    least_weight: float = 0.05
-    """Floor of the normalised weights, so that a weak chain still holds together."""
-    lever_m: float = 1.0
-    """Distance at which a rotation error counts as much as a translation error, metres; without metric scale half
-    the median spread of the edges' points takes its place."""
-    loop_residual: float = 0.05
-    """Residual, in levers, at which a loop edge is trusted by one quarter (the scale of Geman-McClure)."""
-    least_trust: float = 0.1
-    """Trust under which a loop edge is rejected."""
-    iterations: int = 30
-    """Steps of the final solution; each stage before it takes a tenth."""
+    weighted: bool = True
+    """Edges count by their information; else all the same."""
+    robust: bool = True
+    """Edges that the rest contradicts are switched off."""
+    weights: WeightSettings = field(default_factory=WeightSettings)
+    trust: TrustSettings = field(default_factory=TrustSettings)
+    least_weight: float = 1e-4
+    """Loops of less information than this share of the strongest loop's are dropped, as far as the graph still holds
+    together without them."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,10 @@ class GraphResult:
     edges: tuple[Edge, ...]
     """The edges as given, with `weight`, and loop edges that the rest contradicts no longer `accepted`."""
     residual: float
-    """Weighted RMS of the edges, in levers."""
+    """RMS of the trusted edges' errors in their own standard deviations, 1 where they keep what they state."""
+    covariances: dict[int, Array]
+    """By chunk id, of x in S_true = S_graph_chunk exp(x), x = (rho, omega, sigma), relative to the first chunk of the
+    component, which has 0. Shape (7, 7) each."""
 
 
 def optimize(
@@ -67,38 +67,62 @@ def optimize(
 ) -> GraphResult:
     """Place all chunks. The first chunk of each component stays at `initial`, or at the origin where that is silent.
 
-    Edges that geometry did not accept are passed through; those that an earlier call rejected are tried again.
+    Edges that geometry did not accept are passed through; those that an earlier call rejected are tried again. Raises
+    `DegenerateError` for an edge that holds a number that is not finite.
     """
     chosen = settings or GraphSettings()
     ids = sorted(chunk_ids)
     known = set(ids)
     used = [k for k, e in enumerate(edges) if e.u in known and e.v in known and (e.accepted or "trust" in e.scores)]
+    used.sort(key=lambda k: (edges[k].u, edges[k].v, edges[k].kind, edges[k].frames or (-1, -1), k))
     active = [edges[k] for k in used]
+    for edge in active:
+        _check(edge)
     component = _components(ids, active)
-    start = _chain(ids, active, component, initial)
-    out = list(edges)
+    start, tree = _chain(ids, active, component, initial)
     if not active:
-        return GraphResult(start, component, tuple(out), 0.0)
-    weight = edge_weights(np.array([e.confidence for e in active]), chosen)
-    problem = GraphProblem.build(ids, active, component, weight, metric, _lever(active, metric, chosen))
-    poses, trust = _anneal(problem, start, np.array([e.kind != "adjacent" for e in active]), chosen)
-    norms = problem.norms(poses)
-    for k, edge, w, t, r in zip(used, active, weight, trust, norms, strict=True):
-        out[k] = _judge(edge, float(w), float(t), float(r), chosen)
-    total = weight * trust
-    placed = {chunk: poses[k] for k, chunk in enumerate(ids)}
-    return GraphResult(placed, component, tuple(out), float(np.sqrt((total * norms**2).sum() / total.sum())))
+        return GraphResult(start, component, tuple(edges), 0.0, dict.fromkeys(ids, np.zeros((7, 7))))
+    row = {chunk: k for k, chunk in enumerate(ids)}
+    of_edge = information if chosen.weighted else plain_information
+    problem = GraphProblem.build(
+        np.array([row[e.u] for e in active]),
+        np.array([row[e.v] for e in active]),
+        stack([e.S_v_u for e in active]),
+        of_edge(active, metric, chosen.weights),
+        np.array([component[chunk] == chunk for chunk in ids]),
+    )
+    loop = np.array([e.kind != "adjacent" for e in active])
+    found = judge(problem, stack([start[k] for k in ids]), tree, loop, chosen.robust, chosen.trust)
+    out = list(edges)
+    strength = _strengths(problem.information, found, loop)
+    for n, k in enumerate(used):
+        out[k] = _judged(edges[k], float(strength[n]), float(found.squares[n]), found, n)
+    count = max(float(found.trust @ found.marginals.redundancy), 1e-9) if found.marginals else 1e-9
+    residual = float(np.sqrt(found.trust @ found.squares / max(count, 1.0)))
+    return GraphResult(unstack(found.poses, ids), component, tuple(out), residual, _covariances(found, ids))
 
 
-def edge_weights(confidence: Array, settings: GraphSettings) -> Array:
-    """Weights of edges from their confidence m (paper A.4), the strongest edge 1. Shape (E,).
+def _check(edge: Edge) -> None:
+    numbers = [edge.S_v_u.as_matrix(), np.array(edge.confidence)]
+    if edge.covariance is not None:
+        numbers.append(edge.covariance)
+    if not all(np.isfinite(n).all() for n in numbers):
+        raise DegenerateError(f"the edge between chunks {edge.u} and {edge.v} ({edge.kind}) holds a number not finite")
 
-    With the paper's constants all raw weights are below 3.3e-4, so only their ratios mean something.
-    """
-    grown = np.log1p(settings.alpha * np.clip(confidence, 1e-3, 1.0))
-    u = grown / (1.0 + grown)
-    raw = u**settings.sharpness / (u**settings.sharpness + (1.0 - u) ** settings.sharpness)
-    return np.asarray(np.maximum(raw / raw.max(), settings.least_weight))
+
+def _covariances(found: Believed, ids: Sequence[int]) -> dict[int, Array]:
+    assert found.marginals is not None
+    blocks = found.marginals.covariance * widening(float(found.freedom.sum() - found.freedom.min()))
+    out = np.zeros((len(ids), 7, 7))
+    out[:, : blocks.shape[1], : blocks.shape[2]] = blocks
+    return dict(zip(ids, out, strict=True))
+
+
+def _strengths(information: Array, found: Believed, loop: NDArray[np.bool_]) -> Array:
+    """Information of each edge on the turn (which has no unit), by geometric mean, the strongest 1. Shape (E,)."""
+    turn = information[:, 3:6, 3:6] / found.factors[loop.astype(np.int64), None, None]
+    size = np.cbrt(np.maximum(np.linalg.det(turn), 0.0))
+    return np.asarray(size / max(float(size.max()), 1e-300))
 
 
 def _components(ids: Sequence[int], edges: Sequence[Edge]) -> dict[int, int]:
@@ -117,34 +141,44 @@ def _components(ids: Sequence[int], edges: Sequence[Edge]) -> dict[int, int]:
 
 def _chain(
     ids: Sequence[int], edges: Sequence[Edge], component: Mapping[int, int], initial: Mapping[int, Sim3]
-) -> dict[int, Sim3]:
+) -> tuple[dict[int, Sim3], Tree]:
     """Poses along a spanning tree that prefers adjacent edges, then confident ones (Prim's algorithm, few edges)."""
     neighbours = _neighbours(edges)
+    row = {chunk: k for k, chunk in enumerate(ids)}
+    parent, by, order = np.arange(len(ids)), np.full(len(ids), -1), []
     placed: dict[int, Sim3] = {}
+
+    def place(there: int, here: int, k: int) -> None:
+        placed[there] = _across(placed[here], edges[k], here)
+        parent[row[there]], by[row[there]] = row[here], k
+        order.append(row[there])
+
     for root in ids:
         if component[root] != root:
             continue
         placed[root] = initial.get(root, Sim3.identity())
+        order.append(row[root])
         queue = deque([root])
-        waiting: list[Edge] = []
+        waiting: list[int] = []
         while queue or waiting:
             while queue:
                 chunk = queue.popleft()
-                for other, edge in neighbours.get(chunk, []):
+                for other, k in neighbours.get(chunk, []):
                     if other in placed:
                         continue
-                    if edge.kind != "adjacent":
-                        waiting.append(edge)
+                    if edges[k].kind != "adjacent":
+                        waiting.append(k)
                         continue
-                    placed[other] = _across(placed[chunk], edge, chunk)
+                    place(other, chunk, k)
                     queue.append(other)
-            waiting = [e for e in waiting if (e.u in placed) != (e.v in placed)]
+            waiting = [k for k in waiting if (edges[k].u in placed) != (edges[k].v in placed)]
             if waiting:
-                best = max(waiting, key=lambda e: (e.confidence, -e.u, -e.v))
-                here, there = (best.u, best.v) if best.u in placed else (best.v, best.u)
-                placed[there] = _across(placed[here], best, here)
+                best = max(waiting, key=lambda k: (edges[k].confidence, -edges[k].u, -edges[k].v))
+                here, there = (edges[best].u, edges[best].v)
+                here, there = (here, there) if here in placed else (there, here)
+                place(there, here, best)
                 queue.append(there)
-    return placed
+    return placed, Tree(parent, by, np.array(order, np.int64))
 
 
 def _across(S_world_here: Sim3, edge: Edge, here: int) -> Sim3:
@@ -153,41 +187,23 @@ def _across(S_world_here: Sim3, edge: Edge, here: int) -> Sim3:
     return S_world_here @ S_here_there
 
 
-def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, Edge]]]:
-    out: dict[int, list[tuple[int, Edge]]] = {}
-    for edge in sorted(edges, key=lambda e: (e.u, e.v, e.kind)):
-        out.setdefault(edge.u, []).append((edge.v, edge))
-        out.setdefault(edge.v, []).append((edge.u, edge))
+def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
+    """By chunk id: (other chunk, number of the edge)."""
+    out: dict[int, list[tuple[int, int]]] = {}
+    for k, edge in enumerate(edges):
+        out.setdefault(edge.u, []).append((edge.v, k))
+        out.setdefault(edge.v, []).append((edge.u, k))
     return out
 
 
-def _lever(edges: Sequence[Edge], metric: bool, settings: GraphSettings) -> float:
-    spreads = [e.scores["spread"] for e in edges if "spread" in e.scores]
-    return settings.lever_m if metric or not spreads else max(0.5 * float(np.median(spreads)), 1e-9)
-
-
-def _anneal(
-    problem: GraphProblem, start: Mapping[int, Sim3], loop: NDArray[np.bool_], settings: GraphSettings
-) -> tuple[list[Sim3], Array]:
-    """Solve with the kernel tightened step by step. Returns poses in order of chunk id, and the trust in each edge."""
-    poses, trust = problem.stack(start), np.ones(len(loop))
-    if loop.any():
-        scale = settings.loop_residual**2
-        mu = max(2.0 * float((problem.norms(poses)[loop] ** 2).max()) / scale, 1.0)
-        while True:
-            poses = problem.solve(poses, trust, max(3, settings.iterations // 10))
-            squares = problem.norms(poses)[loop] ** 2
-            trust[loop] = (mu * scale / (squares + mu * scale)) ** 2
-            if mu == 1.0:
-                break
-            mu = max(1.0, mu / 1.4)
-    return problem.unstack(problem.solve(poses, trust, settings.iterations)), trust
-
-
-def _judge(edge: Edge, weight: float, trust: float, residual: float, settings: GraphSettings) -> Edge:
-    scores = {**edge.scores, "trust": trust, "graph_residual": residual}
-    if edge.kind == "adjacent" or trust >= settings.least_trust:
-        return replace(edge, weight=weight * trust, accepted=True, scores=scores)
-    reason = f"the rest of the graph contradicts it by {residual:.3f} (geometry alone: {edge.reason})"
+def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int) -> Edge:
+    """The edge with its weight in the graph, and what the graph thinks of it."""
+    deviations = float(np.sqrt(square / 3.0))
+    trusted = bool(found.trust[n] > 0.5)
+    trust = float((found.limit[n] / (square + found.limit[n])) ** 2)
+    scores = {**edge.scores, "trust": trust, "graph_residual": deviations}
+    if trusted:
+        return replace(edge, weight=strength, accepted=True, scores=scores)
     already = "trust" in edge.scores and not edge.accepted
+    reason = f"the rest of the graph contradicts it by {deviations:.1f} deviations (geometry alone: {edge.reason})"
     return replace(edge, weight=0.0, accepted=False, scores=scores, reason=edge.reason if already else reason)
