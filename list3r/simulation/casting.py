@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.projection import NEAR_M, screen_rectangles
-from list3r.simulation.things import BOX, CYLINDER, SPHERE, Solids, Thing, stack_solids
+from list3r.simulation.projection import NEAR_M, Scene, screen_rectangles
+from list3r.simulation.things import BOX, CYLINDER, SPHERE, Solids, Thing
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -20,31 +20,20 @@ _FIRST = 24
 
 
 class Caster:
-    """Casts depth and ids for one camera among things, some of which may have a pose of their own in every frame."""
+    """Casts depth and ids for one camera; things that move are put in their places through `scene`."""
 
     def __init__(self, things: Sequence[Thing], camera: Camera, moving: Sequence[Thing] = ()) -> None:
         self._camera = camera
-        self._solids = stack_solids((*things, *moving))
-        self._corners = self._solids.corners()
+        self.scene = Scene(things, moving)
+        self._solids = self.scene.solids
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
         self._x = np.tile(x, camera.height)
         self._y = np.repeat(y, camera.width)
-        self._to_local = _to_local(self._solids.yaw)
-        self._own = {t.id: (np.flatnonzero(self._solids.thing == t.id), stack_solids([t])) for t in moving}
-
-    def place(self, thing_id: int, T_world_object: Array) -> None:
-        """Put one of the `moving` things somewhere, upright; `T_world_object` (4, 4)."""
-        rows, home = self._own[thing_id]
-        yaw = float(np.arctan2(T_world_object[1, 0], T_world_object[0, 0]))
-        self._solids.center[rows] = home.center @ T_world_object[:3, :3].T + T_world_object[:3, 3]
-        self._solids.yaw[rows] = home.yaw + yaw
-        self._to_local[rows] = _to_local(self._solids.yaw[rows])
-        self._corners[rows] = home.corners() @ T_world_object[:3, :3].T + T_world_object[:3, 3]
 
     def cast(self, T_world_cam: Array) -> tuple[Floats, NDArray[np.int32]]:
         """Depth along z, metres, 0 where nothing is hit, and ids, both (H, W)."""
-        nearest, rects = screen_rectangles(self._corners, T_world_cam, self._camera)
+        nearest, rects = screen_rectangles(self.scene.corners, T_world_cam, self._camera)
         area = np.maximum(rects[:, 2] - rects[:, 0], 0) * np.maximum(rects[:, 3] - rects[:, 1], 0)
         order = np.argsort(nearest, kind="stable")
         order = order[area[order] > 0]
@@ -65,9 +54,10 @@ class Caster:
 
     def _local_frame(self, T_world_cam: Array) -> tuple[Floats, Floats]:
         """R_local_cam (N, 3, 3) and the camera's centre in each solid's frame (N, 3)."""
-        rotation = (self._to_local @ T_world_cam[:3, :3]).astype(np.float32)
+        to_local = _to_local(self._solids.yaw)
+        rotation = (to_local @ T_world_cam[:3, :3]).astype(np.float32)
         offset = T_world_cam[:3, 3] - self._solids.center
-        return rotation, np.einsum("nij,nj->ni", self._to_local, offset).astype(np.float32)
+        return rotation, np.einsum("nij,nj->ni", to_local, offset).astype(np.float32)
 
     def _sweep(
         self,

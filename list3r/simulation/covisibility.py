@@ -14,6 +14,9 @@ from list3r.simulation.video import SimulatedVideo
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
+MOST_DEG = 75.0
+"""Angle between two lines of sight up to which a surface counts as seen again. Two cameras that face each other in a
+corridor see the same walls, but nobody knows them again."""
 _TOLERANCE = 0.03
 """Relative difference of depth up to which a point is seen, beyond what lies within a pixel of it."""
 _POINTS = 320
@@ -23,7 +26,8 @@ _POINTS = 320
 def covisibility(video: SimulatedVideo, frames_a: Sequence[int], frames_b: Sequence[int]) -> Floats:
     """Share of the picture that two frames have in common, the lesser of both directions. Shape (A, B), in [0, 1].
 
-    Only what stands still counts: pixels of movers are left out on both sides, and what a mover hides is not seen.
+    Only what stands still counts: pixels of movers are left out on both sides, and what a mover hides is not seen. A
+    surface counts as seen again from a direction that differs by at most `MOST_DEG`.
     """
     a, b = np.asarray(frames_a, dtype=np.int64), np.asarray(frames_b, dtype=np.int64)
     return np.minimum(seen_share(video, a, b), seen_share(video, b, a).T)
@@ -40,21 +44,29 @@ def seen_share(
     return shared_view(depth_a, video.T_world_cam[a], depth_b, video.T_world_cam[b], video.camera)
 
 
-def shared_view(depth_a: Floats, T_world_a: Array, depth_b: Floats, T_world_b: Array, camera: Camera) -> Floats:
+def shared_view(
+    depth_a: Floats,
+    T_world_a: Array,
+    depth_b: Floats,
+    T_world_b: Array,
+    camera: Camera,
+    most_deg: float = MOST_DEG,
+) -> Floats:
     """Share of the pixels with depth in each picture a whose points are seen in each picture b. Shape (A, B).
 
     `depth_a` (A, H, W) and `depth_b` (B, H, W), metres, 0 for what does not count; `T_world_a` (A, 4, 4) and
     `T_world_b` (B, 4, 4). A point is seen where its depth in b lies between the least and the greatest depth of the
-    3x3 pixels about it, 3 % added on either side.
+    3x3 pixels about it, 3 % added on either side, and where its two lines of sight differ by at most `most_deg`.
     """
     step = max(1, int(np.sqrt(camera.width * camera.height / _POINTS)))
     rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step].reshape(2, -1)
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(rows))], axis=1)
     rays = rays.astype(np.float32)
-    lower = minimum_filter(np.where(depth_b > 0, depth_b, np.inf), (1, 3, 3)) * (1 - _TOLERANCE)
-    upper = maximum_filter(depth_b, (1, 3, 3)) * (1 + _TOLERANCE)
-    lower, upper = lower.astype(np.float32), upper.astype(np.float32)
-    lower, upper = lower.reshape(len(depth_b), -1), upper.reshape(len(depth_b), -1)
+    around = (1, 3, 3)
+    least = minimum_filter(np.where(depth_b > 0, depth_b, np.inf), around).reshape(len(depth_b), -1)
+    most = maximum_filter(depth_b, around).reshape(len(depth_b), -1)
+    lower = np.asarray(least * (1 - _TOLERANCE), dtype=np.float32)
+    upper = np.asarray(most * (1 + _TOLERANCE), dtype=np.float32)
     T_b_world = np.linalg.inv(T_world_b)
     out = np.zeros((len(depth_a), len(depth_b)), np.float32)
     for k, T_world_cam in enumerate(T_world_a):
@@ -63,9 +75,14 @@ def shared_view(depth_a: Floats, T_world_a: Array, depth_b: Floats, T_world_b: A
         if not known.any():
             continue
         T_b_a = (T_b_world @ T_world_cam).astype(np.float32)
-        points = rays[known] * z[known, None]
+        points = np.asarray(rays[known] * z[known, None], dtype=np.float32)
         local = np.matmul(T_b_a[:, :3, :3], points.T) + T_b_a[:, :3, 3:]
-        out[k] = _seen(local, lower, upper, camera).mean(axis=1)
+        seen = _seen(local, lower, upper, camera)
+        if most_deg < 180:
+            unit = points / np.linalg.norm(points, axis=1, keepdims=True)
+            cosine = np.einsum("bkn,bkn->bn", np.matmul(T_b_a[:, :3, :3], unit.T), local)
+            seen &= cosine >= np.cos(np.deg2rad(most_deg)) * np.linalg.norm(local, axis=1)
+        out[k] = seen.mean(axis=1)
     return out
 
 

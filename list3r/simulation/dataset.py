@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,11 @@ from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera
 from list3r.memory.errors import ExportError, OptionError
 from list3r.simulation.changes import Change, apply_changes
+from list3r.simulation.movers import Mover
+from list3r.simulation.presets import Shot, make_shot
 from list3r.simulation.render import Renderer
 from list3r.simulation.sensor import SensorSettings, sense
-from list3r.simulation.truth import world_truth
+from list3r.simulation.truth import mover_truth, world_truth
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.world import World, make_world
 
@@ -38,7 +41,7 @@ class WalkSettings:
     walk_seed: int | None = None
     """Decides the hand's motion and the noise; None takes `seed`."""
     frames: int | None = None
-    """None walks the whole round, about 280; fewer cut it short, more walk it slower."""
+    """None walks the whole round, about 280; fewer cut it short, more walk it slower. A preset is not slowed."""
     start: int = 0
     """Frames of the walk to leave out at its beginning."""
     size: tuple[int, int] = (320, 240)
@@ -49,6 +52,9 @@ class WalkSettings:
     sensor: SensorSettings = field(default_factory=SensorSettings)
     changes: tuple[Change, ...] = ()
     """What has happened to the world before this walk."""
+    preset: str | None = None
+    """A building, a way through it and what moves there, by name (see `presets`); `seed` decides them and `path` is
+    left aside. None films the two rooms of `make_world`."""
     write_ids: bool = False
     """Also write `ids/`: the id of the thing in every pixel, 16 bit."""
 
@@ -68,16 +74,48 @@ class WalkSettings:
 
     def world(self) -> World:
         """The world after its changes."""
-        return apply_changes(make_world(self.seed), self.changes)
+        whole = make_world(self.seed) if self.preset is None else self._shot().building.world
+        return apply_changes(whole, self.changes)
 
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Seconds (F,) and T_world_cam (F, 4, 4) of the frames to be written."""
+        if self.preset is not None:
+            shot, span = self._shot(), self._span()
+            return shot.time_s[span], shot.T_world_cam[span]
         seed = self.seed if self.walk_seed is None else self.walk_seed
         frames = None if self.frames is None else self.frames + self.start
         time_s, poses = camera_path(self.world().tour, frames, self.path, seed)
         if len(time_s) - self.start < 2:
             raise OptionError(f"start {self.start} leaves nothing of a walk of {len(time_s)} frames")
         return time_s[self.start :], poses[self.start :]
+
+    def movers(self) -> tuple[Mover, ...]:
+        """What moves while it is filmed, with its pose in each of the frames to be written."""
+        if self.preset is None:
+            return ()
+        return tuple(replace(m, T_world_object=m.T_world_object[self._span()]) for m in self._shot().movers)
+
+    def cuts(self) -> tuple[int, ...]:
+        """Frames before which the camera jumps, numbered as they are written."""
+        if self.preset is None:
+            return ()
+        count = len(self.poses()[0])
+        return tuple(c - self.start for c in self._shot().cuts if 0 < c - self.start < count)
+
+    def _shot(self) -> Shot:
+        assert self.preset is not None
+        return _shot(self.preset, self.seed)
+
+    def _span(self) -> slice:
+        total = len(self._shot().time_s)
+        if total - self.start < 2:
+            raise OptionError(f"start {self.start} leaves nothing of a walk of {total} frames")
+        return slice(self.start, total if self.frames is None else min(self.start + self.frames, total))
+
+
+@lru_cache(maxsize=2)
+def _shot(preset: str, seed: int) -> Shot:
+    return make_shot(preset, seed)
 
 
 def write_walk(
@@ -89,7 +127,8 @@ def write_walk(
     """Render a walk into `folder`, which is made if absent and must hold no walk yet; the same for any `workers`.
 
     Writes `rgb/`, `depth/` (16 bit, 5000 per metre), `rgb.txt`, `depth.txt`, `groundtruth.txt` (T_world_cam),
-    `calibration.txt` (fx fy cx cy) and `truth.json`. `progress` is called with the number of frames just written.
+    `calibration.txt` (fx fy cx cy) and `truth.json`, which for a preset also names its cuts and its movers with their
+    places over time. `progress` is called with the number of frames just written.
     More than one worker starts processes, which asks of a script that it guards its main part. Raises `OptionError`
     for a folder that holds a walk, `ExportError` for one that cannot be written.
     """
@@ -121,6 +160,9 @@ def _write(root: Path, settings: WalkSettings, workers: int, progress: Callable[
             pool.shutdown(cancel_futures=True)
     write_tum(root / "groundtruth.txt", Trajectory(time_s, poses))
     truth = world_truth(settings.world(), seen)
+    if settings.preset is not None:
+        truth |= {"preset": settings.preset, "cuts": list(settings.cuts())}
+        truth["movers"] = [mover_truth(m.thing, m.T_world_object, seen.get(m.thing.id, {})) for m in settings.movers()]
     (root / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     _write_lists(root, time_s, settings.camera())
     return root
@@ -132,7 +174,8 @@ class _Writer:
     def __init__(self, settings: WalkSettings, root: Path) -> None:
         self._settings, self._root = settings, root
         self._time_s, self._poses = settings.poses()
-        self._renderer = Renderer(settings.world(), settings.camera())
+        self._movers = settings.movers()
+        self._renderer = Renderer(settings.world(), settings.camera(), [m.thing for m in self._movers])
         self._seed = settings.seed if settings.walk_seed is None else settings.walk_seed
 
     def write_span(self, span: tuple[int, int]) -> list[dict[int, int]]:
@@ -140,6 +183,8 @@ class _Writer:
         return [self._write(position) for position in range(*span)]
 
     def _write(self, position: int) -> dict[int, int]:
+        for mover in self._movers:
+            self._renderer.scene.place(mover.thing.id, mover.T_world_object[position])
         frame = self._renderer.render(self._poses[position])
         sensed = sense(
             frame, self._settings.sensor, self._seed, position + self._settings.start, float(self._time_s[position])

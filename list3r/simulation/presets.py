@@ -127,7 +127,7 @@ def make_video(preset: str, seed: int, size: tuple[int, int] = (64, 48), movers:
     ids = np.empty(depth.shape, np.int32)
     for k, pose in enumerate(shot.T_world_cam):
         for mover in shot.movers:
-            caster.place(mover.thing.id, mover.T_world_object[k])
+            caster.scene.place(mover.thing.id, mover.T_world_object[k])
         depth[k], ids[k] = caster.cast(pose)
     return SimulatedVideo(
         preset,
@@ -273,10 +273,10 @@ def _jump(take: _Take) -> Director:
         if view is None:
             continue
         then = looking_at((*view.xy, take.eye_m), view.targets[0])[None]
-        if glimpse.common(then, now).max() > 0:
+        if glimpse.common(then, now, 180.0).max() > 0:
             continue
         best = best or view
-        if glimpse.common(then, poses[[frame]])[0, 0] > 0.4:
+        if glimpse.common(then, poses[[frame]], 60.0)[0, 0] > 0.4:
             best = view
             break
     assert best is not None, "some room other than the present one has been filmed"
@@ -294,11 +294,11 @@ class _Glimpse:
         self._camera = preset_camera((32, 24))
         self._caster = Caster(take.building.world.things, self._camera)
 
-    def common(self, T_world_a: Array, T_world_b: Array) -> NDArray[np.float32]:
+    def common(self, T_world_a: Array, T_world_b: Array, most_deg: float) -> NDArray[np.float32]:
         """Share of the picture that views have in common, the lesser of both directions. Shape (A, B)."""
         depth_a, depth_b = (np.stack([self._caster.cast(T)[0] for T in poses]) for poses in (T_world_a, T_world_b))
-        forth = shared_view(depth_a, T_world_a, depth_b, T_world_b, self._camera)
-        back = shared_view(depth_b, T_world_b, depth_a, T_world_a, self._camera)
+        forth = shared_view(depth_a, T_world_a, depth_b, T_world_b, self._camera, most_deg)
+        back = shared_view(depth_b, T_world_b, depth_a, T_world_a, self._camera, most_deg)
         return np.minimum(forth, back.T)
 
 

@@ -1,16 +1,37 @@
-"""Where solids can show in a picture."""
+"""All solids of a scene, some of which move, and where they can show in a picture."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.simulation.things import Thing, stack_solids
 
 Array = NDArray[np.float64]
 
 NEAR_M = 0.05
 _EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)])
+
+
+class Scene:
+    """The solids of things that stand still and of things that are put elsewhere from frame to frame."""
+
+    def __init__(self, things: Sequence[Thing], moving: Sequence[Thing] = ()) -> None:
+        self.solids = stack_solids((*things, *moving))
+        self.corners = self.solids.corners()
+        """World, metres. Shape (N, 8, 3)."""
+        self._own = {t.id: (np.flatnonzero(self.solids.thing == t.id), stack_solids([t])) for t in moving}
+
+    def place(self, thing_id: int, T_world_object: Array) -> None:
+        """Put one of the moving things somewhere, upright; it is made at the origin. `T_world_object` (4, 4)."""
+        rows, home = self._own[thing_id]
+        rotation, position = T_world_object[:3, :3], T_world_object[:3, 3]
+        self.solids.center[rows] = home.center @ rotation.T + position
+        self.solids.yaw[rows] = home.yaw + np.arctan2(rotation[1, 0], rotation[0, 0])
+        self.corners[rows] = home.corners() @ rotation.T + position
 
 
 def screen_rectangles(corners: Array, T_world_cam: Array, camera: Camera) -> tuple[Array, NDArray[np.int64]]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.projection import NEAR_M, screen_rectangles
+from list3r.simulation.projection import NEAR_M, Scene, screen_rectangles
 from list3r.simulation.shading import ContactShadows, TextureAtlas, illumination, surface
-from list3r.simulation.things import BOX, CYLINDER, stack_solids
+from list3r.simulation.things import BOX, CYLINDER, Thing, stack_solids
 from list3r.simulation.world import World
 
 Array = NDArray[np.float64]
@@ -35,21 +36,24 @@ class RenderedFrame:
 
 
 class Renderer:
-    """Draws a world with one camera. Solids are culled by the rectangle of their corners and drawn near to far."""
+    """Draws a world with one camera. Solids are culled by the rectangle of their corners and drawn near to far.
 
-    def __init__(self, world: World, camera: Camera) -> None:
+    Things in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
+    """
+
+    def __init__(self, world: World, camera: Camera, moving: Sequence[Thing] = ()) -> None:
         self._world = world
         self._camera = camera
-        self._solids = stack_solids(world.things)
-        self._corners = self._solids.corners()
+        self.scene = Scene(world.things, moving)
+        self._solids = self.scene.solids
         self._atlas = TextureAtlas(self._solids)
-        self._shadows = ContactShadows(world, self._solids)
+        self._shadows = ContactShadows(world, stack_solids(world.things))
         self._x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         self._y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
 
     def render(self, T_world_cam: Array) -> RenderedFrame:
         """The picture from a pose. Shape (4, 4)."""
-        rects = screen_rectangles(self._corners, T_world_cam, self._camera)
+        rects = screen_rectangles(self.scene.corners, T_world_cam, self._camera)
         depth, solid = self._cast(T_world_cam, *rects)
         shape = depth.shape
         hit = np.flatnonzero(solid.ravel() >= 0)

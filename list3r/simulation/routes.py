@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from list3r.simulation.buildings import Building, PlacedRoom
@@ -102,10 +102,10 @@ class FreeMap:
         """A smooth way from one place to another, points 0.1 m apart. Shape (N, 2)."""
         columns = self.clearance_m.shape[1]
         a, b = (int(r * columns + c) for r, c in self.cells(np.stack([start, goal])))
-        _, before = dijkstra(self._graph, directed=True, indices=a, return_predecessors=True)
+        _, before = dijkstra(self._graph, return_predecessors=True, indices=[a])
         trail = [b]
         while trail[-1] != a:
-            step = int(before[trail[-1]])
+            step = int(before[0, trail[-1]])
             assert step >= 0, "rooms of a building are joined"
             trail.append(step)
         row, column = np.divmod(np.array(trail[::-1]), columns)
@@ -117,7 +117,7 @@ class FreeMap:
         return np.asarray(smooth[6:-6])
 
 
-def _grid_graph(cost: Array) -> csr_matrix:
+def _grid_graph(cost: Array) -> csr_array:
     """Edges between neighbouring cells of finite cost."""
     rows, columns = cost.shape
     number = np.arange(rows * columns).reshape(rows, columns)
@@ -132,7 +132,7 @@ def _grid_graph(cost: Array) -> csr_matrix:
         weights.append(weight[ok])
     i, j, w = np.concatenate(heads), np.concatenate(tails), np.concatenate(weights)
     both = (np.concatenate([w, w]), (np.concatenate([i, j]), np.concatenate([j, i])))
-    return coo_matrix(both, shape=(cost.size, cost.size)).tocsr()
+    return coo_array(both, shape=(cost.size, cost.size)).tocsr()
 
 
 @dataclass(frozen=True)

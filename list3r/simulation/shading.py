@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.simulation.layout import Room
 from list3r.simulation.materials import TEXTURE_PX, bake, mip_levels
 from list3r.simulation.things import BOX, Solids
 from list3r.simulation.world import HEIGHT_M, World
@@ -15,6 +16,8 @@ Floats = NDArray[np.float32]
 _CELL_M = 0.02
 _MARGIN_M = 0.3
 _LEVELS = 6
+_LAMP_M = 5.0
+"""Length of room that one lamp lights."""
 
 
 class TextureAtlas:
@@ -66,9 +69,11 @@ class ContactShadows:
             if t.id in supports and t.structure is None
         }
         self._heights = np.array(sorted(tops))
-        self._origin = np.array([-_MARGIN_M, -_MARGIN_M])
+        low = np.array([min(room.x0 for room in world.rooms), min(room.y0 for room in world.rooms)])
+        high = np.array([max(r.x1 for r in world.rooms), max(r.y0 + r.depth for r in world.rooms)])
+        self._origin = low - _MARGIN_M
         corners = solids.corners()
-        reach = np.array([world.rooms[-1].x1, max(room.depth for room in world.rooms)]) + 2 * _MARGIN_M
+        reach = high - low + 2 * _MARGIN_M
         shape = tuple(np.ceil(reach[::-1] / _CELL_M).astype(int))
         self._maps = np.stack([self._bake(corners, float(h), shape) for h in self._heights])
 
@@ -132,12 +137,20 @@ def surface(solids: Solids, solid: NDArray[np.int64], points: Floats, toward: Fl
     return world.astype(np.float32), u.astype(np.float32), v.astype(np.float32)
 
 
+def _lamps(room: Room) -> list[Floats]:
+    """One lamp in the middle of a room, several in a row where it is long."""
+    count = max(1, round((room.x1 - room.x0) / _LAMP_M))
+    share = (np.arange(count) + 0.5) / count
+    y, z = room.y0 + room.depth / 2, HEIGHT_M - 0.15
+    return [np.array([room.x0 + s * (room.x1 - room.x0), y, z], np.float32) for s in share]
+
+
 def illumination(world: World, points: Floats, normals: Floats) -> Floats:
-    """Light on surface points: sky from above, one lamp under each ceiling, gloom near the skirting. Shape (N,)."""
+    """Light on surface points: sky from above, lamps under each ceiling, gloom near the skirting. Shape (N,)."""
     light = 0.50 + 0.12 * normals[:, 2]
-    for room in world.rooms:
-        lamp = np.array([(room.x0 + room.x1) / 2, room.depth / 2, HEIGHT_M - 0.15], np.float32)
+    for room, lamp in [(r, each) for r in world.rooms for each in _lamps(r)]:
         inside = (points[:, 0] > room.x0 - 0.06) & (points[:, 0] < room.x1 + 0.06)
+        inside &= (points[:, 1] > room.y0 - 0.06) & (points[:, 1] < room.y0 + room.depth + 0.06)
         ray = lamp - points
         distance = np.linalg.norm(ray, axis=1)
         cosine = np.einsum("nk,nk->n", ray, normals) / np.maximum(distance, 1e-3)

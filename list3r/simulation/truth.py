@@ -52,6 +52,23 @@ def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
     }
 
 
+def mover_truth(thing: Thing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
+    """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
+
+    `thing` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
+    """
+    yaw = np.arctan2(T_world_object[:, 1, 0], T_world_object[:, 0, 0])
+    return {
+        "id": thing.id,
+        "label": thing.label,
+        "size": _rounded(thing.box().size),
+        "position": [_rounded(p) for p in T_world_object[:, :3, 3]],
+        "yaw": _rounded(yaw),
+        "frames_seen": seen.get("frames", 0),
+        "largest_px": seen.get("largest_px", 0),
+    }
+
+
 def true_relations(world: World) -> list[tuple[int, str, int]]:
     """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `next_to` by gap, both ways.
 

@@ -76,7 +76,7 @@ def looking_at(eye: tuple[float, float, float], target: tuple[float, float, floa
     """T_world_cam of an upright camera at `eye` that looks at `target`, metres. Shape (4, 4)."""
     x, y, z = np.array(target) - np.array(eye)
     angles = [np.array([a]) for a in (np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), 0.0)]
-    return look_poses(np.array([eye]), *angles)[0]
+    return np.asarray(look_poses(np.array([eye]), *angles)[0])
 
 
 def _path(stops: tuple[Stop, ...], settings: PathSettings) -> tuple[Array, Array, Array, Array]:
