@@ -1,4 +1,4 @@
-"""eval trajectory, instances: results against truth."""
+"""eval trajectory, cloud, instances, revisits: results against truth."""
 
 from __future__ import annotations
 
@@ -8,69 +8,199 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.common import JsonOption, open_memory, print_json, print_table
+from list3r.cli.evaluation_cloud import cloud
+from list3r.cli.evaluation_inputs import align_by_path, is_memory, mask_frames, read_scene_of, read_trajectory
+from list3r.cli.evaluation_options import (
+    Estimate,
+    PlotOption,
+    ScaleOption,
+    Truth,
+    check_plot,
+    check_scale,
+    free_scale,
+    save_picture,
+    share,
+)
+from list3r.cli.evaluation_revisits import revisits
 
 if TYPE_CHECKING:
-    from list3r.evaluation.trajectory import Trajectory
+    from matplotlib.figure import Figure
 
-Truth = Annotated[Path, typer.Argument(metavar="TRUTH", show_default=False)]
-Estimate = Annotated[Path, typer.Argument(metavar="ESTIMATE", show_default=False)]
+    from list3r.evaluation.trajectory import Trajectory
+    from list3r.memory.geometry import Sim3
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     group = typer.Typer(help="Measure a result against truth.", no_args_is_help=True, rich_markup_mode=None)
-    group.command("trajectory")(trajectory)
-    group.command("instances")(instances)
+    for command in (trajectory, cloud, instances, revisits):
+        group.command(command.__name__)(command)
     app.add_typer(group, name="eval")
+
+
+# ---------------------------------------------------------------------------------------------- trajectory
 
 
 def trajectory(
     truth: Truth,
     estimate: Estimate,
-    delta: Annotated[int, typer.Option("--delta", help="Distance of the poses that RPE relates, frames.")] = 1,
+    delta: Annotated[
+        str, typer.Option("--delta", help="Distance of the poses that RPE relates: 10 (frames), 0.5m or 2s.")
+    ] = "1",
     tolerance: Annotated[float, typer.Option("--tolerance", help="Greatest gap of associated times, seconds.")] = 0.01,
+    scale: Annotated[
+        str, typer.Option("--scale", help="Of the picture: free, fixed or auto (free for a memory of relative scale).")
+    ] = "auto",
+    plot: PlotOption = None,
     json: JsonOption = False,
 ) -> None:
     """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a TUM file, a memory, or a source with poses.
 
-    Example: list3r eval trajectory walk/groundtruth.txt house.l3r
+    Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
     """
-    from list3r.evaluation.trajectory import evaluate_trajectory
+    from list3r.evaluation.trajectory import Delta, evaluate_trajectory
 
-    errors = evaluate_trajectory(_trajectory(truth), _trajectory(estimate), tolerance, delta).as_dict()
+    check_scale(scale)
+    check_plot(plot)
+    apart = Delta.parse(delta)
+    true, found = read_trajectory(truth), read_trajectory(estimate)
+    errors = evaluate_trajectory(true, found, tolerance, delta=apart)
+    if plot is not None:
+        free = free_scale(scale, estimate)
+        save_picture(
+            _trajectory_figure(true, found, tolerance, f"{estimate.name} against {truth.name}", free=free), plot
+        )
+    scores = errors.as_dict()
     if json:
-        print_json(errors)
+        print_json(scores)
         return
-    print(f"{errors['pairs']} poses associated; scale {errors['scale']:.4f}; RPE over {delta} frame(s)")
-    names = ("ate_se3_m", "ate_sim3_m", "rpe_translation_m", "rpe_rotation_deg")
+    covered = errors.covered
+    print(f"{errors.pairs} poses associated; scale {errors.scale:.4f}; RPE over {apart}")
+    gaps = f"{covered.gaps} gap{'s' * (covered.gaps != 1)}, the longest stretch without poses"
+    missing = "" if covered.longest_gap_s == 0 else f"; {gaps} {covered.longest_gap_s:.2f} s"
+    print(f"the estimate covers {100 * covered.truth:.1f} % of the truth's time{missing}")
+    if errors.coverage < 1:
+        print(f"{100 * errors.coverage:.1f} % of its poses have a true one within {tolerance:g} s")
+    names = ("ate_se3_m", "ate_sim3_m", "rpe_translation_m", "rpe_translation_sim3_m", "rpe_rotation_deg")
     keys = ("rmse", "mean", "median", "std", "max")
-    print_table([[name, *[f"{errors[name][key]:.4f}" for key in keys]] for name in names], ["", *keys])
+    print_table([[name, *[f"{scores[name][key]:.4f}" for key in keys]] for name in names], ["", *keys])
+
+
+def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float, title: str, *, free: bool) -> Figure:
+    from list3r.evaluation.figures import trajectory_figure
+    from list3r.evaluation.trajectory import align, associated, position_errors
+
+    a, b = associated(truth, estimate, tolerance)
+    S_truth_estimate = align(a, b, with_scale=free)
+    errors = position_errors(a, b, S_truth_estimate)
+    kind = f"Sim(3), scale {float(S_truth_estimate.scale):.4f}" if free else "SE(3)"
+    words = f"{title}\nATE {float((errors**2).mean() ** 0.5):.4f} m RMSE over {len(errors)} poses, {kind}"
+    return trajectory_figure(truth, b.time_s, S_truth_estimate.apply(b.positions()), errors, words)
+
+
+# ---------------------------------------------------------------------------------------------- instances
 
 
 def instances(
     truth: Truth,
     estimate: Estimate,
-    truth_trajectory: Annotated[
-        Path | None, typer.Option("--align", metavar="TRAJECTORY", help="True trajectory, to place a memory by.")
+    align: Annotated[
+        str | None,
+        typer.Option(
+            "--align",
+            metavar="TRAJECTORY|none",
+            help="True path of the camera, to place a memory by. Absent: groundtruth.txt beside TRUTH, if it is there.",
+        ),
     ] = None,
+    scale: ScaleOption = "auto",
+    ids: Annotated[
+        Path | None,
+        typer.Option(
+            "--ids",
+            metavar="FOLDER",
+            help="Pictures of the true ids of every frame, for id switches of a memory. Absent: ids/ beside TRUTH.",
+        ),
+    ] = None,
+    every: Annotated[int, typer.Option("--every", metavar="N", help="Follow ids over every N-th frame.")] = 1,
+    plot: PlotOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Recall, precision, duplicates of instances and relations. TRUTH: a truth.json; ESTIMATE: a memory or scene JSON.
+    """Recall, precision, duplicates, merges, id switches; relations. TRUTH: a truth.json; ESTIMATE: a memory or scene
+    JSON.
 
-    Example: list3r eval instances walk/truth.json rooms.l3r --align walk/groundtruth.txt
+    Example: list3r eval instances walk/truth.json rooms.l3r --plot found.png
     """
-    from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
+    from list3r.evaluation.scene import evaluate_scene, read_scene
+    from list3r.memory.errors import OptionError
 
-    S_truth_scene = None
-    if truth_trajectory is not None:
-        S_truth_scene = alignment_of(_trajectory(truth_trajectory), _trajectory(estimate), with_scale=False)
-    scores = evaluate_scene(_scene(estimate), read_scene(truth), S_truth_scene)
+    check_scale(scale)
+    check_plot(plot)
+    if every < 1:
+        raise OptionError(f"--every {every}: take every n-th frame with n of at least 1")
+    true, found = read_scene(truth), read_scene_of(estimate)
+    beside = truth.parent / "groundtruth.txt"
+    if align is None and is_memory(estimate) and beside.is_file():
+        align = str(beside)
+    S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, scale)
+    scores = evaluate_scene(found, true, S_truth_scene)
+    scores["identities"] = _identities(true, truth, estimate, ids, every)
+    if plot is not None:
+        save_picture(
+            _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), plot
+        )
     if json:
         print_json(scores)
         return
+    if S_truth_scene is not None:
+        print(f"placed by the camera's path in {align}, scale {float(S_truth_scene.scale):.4f}")
     print_table(score_rows(scores), ["", "recall", "precision", "more"])
     for missed in scores["missed"]:
         print(f"missed: {missed['label']} ({missed['id']})")
+    identities = scores["identities"]
+    if identities is not None:
+        print(
+            f"{identities['switches']} id switches of {identities['objects']} things in {identities['frames']} frames"
+        )
+        labels = {int(e["id"]): e.get("label") for e in true["instances"]}
+        for k, several in identities["several_ids"].items():
+            print(f"several ids: {labels.get(k)} ({k}) was {', '.join(map(str, several))}")
+
+
+def _identities(
+    true: dict[str, Any], truth: Path, estimate: Path, ids: Path | None, every: int
+) -> dict[str, Any] | None:
+    """Id switches, None where there are no true ids of pixels or the estimate has no masks."""
+    from list3r.evaluation.identity import evaluate_identities
+    from list3r.memory.errors import OptionError
+
+    folder = ids or truth.parent / "ids"
+    if ids is not None and not ids.is_dir():
+        raise OptionError(f"--ids {ids} is no folder; give the folder with one picture of true ids a frame")
+    if not is_memory(estimate):
+        if ids is not None:
+            raise OptionError(f"--ids: {estimate} has no masks; id switches are measured on a memory")
+        return None
+    if not folder.is_dir():
+        return None
+    wanted = {int(e["id"]) for e in true["instances"] if not e.get("structure")}
+    with open_memory(estimate) as scene:
+        return evaluate_identities(mask_frames(scene.store, folder, every), wanted).as_dict()
+
+
+def _instances_figure(
+    true: dict[str, Any], found: dict[str, Any], scores: dict[str, Any], S_truth_scene: Sim3 | None, title: str
+) -> Figure:
+    from list3r.evaluation.figures import instances_figure
+    from list3r.evaluation.scene import scene_boxes
+
+    labels = {int(e["id"]): str(e.get("label") or e.get("description") or "") for e in true["instances"]}
+    matches = scores["matched_ids"]
+    counted = {t for t, _, _ in matches} | {m["id"] for m in scores["missed"]}
+    true_boxes = {k: (box, labels[k]) for k, box in scene_boxes(true).items() if k in counted}
+    boxes = {k: (box, "") for k, box in scene_boxes(found, S_truth_scene).items()}
+    loose = scores["instances_0.25"]
+    words = f"{title}: recall {loose['recall']:.2f}, precision {loose['precision']:.2f} at IoU 0.25"
+    return instances_figure(true_boxes, boxes, matches, words)
 
 
 def score_rows(scores: dict[str, Any]) -> list[list[object]]:
@@ -79,66 +209,7 @@ def score_rows(scores: dict[str, Any]) -> list[list[object]]:
     for threshold in ("0.25", "0.50"):
         entry = scores[f"instances_{threshold}"]
         more = f"{entry['duplicates']} duplicates, {entry['merged_pairs']} merged pairs"
-        rows.append([f"things at IoU {threshold}", _share(entry["recall"]), _share(entry["precision"]), more])
+        rows.append([f"things at IoU {threshold}", share(entry["recall"]), share(entry["precision"]), more])
     for name, entry in scores["relations"]["by_predicate"].items():
-        rows.append([f"{name}, of matched things", _share(entry["recall"]), _share(entry["precision"]), ""])
+        rows.append([f"{name}, of matched things", share(entry["recall"]), share(entry["precision"]), ""])
     return rows
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _is_memory(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(16) == b"SQLite format 3\x00"
-
-
-def _scene(path: Path) -> dict[str, Any]:
-    from list3r.evaluation.scene import read_scene
-    from list3r.exporters.scene_json import scene_dict
-
-    if not _is_memory(path):
-        return read_scene(path)
-    with open_memory(path) as scene:
-        return scene_dict(scene.store)
-
-
-def _trajectory(path: Path) -> Trajectory:
-    from list3r.evaluation.trajectory import read_tum
-
-    if path.is_dir() or path.suffix.lower() in (".mp4", ".mov", ".mkv", ".webm"):
-        return _given(path)
-    return _stored(path) if _is_memory(path) else read_tum(path)
-
-
-def _stored(path: Path) -> Trajectory:
-    import numpy as np
-
-    from list3r.evaluation.trajectory import Trajectory
-    from list3r.memory.errors import OptionError
-
-    with open_memory(path) as scene:
-        poses = scene.store.camera_poses()
-    if not poses:
-        raise OptionError(f"{path} has no frame with a pose; finish its build with --resume")
-    return Trajectory(np.array([f.time_s for f, _ in poses]), np.stack([S.as_matrix() for _, S in poses]))
-
-
-def _given(path: Path) -> Trajectory:
-    """The poses that come with a source."""
-    import numpy as np
-
-    from list3r.evaluation.trajectory import Trajectory
-    from list3r.frames.base import Frame
-    from list3r.frames.source import open_source
-    from list3r.memory.errors import OptionError
-
-    source = open_source(path)
-    if not source.info.has_poses:
-        raise OptionError(f"{path} has no poses; give a TUM trajectory file, a memory, or a source with poses")
-    frames = [f for f in source.read(0, source.info.frame_count) if isinstance(f, Frame) and f.T_source_cam is not None]
-    poses = [f.T_source_cam for f in frames if f.T_source_cam is not None]
-    return Trajectory(np.array([f.time_s for f in frames]), np.stack(poses))

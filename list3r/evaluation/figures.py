@@ -27,6 +27,10 @@ _GREY, _FOUND, _MISSED, _FALSE = "#8a8f98", "#2a9d5c", "#d1495b", "#9aa0a8"
 _MOST_POINTS = 60_000
 
 
+UPRIGHT: tuple[Array, str] = (np.eye(3)[:2], "seen along -z")
+"""The page of a world of which z is up, see `page_axes`."""
+
+
 def check_ending(path: str | Path) -> Path:
     """The path of a picture. Raises `OptionError` for an ending that is no kind of picture that is written here."""
     path = Path(path)
@@ -111,40 +115,38 @@ def _gaps(moments: Array) -> NDArray[np.bool_]:
 
 
 def cloud_figure(
-    estimate: Array, to_truth: Array, truth: Array, to_estimate: Array, limit_m: float, title: str
+    clouds: tuple[Array, Array],
+    distances: tuple[Array, Array],
+    limit_m: float,
+    title: str,
+    page: tuple[Array, str],
 ) -> Figure:
-    """Both clouds from above (along z), every point in the colour of its distance to the other cloud.
+    """Estimate and truth from above, every point in the colour of its distance to the other cloud.
 
-    Points (N, 3) and (M, 3), distances (N,) and (M,), metres; the colours end at `limit_m`.
+    Points (N, 3) and (M, 3), distances (N,) and (M,), metres; the colours end at `limit_m`. `page` as of `page_axes`.
     """
-    figure, panels = _sheet(figsize=(11.0, 6.2), columns=2)
-    both = np.concatenate([estimate[:, :2], truth[:, :2]])
-    low, high = np.quantile(both, [0.001, 0.999], axis=0)
+    axes, note = page
+    flat = [points @ axes.T for points in clouds]
+    low, high = np.quantile(np.concatenate(flat), [0.001, 0.999], axis=0)
     margin = 0.03 * float(np.max(high - low)) + 1e-6
+    ratio = float(np.clip((high - low + margin)[1] / max((high - low + margin)[0], 1e-9), 0.25, 1.6))
+    figure, panels = _sheet(figsize=(11.0, 4.9 * ratio + 1.4), columns=2)
     drawn: Any = None
-    for axis, points, distance, name in (
-        (panels[0], estimate, to_truth, "estimate: distance to the truth (accuracy)"),
-        (panels[1], truth, to_estimate, "truth: distance to the estimate (completeness)"),
-    ):
+    names = ("estimate: distance to the truth (accuracy)", "truth: distance to the estimate (completeness)")
+    for axis, points, xy, distance, name in zip(panels, clouds, flat, distances, names, strict=True):
         rows = np.arange(len(points))
         if len(rows) > _MOST_POINTS:
             rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_POINTS, replace=False))
-        rows = rows[np.argsort(points[rows, 2], kind="stable")]
+        rows = rows[np.argsort(points[rows] @ np.cross(*axes), kind="stable")]
+        color = np.minimum(100 * distance[rows], 100 * limit_m)
         drawn = axis.scatter(
-            *points[rows, :2].T,
-            c=np.minimum(100 * distance[rows], 100 * limit_m),
-            s=1.2,
-            cmap="viridis",
-            vmin=0,
-            vmax=100 * limit_m,
-            linewidths=0,
-            rasterized=True,
+            *xy[rows].T, c=color, s=1.2, cmap="viridis", vmin=0, vmax=100 * limit_m, linewidths=0, rasterized=True
         )
         axis.set_aspect("equal")
         axis.set_xlim(low[0] - margin, high[0] + margin)
         axis.set_ylim(low[1] - margin, high[1] + margin)
         axis.set_title(name, fontsize=9)
-        axis.set_xlabel("m, seen along -z", fontsize=9)
+        axis.set_xlabel(f"m, {note}", fontsize=9)
     figure.colorbar(drawn, ax=list(panels), label="distance, cm", fraction=0.03, pad=0.02, extend="max")
     figure.suptitle(title, fontsize=11)
     return figure

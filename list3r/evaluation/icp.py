@@ -42,7 +42,8 @@ def register(
     reach = settings.reach_m
     for _ in range(settings.rounds):
         moved = S.apply(p)
-        distance, row = tree.query(moved, distance_upper_bound=reach, workers=-1)
+        nearest = tree.query(moved, distance_upper_bound=reach, workers=-1)
+        distance, row = np.asarray(nearest[0]), np.asarray(nearest[1])
         near = np.isfinite(distance)
         if near.sum() < max(10, settings.least_share * len(p)):
             raise DegenerateError(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from list3r.evaluation.cloud import Array
+from list3r.evaluation.cloud import Array, near_order
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.geometry import Sim3
 
@@ -78,7 +78,7 @@ def _read(path: Path, ending: str) -> tuple[Any, Any, str]:
     if ending == ".pcd":
         import open3d
 
-        cloud = open3d.io.read_point_cloud(str(path))
+        cloud: Any = open3d.io.read_point_cloud(str(path))  # type: ignore[arg-type]
         return np.asarray(cloud.points), np.asarray(cloud.normals) if cloud.has_normals() else None, "a cloud"
     return _read_mesh(path)
 
@@ -152,19 +152,21 @@ def _means(values: Array, owner: NDArray[np.int64], count: NDArray[np.int64]) ->
     )
 
 
-def estimate_normals(points: ArrayLike, neighbours: int = 16) -> Array:
+def estimate_normals(points: ArrayLike, neighbours: int = 24) -> Array:
     """Unit normals, either way round, of the planes through each point's nearest neighbours. Shape (N, 3) -> (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
     k = min(neighbours, len(p))
     if k < 3:
         return np.tile([0.0, 0.0, 1.0], (len(p), 1))
-    tree = cKDTree(p, balanced_tree=False)
+    order = near_order(p)
+    sorted_points = p[order]
+    tree = cKDTree(sorted_points, balanced_tree=False)
     out = np.empty_like(p)
-    for start in range(0, len(p), 100_000):
-        rows = slice(start, start + 100_000)
-        near = p[np.asarray(tree.query(p[rows], k, workers=-1)[1])]
+    for start in range(0, len(p), 50_000):
+        rows = slice(start, start + 50_000)
+        near = sorted_points[np.asarray(tree.query(sorted_points[rows], k, workers=-1)[1])]
         near -= near.mean(axis=1, keepdims=True)
-        out[rows] = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
+        out[order[rows]] = np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0]
     return out
 
 

@@ -60,6 +60,12 @@ class FolderSource:
             except FrameError as error:
                 yield BadFrame(number, str(error))
 
+    def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
+        """Frame.index, seconds and pose of the colour camera of every frame that has one; no picture is decoded."""
+        found = [(k, self._layout.files[k]) for k in self._numbers]
+        poses = [(k, self._time_s(k, file), self._pose(file)) for k, file in found]
+        return [(k, time_s, T) for k, time_s, T in poses if T is not None]
+
     def read_raw(self, position: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour as stored, shape (H, W, 3), and metric depth on the depth camera's own pixels, shape (h, w).
 
@@ -79,8 +85,10 @@ class FolderSource:
             if file.depth is None:
                 raise FrameError(f"{file.color.name} has no depth image")
             depth = self._rig.depth(read_raw_depth(file.depth))
-        time_s = number / self._fps if file.time_s is None or self._options.fps else file.time_s
-        return Frame(number, time_s, color, depth, self._pose(file))
+        return Frame(number, self._time_s(number, file), color, depth, self._pose(file))
+
+    def _time_s(self, number: int, file: FrameFile) -> float:
+        return number / self._fps if file.time_s is None or self._options.fps else file.time_s
 
     def _pose(self, file: FrameFile) -> NDArray[np.float64] | None:
         """The colour camera's pose, None where the file has none or an invalid one."""
