@@ -7,17 +7,18 @@ it (`cross_check`): a model that is shown two look-alike places invents a relati
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.alignment import align
 from list3r.association.chain import adjoint
 from list3r.association.cross_check import CrossSettings, Side, cross_check
 from list3r.association.edges import EdgeSettings, measure_edge
-from list3r.association.instance_cues import InstanceCues
+from list3r.association.support import shared_samples
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, JointWindow
@@ -46,8 +47,8 @@ class WindowSettings:
     """Every so many posed frames."""
     least_confidence: float = 0.2
     """Least confidence m of either side's alignment."""
-    most_scale_ratio: float = 1.6
-    """Largest ratio of the window's scale to that of the instances' layout, where four or more agree on one."""
+    rough_pairs: int = 600
+    """Pairs of points of the first estimate of either side."""
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     cross: CrossSettings = field(default_factory=CrossSettings)
 
@@ -69,45 +70,71 @@ class Place:
         return self.chunk_id, self.frame
 
 
+Objection = Callable[[Sim3], str | None]
+"""Why a relation S_v_u cannot be, or None."""
+
+
 def joint_edge(
     joint: JointReconstructor,
     u: Place,
     v: Place,
-    cues: InstanceCues,
-    verified: bool = True,
+    objection: Objection | None = None,
     settings: WindowSettings | None = None,
 ) -> Edge:
     """The loop edge from u to v through a joint window, accepted or rejected with the reason.
 
-    With `verified` false every edge that can be measured is accepted (the paper's baseline, VGGT-Long).
+    Without `objection` every edge that can be measured is accepted (the paper's baseline, VGGT-Long). With it a first
+    estimate is put to the test, and only what stands is measured with care.
     """
     chosen = settings or WindowSettings()
     frames_u, frames_v = window_frames(u, chosen), window_frames(v, chosen)
     window = joint(u.session_id, frames_u.tolist(), v.session_id, frames_v.tolist())
     if window is None:
         return no_edge(u.end, v.end, "the frames of the two places cannot be reconstructed together")
+    verdict = _Verdict(u, v, (frames_u, frames_v), objection, chosen)
     try:
+        if objection is not None:
+            rough = _rough(window.v, v.side.samples, chosen) @ _rough(u.side.samples, window.u, chosen)
+            if against := verdict.of(rough):
+                return replace(no_edge(u.end, v.end, against), S_v_u=rough, scores=verdict.scores)
         to_window = _half(u.side.samples, window.u, u, window, chosen.edges)
         to_v = _half(window.v, v.side.samples, v, window, chosen.edges)
     except DegenerateError as error:
         return no_edge(u.end, v.end, f"the joint window does not fit its chunks: {error}")
     edge = _composed(u, v, to_window, to_v)
-    if not verified:
-        return replace(edge, accepted=True, weight=edge.confidence)
-    against = _misfit(to_window, to_v, cues, edge, chosen)
-    check = cross_check(edge.S_v_u, u.side, v.side, (frames_u, frames_v), chosen.cross)
-    scores = {"overlap": check.overlap, "agreement": check.agreement, "kinds": float(check.kinds)}
-    if check.kinds and np.isfinite(check.likeness):
-        scores["likeness"] = check.likeness
-    against = against or check.contradiction(chosen.cross)
-    seen = f"{check.overlap:.0%} of the surface is seen by both chunks, {check.agreement:.0%} of it agrees"
+    if objection is None:
+        return edge
+    against = _misfit(to_window, to_v, chosen) or verdict.of(edge.S_v_u)
     return replace(
         edge,
         accepted=against is None,
         weight=0.0 if against else edge.confidence,
-        reason=f"{edge.reason}; {against or seen}",
-        scores=edge.scores | scores,
+        reason=f"{edge.reason}; {against or verdict.seen}",
+        scores=edge.scores | verdict.scores,
     )
+
+
+class _Verdict:
+    """What speaks against a relation; `scores` and `seen` tell of the last one."""
+
+    def __init__(
+        self, u: Place, v: Place, made_from: tuple[Ints, Ints], objection: Objection | None, settings: WindowSettings
+    ) -> None:
+        self._u, self._v, self._made_from, self._objection = u, v, made_from, objection
+        self._settings = settings.cross
+        self.scores: dict[str, float] = {}
+        self.seen = ""
+
+    def of(self, S_v_u: Sim3) -> str | None:
+        """Why it cannot be, or None."""
+        if self._objection is not None and (against := self._objection(S_v_u)):
+            return against
+        check = cross_check(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
+        self.scores = {"overlap": check.overlap, "agreement": check.agreement, "kinds": float(check.kinds)}
+        if np.isfinite(check.likeness):
+            self.scores["likeness"] = check.likeness
+        self.seen = f"{check.overlap:.0%} of the surface is seen by both chunks, {check.agreement:.0%} of it agrees"
+        return check.contradiction(self._settings)
 
 
 def window_frames(place: Place, settings: WindowSettings) -> Ints:
@@ -134,6 +161,15 @@ def no_edge(u: tuple[int, int], v: tuple[int, int], reason: str) -> Edge:
         reason=reason,
         frames=(u[1], v[1]),
     )
+
+
+def _rough(a: FrameSamples, b: FrameSamples, settings: WindowSettings) -> Sim3:
+    """A first estimate of the similarity from a to b, by some of the samples that they share."""
+    at_a, at_b = shared_samples(a, b)
+    pick = np.linspace(0, len(at_a) - 1, min(len(at_a), settings.rough_pairs)).astype(np.int64)
+    at_a, at_b = at_a[pick], at_b[pick]
+    weight = np.sqrt(a.confidence[at_a] * b.confidence[at_b])
+    return align(a.points[at_a], b.points[at_b], weight, a.frame[at_a], False, settings.edges.alignment).S_v_u
 
 
 def _half(a: FrameSamples, b: FrameSamples, place: Place, window: JointWindow, settings: EdgeSettings) -> Edge:
@@ -177,12 +213,8 @@ def composed_covariance(first: Edge, second: Edge) -> Array | None:
     return np.asarray(moved @ second.covariance @ moved.T + first.covariance)
 
 
-def _misfit(to_window: Edge, to_v: Edge, cues: InstanceCues, edge: Edge, settings: WindowSettings) -> str | None:
+def _misfit(to_window: Edge, to_v: Edge, settings: WindowSettings) -> str | None:
     for half in (to_window, to_v):
         if not half.accepted or half.confidence < settings.least_confidence:
             return f"the joint window does not fit chunk {half.u}: {half.reason}"
-    if len(cues.pairs) >= 4 and np.isfinite(cues.log_scale):
-        ratio = float(np.exp(abs(np.log(float(edge.S_v_u.scale)) - cues.log_scale)))
-        if ratio > settings.most_scale_ratio:
-            return f"its scale is {ratio:.1f} times off that of the instances' layout"
     return None

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
-from list3r.association.chain import ChainSettings, predict
+import numpy as np
+
+from list3r.association.chain import ChainSettings, Prediction, predict
 from list3r.association.cross_check import Side
 from list3r.association.frame_search import Candidate, DescriptorStore, SearchSettings, find_candidates
 from list3r.association.instance_cues import (
@@ -24,10 +27,11 @@ from list3r.association.instance_cues import (
     instance_set,
     loop_score,
 )
-from list3r.association.joint_window import JointReconstructor, Place, WindowSettings, joint_edge, no_edge
+from list3r.association.joint_window import JointReconstructor, Objection, Place, WindowSettings, joint_edge, no_edge
 from list3r.association.verification import VerificationSettings, verify
 from list3r.frames.base import Camera
 from list3r.memory.chunk_verbs import LocalNode
+from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 
 STRICT = 0.85
@@ -50,6 +54,10 @@ class RevisitSettings:
     """Most candidates of a chunk that are verified."""
     enough: int = 6
     """Accepted edges after which no further candidate of a chunk is verified."""
+    layout_pairs: int = 5
+    """Instances that must agree on a layout for its scale to count."""
+    most_scale_ratio: float = 1.6
+    """Largest ratio of an edge's scale to that of the instances' layout."""
     search: SearchSettings = field(default_factory=SearchSettings)
     cues: CueSettings = field(default_factory=CueSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
@@ -131,6 +139,14 @@ def _with_scores(edge: Edge, scored: _Scored) -> Edge:
     return replace(edge, scores=edge.scores | scores)
 
 
+def _objected(edge: Edge, objection: Objection) -> Edge:
+    """An edge, rejected where there is an objection."""
+    against = objection(edge.S_v_u) if edge.accepted else None
+    if against is None:
+        return edge
+    return replace(edge, accepted=False, weight=0.0, reason=f"{against} ({edge.reason})")
+
+
 class _Lookout:
     """The new chunk, and the stored ones it is compared with, read once each."""
 
@@ -156,31 +172,33 @@ class _Lookout:
 
     def verified(self, scored: _Scored, joint: JointReconstructor | None, found: Sequence[Edge]) -> Edge:
         """The edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
-        edge = self._measured(scored, joint)
-        if not edge.accepted or not self._settings.verified:
-            return edge
-        way = predict([*self._edges, *found], edge.u, edge.v, self._settings.chain)
-        if way is None:
-            return edge
-        off = way.deviations(edge.S_v_u)
-        edge = replace(edge, scores=edge.scores | {"way": off})
-        if off <= self._settings.chain.most_deviations:
-            return edge
-        reason = f"the way between the chunks contradicts it by {off:.0f} deviations ({edge.reason})"
-        return replace(edge, accepted=False, weight=0.0, reason=reason)
-
-    def _measured(self, scored: _Scored, joint: JointReconstructor | None) -> Edge:
         c = scored.candidate
         u, v = self._rows[c.u], self._rows[self._id]
+        way = predict([*self._edges, *found], c.u, self._id, self._settings.chain)
+        objection = partial(self._objection, scored.cues, way)
         edge = None
         keyframe_u, keyframe_v = self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
         if all(k.depth_small.size and len(k.keypoints_xy) for k in (keyframe_u, keyframe_v)):
             metric = u.scale_kind == v.scale_kind == "metric"
             edge = verify(keyframe_u, keyframe_v, c.u, self._id, metric, self._settings.verification)
+            edge = _objected(edge, objection) if self._settings.verified else edge
         if joint is None or (edge is not None and edge.accepted):
-            return edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
-        place_u, place_v = self._place(u, c.frame_u), self._place(v, c.frame_v)
-        return joint_edge(joint, place_u, place_v, scored.cues, self._settings.verified, self._settings.window)
+            edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
+        else:
+            ends = self._place(u, c.frame_u), self._place(v, c.frame_v)
+            edge = joint_edge(joint, *ends, objection if self._settings.verified else None, self._settings.window)
+        off = {} if way is None else {"way": way.deviations(edge.S_v_u)}
+        return replace(edge, scores=edge.scores | off)
+
+    def _objection(self, cues: InstanceCues, way: Prediction | None, S_v_u: Sim3) -> str | None:
+        """What the way between the chunks and the layout of their instances say against a relation."""
+        if way is not None and (off := way.deviations(S_v_u)) > self._settings.chain.most_deviations:
+            return f"the way between the chunks contradicts it by {off:.0f} deviations"
+        if len(cues.pairs) >= self._settings.layout_pairs and np.isfinite(cues.log_scale):
+            ratio = float(np.exp(abs(np.log(float(S_v_u.scale)) - cues.log_scale)))
+            if ratio > self._settings.most_scale_ratio:
+                return f"its scale is {ratio:.1f} times off that of the instances' layout"
+        return None
 
     def _place(self, row: ChunkRow, frame: int) -> Place:
         return Place(row.chunk_id, row.session_id, frame, row.scale_kind == "metric", self._side(row.chunk_id))
