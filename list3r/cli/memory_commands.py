@@ -25,7 +25,10 @@ def register(app: typer.Typer) -> None:
 def info(
     memory: MemoryArgument,
     loops: Annotated[
-        bool, typer.Option("--loops", help="List every measured relation of chunks and its verdict.")
+        bool,
+        typer.Option(
+            "--loops", help="List every loop candidate: scores, verdict and reason; how surely chunks are placed."
+        ),
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -33,11 +36,14 @@ def info(
 
     Example: list3r info house.l3r --loops
     """
+    from list3r.cli.loop_report import loop_report, print_loop_report
+
     with open_memory(memory) as scene:
         report = memory_report(scene)
-        edges = [_edge(e) for e in scene.store.edges() if e.kind == "loop" or loops]
+        chunks = loop_report(scene.store) if loops else {}
+        units = scene.units
     if json:
-        print_json({**report, "edges": edges} if loops else report)
+        print_json({**report, **chunks})
         return
     for key, value in report.items():
         if key != "sessions":
@@ -47,11 +53,7 @@ def info(
             f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}"
         )
     if loops:
-        rows = [
-            [e["u"], e["v"], e["kind"], e["frames"], e["inliers"], e["residual_m"], e["weight"], e["reason"]]
-            for e in edges
-        ]
-        print_table(rows, ["u", "v", "kind", "frames", "inliers", "residual", "weight", "verdict"])
+        print_loop_report(chunks, units)
 
 
 def memory_report(scene: SceneMemory) -> dict[str, Any]:
@@ -82,21 +84,6 @@ def memory_report(scene: SceneMemory) -> dict[str, Any]:
             {"id": s.session_id, "source": s.source, "frames": s.frame_count, "state": s.state}
             for s in store.sessions()
         ],
-    }
-
-
-def _edge(edge: Any) -> dict[str, Any]:
-    return {
-        "u": edge.u,
-        "v": edge.v,
-        "kind": edge.kind,
-        "frames": "" if edge.frames is None else "{}-{}".format(*edge.frames),
-        "inliers": edge.inliers,
-        "residual_m": edge.residual_m,
-        "weight": edge.weight,
-        "accepted": edge.accepted,
-        "reason": edge.reason,
-        "scores": edge.scores,
     }
 
 

@@ -215,11 +215,20 @@ def revisits_figure(frame: NDArray[np.int64], share: NDArray[np.float32], judged
         (True, 0, _MISSED, "X", "accepted, wrong"),
         (True, -1, "#e0a030", "o", "accepted, open"),
         (False, 1, "#3573b9", "^", "rejected, yet a revisit"),
-        (False, 0, _FALSE, ".", "rejected, right"),
+        (False, 0, "#5b6470", "v", "rejected, right"),
+        (False, -1, "#e0a030", ".", "rejected, open"),
     ):
         rows = (c.accepted == wanted) & (judged.frame_labels == label)
         if rows.any():
-            axis.scatter(pair[rows, 0], pair[rows, 1], s=34, color=color, marker=mark, label=f"{name} ({rows.sum()})")
+            axis.scatter(
+                pair[rows, 0],
+                pair[rows, 1],
+                s=34,
+                color=color,
+                marker=mark,
+                label=f"{name} ({rows.sum()})",
+                clip_on=False,
+            )
     figure.colorbar(drawn, ax=axis, label="share of the surface seen in both frames", fraction=0.045, pad=0.02)
     axis.set_xlabel("frame", fontsize=9)
     axis.set_ylabel("frame", fontsize=9)
