@@ -46,6 +46,8 @@ class Front:
     """Which off-diagonal blocks of the matrix enter here. Shape (N,)."""
     at: tuple[Rows, Rows]
     """Block row and column of those within this front, row > column."""
+    repeated: bool
+    """True where two of them are at one place."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,8 @@ def _pattern(count: int, size: int, place: Rows, structure: list[Rows], rows: Ro
         entries = order[bounds[k] : bounds[k + 1]]
         at = (np.searchsorted(held[k], later[entries]), np.searchsorted(held[k], sooner[entries]))
         scalar = (into[:, None] * size + np.arange(size)).ravel()
-        fronts.append(Front(block_at[a:b], block_at[below[k]], parent, scalar, entries, at))
+        repeated = len(np.unique(at[0] * count + at[1])) < len(entries)
+        fronts.append(Front(block_at[a:b], block_at[below[k]], parent, scalar, entries, at, repeated))
     front_of = np.empty(count, np.int64)
     front_of[block_at] = front_at
     return BlockPattern(count, size, tuple(fronts), place[rows] < place[columns], front_of)
@@ -155,7 +158,11 @@ class BlockFactor:
             p, n = len(front.pivots), len(front.pivots) + len(front.below)
             matrix = np.zeros((n, d, n, d))
             matrix[np.arange(p), :, np.arange(p), :] = diagonal[front.pivots]
-            np.add.at(matrix, (front.at[0], slice(None), front.at[1], slice(None)), oriented[front.entries])
+            blocks = matrix.transpose(0, 2, 1, 3)
+            if front.repeated:
+                np.add.at(blocks, front.at, oriented[front.entries])
+            else:
+                blocks[front.at] = oriented[front.entries]
             flat = matrix.reshape(n * d, n * d)
             for into, left in waiting[k]:
                 flat[into[:, None], into] += left

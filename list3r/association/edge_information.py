@@ -48,12 +48,17 @@ def edge_weights(confidence: Array, settings: WeightSettings) -> Array:
 
 
 def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
-    """Inverse covariances of the edges' tangent errors with bending, u's units. Shape (E, D, D), D = 6 if metric else 7.
+    """Inverse covariances of the edges' tangent errors with bending, in u's units.
 
-    BASIS
+    Shape (E, D, D), D = 6 if metric else 7. BASIS
     """
-    covariance = np.stack([_covariance(e, metric, settings) for e in edges])
     size = 6 if metric else 7
+    covariance = np.empty((len(edges), 7, 7))
+    measured = np.array([e.covariance is not None for e in edges], bool)
+    if measured.any():
+        covariance[measured] = _bent(np.array([e.covariance for e in edges if e.covariance is not None]), settings)
+    for k in np.flatnonzero(~measured):
+        covariance[k] = _unmeasured(edges[k], metric, settings)
     inverse = np.linalg.inv(covariance[:, :size, :size])
     inverse = (inverse + np.swapaxes(inverse, 1, 2)) / 2.0
     if settings.sharpen:
@@ -76,33 +81,44 @@ def _lever(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
     return max(0.5 * edge.scores["spread"] / float(edge.S_v_u.scale), 1e-9)
 
 
-def _covariance(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
-    """Covariance of an edge with bending about the middle of its support. Shape (7, 7)."""
-    if edge.covariance is None:
-        lever = _lever(edge, metric, settings) or settings.lever_m
-        deviation = settings.unmeasured / np.sqrt(max(edge.confidence, 1e-2))
-        unit = np.array([lever] * 3 + [1.0] * 4)
-        return np.diag(unit**2 * (deviation**2 + settings.bend**2))
-    center, radius = support_of(edge.covariance)
-    shape = np.eye(7)
-    shape[:3, 3:6], shape[:3, 6] = skew(center), -center
-    shape *= np.array([radius] * 3 + [1.0] * 4)
-    return np.asarray(edge.covariance + settings.bend**2 * shape @ shape.T)
+def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
+    """Covariance of an edge that states none. Shape (7, 7)."""
+    lever = _lever(edge, metric, settings) or settings.lever_m
+    deviation = settings.unmeasured / np.sqrt(max(edge.confidence, 1e-2))
+    unit = np.array([lever] * 3 + [1.0] * 4)
+    return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bend**2)))
 
 
-def support_of(covariance: Array) -> tuple[Array, float]:
-    """Centre and radius of the points that an alignment with this covariance stood on, shape (3,) and a length.
+def _bent(covariance: Array, settings: WeightSettings) -> Array:
+    """Covariances with bending about the middle of each edge's support. Shape (E, 7, 7)."""
+    center, radius = support_of(covariance)
+    shape = _about(center)
+    shape[:, :, :3] *= radius[:, None, None]
+    return np.asarray(covariance + settings.bend**2 * shape @ np.swapaxes(shape, 1, 2))
+
+
+def _about(center: Array) -> Array:
+    """Matrices that take tangents about centres to tangents about the origin. Shape (E, 3) -> (E, 7, 7)."""
+    out = np.tile(np.eye(7), (len(center), 1, 1))
+    out[:, :3, 3:6], out[:, :3, 6] = skew(center), -center
+    return out
+
+
+def support_of(covariance: Array) -> tuple[Array, Array]:
+    """Centre and radius of the points that alignments with these covariances stood on. Shapes (E, 3) and (E,).
 
     About the centre the errors of shift and turn are independent, which gives the centre; the ratio of their
-    deviations is the radius.
+    deviations is the radius. 0 and 1 where the turn has no error.
     """
-    turn = covariance[3:6, 3:6]
-    if not np.trace(turn) > 0:
-        return np.zeros(3), 1.0
-    ridge = 1e-9 * float(np.trace(turn)) * np.eye(3)
-    cross = np.linalg.solve(turn + ridge, covariance[:3, 3:6].T).T
-    center = 0.5 * np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]])
-    back = np.eye(7)
-    back[:3, 3:6], back[:3, 6] = -skew(center), center
-    shift = (back @ covariance @ back.T)[:3, :3]
-    return center, float(np.sqrt(max(np.trace(shift) / np.trace(turn), 1e-18)))
+    turn = covariance[:, 3:6, 3:6]
+    size = np.trace(turn, axis1=1, axis2=2)
+    exact = ~(size > 0)
+    steady = np.where(exact[:, None, None], np.eye(3), turn + 1e-9 * size[:, None, None] * np.eye(3))
+    cross = np.swapaxes(np.linalg.solve(steady, np.swapaxes(covariance[:, :3, 3:6], 1, 2)), 1, 2)
+    center = 0.5 * np.stack(
+        [cross[:, 2, 1] - cross[:, 1, 2], cross[:, 0, 2] - cross[:, 2, 0], cross[:, 1, 0] - cross[:, 0, 1]], axis=1
+    )
+    center[exact] = 0.0
+    back = _about(-center)
+    shift = np.trace((back @ covariance @ np.swapaxes(back, 1, 2))[:, :3, :3], axis1=1, axis2=2)
+    return center, np.where(exact, 1.0, np.sqrt(np.maximum(shift, 1e-18) / np.where(exact, 1.0, size)))

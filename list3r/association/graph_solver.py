@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,10 @@ class GraphProblem:
     def size(self) -> int:
         """Degrees of freedom of a chunk, D."""
         return int(self.information.shape[1])
+
+    def scaled(self, factors: Array) -> GraphProblem:
+        """The same graph with variances larger by factors. Shape (E,)."""
+        return replace(self, information=self.information / factors[:, None, None])
 
     def residuals(self, poses: Sim3) -> Array:
         """Tangent error of each edge. Shape (E, D)."""
@@ -186,7 +190,7 @@ def _ad(e: Array) -> Array:
 
 def _gathered(where: NDArray[np.int64], values: Array, count: int) -> Array:
     """Sums of rows by number. Shape (N, ...) -> (count, ...)."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     order = np.argsort(where, kind="stable")
     out = np.zeros((count, flat.shape[1]))
     if len(order):

@@ -9,17 +9,21 @@ have drifted is measured on the loops themselves, by the median.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from list3r.association.graph_solver import GraphProblem, adjoint, take
+from list3r.association.graph_solver import GraphProblem, adjoint
 from list3r.association.marginals import Marginals, marginals, variance_factors
 from list3r.memory.geometry import Sim3
 
 Array = NDArray[np.float64]
+
+
+_NONE = 1e-9
+"""What edges that are not believed weigh, so that what hangs on them alone stays put."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,11 @@ class TrustSettings:
     """Share of true loops whose error lies inside the limit, were all errors as stated."""
     adjacent_limit: float = 4.0
     """The limit of adjacent edges, in limits of loops: so many agreeing loops outvote one."""
-    prior_loops: float = 4.0
+    least_loops: float = 0.5
+    """Least share of loops and"""
+    least_adjacent: float = 0.9
+    """of adjacent edges that must be believed before errors are taken to be as stated."""
+    prior_loops: int = 4
     """Loops that speak for the stated drift of the chain when its true drift is measured."""
     most_drift: float = 30.0
     """Largest factor by which the chain may have drifted more than stated (deviations, not squares)."""
@@ -38,7 +46,7 @@ class TrustSettings:
     """Degrees of freedom that speak for the stated errors of edges."""
     rounds: int = 3
     """Times that errors are scaled and edges judged anew."""
-    iterations: int = 30
+    iterations: int = 20
     """Most steps of a solution; each stage of the annealing takes a tenth."""
 
 
@@ -57,7 +65,7 @@ class Believed:
     """Variance factors of adjacent and of loop edges. Shape (2,)."""
     freedom: Array
     """Degrees of freedom behind the factors. Shape (2,)."""
-    marginals: Marginals | None
+    marginals: Marginals
 
 
 @dataclass(frozen=True)
@@ -77,26 +85,39 @@ def judge(
 ) -> Believed:
     """Solve the graph and find which edges to believe. `loop` (E,) marks those that may be false."""
     kinds = loop.astype(np.int64)
-    drift = drift_factor(problem, start, tree, loop, settings) if loop.any() else 1.0
-    factors = np.array([drift, 1.0])
     limit = chi2.ppf(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
-    poses, trust = start, np.ones(len(loop))
+    poses, trust, factors = _as_stated_or_drifted(problem, start, tree, loop, limit, robust, settings)
     freedom = np.full(2, settings.prior_freedom)
-    known = None
-    for turn in range(settings.rounds):
-        scaled = replace(problem, information=problem.information / factors[kinds, None, None])
-        if turn == 0:
-            poses, trust = _first(scaled, start, tree, loop, limit, robust and bool(loop.any()), settings)
-        else:
-            poses, trust = _harden(scaled, poses, trust, limit, robust, settings)
-        known = marginals(scaled, poses, np.maximum(trust, 1e-9))
-        squares = scaled.squares(poses)
-        if not loop.any():
-            break
+    for _ in range(settings.rounds if loop.any() else 0):
+        scaled = problem.scaled(factors[kinds])
+        poses, trust = _harden(scaled, poses, limit, robust, settings)
+        known, squares = marginals(scaled, poses, np.maximum(trust, _NONE)), scaled.squares(poses)
         factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, factors, settings.prior_freedom)
-    scaled = replace(problem, information=problem.information / factors[kinds, None, None])
-    known = marginals(scaled, poses, np.maximum(trust, 1e-9))
+    scaled = problem.scaled(factors[kinds])
+    known = marginals(scaled, poses, np.maximum(trust, _NONE))
     return Believed(poses, trust, scaled.squares(poses), limit, factors, freedom, known)
+
+
+def _as_stated_or_drifted(
+    problem: GraphProblem,
+    start: Sim3,
+    tree: Tree,
+    loop: NDArray[np.bool_],
+    limit: Array,
+    robust: bool,
+    settings: TrustSettings,
+) -> tuple[Sim3, Array, Array]:
+    """Poses, trust and variance factors with errors as stated; where too few edges are believed so, with the chain's
+    drift as large as the loops say it is."""
+    ones = np.ones(len(loop))
+    if not loop.any() or not robust:
+        return problem.solve(start, ones, settings.iterations), ones, np.ones(2)
+    poses, trust = _first(problem, start, tree, loop, limit, settings)
+    enough = trust[loop].mean() >= settings.least_loops and trust[~loop].mean() >= settings.least_adjacent
+    drift = 1.0 if enough else drift_factor(problem, start, tree, loop, settings)
+    if drift > 1.0:
+        poses, trust = _first(problem.scaled(np.where(loop, 1.0, drift)), start, tree, loop, limit, settings)
+    return poses, trust, np.array([drift, 1.0])
 
 
 def _first(
@@ -105,19 +126,17 @@ def _first(
     tree: Tree,
     loop: NDArray[np.bool_],
     limit: Array,
-    robust: bool,
     settings: TrustSettings,
 ) -> tuple[Sim3, Array]:
+    """Anneal from all edges, and from the loops within what the chain can have drifted; the better of the two."""
     ones = np.ones(len(loop))
-    if not robust:
-        return problem.solve(start, ones, settings.iterations), ones
     within = ~loop
-    within[loop] = chain_squares(problem, start, tree, loop)[0] <= limit[loop]
+    within[loop] = chain_squares(problem, start, tree, loop) <= limit[loop]
     found = []
     for first in (ones, within.astype(np.float64)):
-        poses = start if first.all() else problem.solve(start, np.maximum(first, 1e-9), settings.iterations)
+        poses = start if first.all() else problem.solve(start, np.maximum(first, _NONE), settings.iterations)
         poses, _ = _anneal(problem, poses, limit, settings, gated=not first.all())
-        poses, trust = _harden(problem, poses, None, limit, robust, settings)
+        poses, trust = _harden(problem, poses, limit, True, settings)
         cost = float(np.minimum(problem.squares(poses), limit).sum())
         found.append((cost, poses, trust))
         if within.all():
@@ -131,10 +150,10 @@ def _anneal(
     """Tighten the kernel step by step; from a gated start only the last stages."""
     worst = float((problem.squares(poses) / limit).max())
     mu = 2.0 if gated else max(2.0 * worst, 1.0)
-    steps = max(2, settings.iterations // 10)
+    steps = settings.iterations // 10
     trust = (mu / (problem.squares(poses) / limit + mu)) ** 2 if gated else np.ones(len(limit))
     while True:
-        poses = problem.solve(poses, np.maximum(trust, 1e-9), steps)
+        poses = problem.solve(poses, np.maximum(trust, _NONE), steps)
         share = problem.squares(poses) / limit
         trust = (mu / (share + mu)) ** 2
         if mu == 1.0:
@@ -143,18 +162,18 @@ def _anneal(
 
 
 def _harden(
-    problem: GraphProblem, poses: Sim3, trust: Array | None, limit: Array, robust: bool, settings: TrustSettings
+    problem: GraphProblem, poses: Sim3, limit: Array, robust: bool, settings: TrustSettings
 ) -> tuple[Sim3, Array]:
     """Solve by the edges inside their limits alone, until that set stays."""
-    seen: list[bytes] = []
     inside = problem.squares(poses) <= limit if robust else np.ones(len(limit), bool)
-    for _ in range(6):
-        poses = problem.solve(poses, np.where(inside, 1.0, 1e-9), settings.iterations)
-        seen.append(inside.tobytes())
-        inside = problem.squares(poses) <= limit if robust else inside
-        if inside.tobytes() in seen:
-            break
-    return poses, np.where(np.frombuffer(seen[-1], bool), 1.0, 0.0)
+    seen: set[bytes] = set()
+    while True:
+        poses = problem.solve(poses, np.where(inside, 1.0, _NONE), settings.iterations)
+        seen.add(inside.tobytes())
+        after = problem.squares(poses) <= limit if robust else inside
+        if after.tobytes() in seen or len(seen) == 6:
+            return poses, inside.astype(np.float64)
+        inside = after
 
 
 # -------------------------------------------------------------------------------------------------- the chain
@@ -167,20 +186,13 @@ def drift_factor(
 
     Up to half of the loops may be false.
     """
-    _, ratio = chain_squares(problem, start, tree, loop)
-    middle = chi2.ppf(0.5, problem.size)
-    ratios = np.sort(ratio / middle)
-    stated = round(settings.prior_loops)
-    # So many loops that lie where they are expected: half of them nearer than the median, half further.
-    pooled = np.sort(np.concatenate([ratios, np.ones(stated)]))
+    ratio = chain_squares(problem, start, tree, loop) / chi2.ppf(0.5, problem.size)
+    pooled = np.concatenate([ratio, np.ones(settings.prior_loops)])
     return float(np.clip(np.median(pooled), 1.0, settings.most_drift**2))
 
 
-def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Squared Mahalanobis distances of the loops from the chain, by its uncertainty and their own. Shape (L,) twice.
-
-    The second is what the chain alone would have to be scaled by for the first to be what it should on average.
-    """
+def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_]) -> Array:
+    """Squared Mahalanobis distances of the loops from the chain, by its uncertainty and their own. Shape (L,)."""
     d = problem.size
     world = adjoint(start)[:, :d, :d]
     # Covariances of edges in the frame of the world, summed from the root.
@@ -196,8 +208,7 @@ def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[
     back = np.linalg.inv(world[u])
     chain = back @ (total[u] + total[v] - 2 * total[meet]) @ np.swapaxes(back, 1, 2)
     e = problem.residuals(start)[loop]
-    both = np.einsum("ei,ei->e", e, np.linalg.solve(chain + own[loop], e[..., None])[..., 0])
-    return both, both
+    return np.asarray(np.einsum("ei,ei->e", e, np.linalg.solve(chain + own[loop], e[..., None])[..., 0]))
 
 
 def _common_ancestor(tree: Tree, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,9 +1,9 @@
 """The graph of chunks: all edges together decide where every chunk lies (paper A.4).
 
-Minimises the sum of e^T W e, e = log(S_v_u^-1 S_v_world S_world_u), by Levenberg-Marquardt (`graph_solver`), W from each
-edge's covariance and the bending of chunks (`edge_information`); false loops are switched off (`loop_trust`), and every
-chunk gets a covariance (`marginals`). The start is always the chain of adjacent edges from each component's first
-chunk, so the result does not depend on the order in which chunks arrived.
+Minimises the sum of e^T W e, e = log(S_v_u^-1 S_v_world S_world_u), by Levenberg-Marquardt (`graph_solver`), W from
+the covariance of each edge and the bending of chunks (`edge_information`); false loops are switched off (`loop_trust`),
+and every chunk gets a covariance (`marginals`). The start is always the chain of adjacent edges from each component's
+first chunk, so the result does not depend on the order in which chunks arrived.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from list3r.association.edge_information import WeightSettings, information, plain_information
-from list3r.association.graph_solver import GraphProblem, stack, take, unstack
+from list3r.association.graph_solver import GraphProblem, adjoint, stack, unstack
 from list3r.association.loop_trust import Believed, Tree, TrustSettings, judge
-from list3r.association.marginals import widening
+from list3r.association.marginals import marginals, widening
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
@@ -36,9 +37,8 @@ class GraphSettings:
     """Edges that the rest contradicts are switched off."""
     weights: WeightSettings = field(default_factory=WeightSettings)
     trust: TrustSettings = field(default_factory=TrustSettings)
-    least_weight: float = 1e-4
-    """Loops of less information than this share of the strongest loop's are dropped, as far as the graph still holds
-    together without them."""
+    least_weight: float = 1e-5
+    """Loops of less information than this share of the strongest edge's are dropped (deviations 300 times larger)."""
 
 
 @dataclass(frozen=True)
@@ -83,23 +83,163 @@ def optimize(
     if not active:
         return GraphResult(start, component, tuple(edges), 0.0, dict.fromkeys(ids, np.zeros((7, 7))))
     row = {chunk: k for k, chunk in enumerate(ids)}
-    of_edge = information if chosen.weighted else plain_information
-    problem = GraphProblem.build(
-        np.array([row[e.u] for e in active]),
-        np.array([row[e.v] for e in active]),
-        stack([e.S_v_u for e in active]),
-        of_edge(active, metric, chosen.weights),
-        np.array([component[chunk] == chunk for chunk in ids]),
-    )
+    problem = _problem(active, row, np.array([component[chunk] == chunk for chunk in ids]), metric, chosen)
     loop = np.array([e.kind != "adjacent" for e in active])
     found = judge(problem, stack([start[k] for k in ids]), tree, loop, chosen.robust, chosen.trust)
     out = list(edges)
     strength = _strengths(problem.information, found, loop)
     for n, k in enumerate(used):
         out[k] = _judged(edges[k], float(strength[n]), float(found.squares[n]), found, n)
-    count = max(float(found.trust @ found.marginals.redundancy), 1e-9) if found.marginals else 1e-9
+    count = max(float(found.trust @ found.marginals.redundancy), 1e-9)
     residual = float(np.sqrt(found.trust @ found.squares / max(count, 1.0)))
     return GraphResult(unstack(found.poses, ids), component, tuple(out), residual, _covariances(found, ids))
+
+
+def extend(
+    new: int,
+    chunk_ids: Sequence[int],
+    edges: Sequence[Edge],
+    placed: GraphResult,
+    metric: bool,
+    settings: GraphSettings | None = None,
+) -> GraphResult:
+    """Place one more chunk in a graph whose other chunks lie as `placed` says (as `optimize` or `extend` put them).
+
+    A chunk that hangs on one edge is chained: that is the optimum. One with loops that agree with the map is fitted to
+    it alone; if its edges do not fit then, all chunks are solved from where they lie; if it joins components, from the
+    beginning. Only the edges of the new chunk are judged; `optimize` at the end of a session judges all.
+    """
+    chosen = settings or GraphSettings()
+    mine = [k for k, e in enumerate(edges) if new in (e.u, e.v) and e.accepted]
+    others = {e.u if e.v == new else e.v for e in (edges[k] for k in mine)}
+    if not mine:
+        return _with(placed, new, placed.S_graph_chunk.get(new, Sim3.identity()), new, edges, np.zeros((7, 7)))
+    if len({placed.components[k] for k in others}) > 1:
+        return optimize(chunk_ids, edges, placed.S_graph_chunk, metric, chosen)
+    active = [edges[k] for k in mine]
+    for edge in active:
+        _check(edge)
+    first = min(range(len(active)), key=lambda n: (active[n].kind != "adjacent", -active[n].confidence))
+    here = active[first].u if active[first].v == new else active[first].v
+    start = _across(placed.S_graph_chunk[here], active[first], here)
+    factors = _factors(edges)
+    ids = sorted({new, *others})
+    row = {chunk: k for k, chunk in enumerate(ids)}
+    poses = stack([start if k == new else placed.S_graph_chunk[k] for k in ids])
+    problem = _problem(active, row, np.array([k != new for k in ids]), metric, chosen)
+    loop = np.array([e.kind != "adjacent" for e in active])
+    problem = problem.scaled(factors[loop.astype(np.int64)])
+    if len(active) > 1:
+        poses = problem.solve(poses, np.ones(len(active)), 5)
+    squares = problem.squares(poses)
+    if len(active) > 1 and float(squares.max()) > chi2.ppf(0.95, problem.size):
+        return _resolved(new, chunk_ids, edges, mine, placed, start, metric, chosen)
+    out = list(edges)
+    for n, k in enumerate(mine):
+        scores = {**edges[k].scores, "graph_residual": float(np.sqrt(squares[n] / 3.0))}
+        scores |= {"trust": 1.0, "variance_factor": float(factors[int(loop[n])])}
+        out[k] = replace(edges[k], scores=scores)
+    covariance = _hanging(placed.covariances[here], active[first], here, problem.information[first])
+    return _with(placed, new, unstack(poses, ids)[new], placed.components[here], out, covariance)
+
+
+def _resolved(
+    new: int,
+    chunk_ids: Sequence[int],
+    edges: Sequence[Edge],
+    mine: Sequence[int],
+    placed: GraphResult,
+    start: Sim3,
+    metric: bool,
+    settings: GraphSettings,
+) -> GraphResult:
+    """All chunks solved from where they lie, with edges believed as before and the new chunk's loops judged."""
+    ids = sorted(chunk_ids)
+    known = set(ids)
+    used = [k for k, e in enumerate(edges) if e.accepted and e.u in known and e.v in known]
+    active = [edges[k] for k in used]
+    row = {chunk: k for k, chunk in enumerate(ids)}
+    component = {**placed.components, new: placed.components[_other(edges[mine[0]], new)]}
+    loop = np.array([e.kind != "adjacent" for e in active])
+    problem = _problem(active, row, np.array([component[k] == k for k in ids]), metric, settings)
+    problem = problem.scaled(_factors(edges)[loop.astype(np.int64)])
+    poses = stack([start if k == new else placed.S_graph_chunk[k] for k in ids])
+    fresh = np.isin(used, mine) & loop & settings.robust
+    limit = float(chi2.ppf(settings.trust.loop_quantile, problem.size))
+    trust = np.ones(len(used))
+    for _ in range(3):
+        poses = problem.solve(poses, trust, 3)
+        squares = problem.squares(poses)
+        after = np.where(fresh & (squares > limit), 1e-9, 1.0)
+        if (after == trust).all():
+            break
+        trust = after
+    out = list(edges)
+    for n in np.flatnonzero(np.isin(used, mine)):
+        edge, deviations = active[n], float(np.sqrt(squares[n] / 3.0))
+        scores = {**edge.scores, "graph_residual": deviations, "trust": (limit / (float(squares[n]) + limit)) ** 2}
+        believed = bool(trust[n] == 1.0)
+        reason = edge.reason if believed else _contradicted(edge, deviations)
+        out[used[n]] = replace(edge, accepted=believed, scores=scores, reason=reason)
+    blocks = marginals(problem, poses, trust).covariance
+    covariances = np.zeros((len(ids), 7, 7))
+    covariances[:, : problem.size, : problem.size] = blocks * widening(settings.trust.prior_freedom)
+    residual = float(np.sqrt((trust * squares).mean()))
+    by_id = dict(zip(ids, covariances, strict=True))
+    return GraphResult(unstack(poses, ids), component, tuple(out), residual, by_id)
+
+
+def _other(edge: Edge, chunk: int) -> int:
+    return edge.u if edge.v == chunk else edge.v
+
+
+def _with(
+    placed: GraphResult, new: int, S: Sim3, component: int, edges: Sequence[Edge], covariance: Array
+) -> GraphResult:
+    return GraphResult(
+        {**placed.S_graph_chunk, new: S},
+        {**placed.components, new: component},
+        tuple(edges),
+        placed.residual,
+        {**placed.covariances, new: covariance},
+    )
+
+
+def _hanging(of_here: Array, edge: Edge, here: int, information: Array) -> Array:
+    """Covariance of a chunk at the other end of an edge from a chunk with covariance `of_here`. Shape (7, 7)."""
+    own = np.zeros((7, 7))
+    own[: len(information), : len(information)] = np.linalg.inv(information)
+    if here == edge.u:
+        moved = adjoint(edge.S_v_u)
+        return np.asarray(moved @ (of_here + own) @ moved.T)
+    moved = adjoint(edge.S_v_u.inverse())
+    return np.asarray(moved @ of_here @ moved.T + own)
+
+
+def _factors(edges: Sequence[Edge]) -> Array:
+    """Variance factors of adjacent and of loop edges that the last full solution found. Shape (2,)."""
+    out = np.ones(2)
+    for kind in range(2):
+        known = (e.scores["variance_factor"] for e in edges if "variance_factor" in e.scores and _kind(e) == kind)
+        out[kind] = next(known, 1.0)
+    return out
+
+
+def _kind(edge: Edge) -> int:
+    return int(edge.kind != "adjacent")
+
+
+def _problem(
+    active: Sequence[Edge], row: Mapping[int, int], fixed: NDArray[np.bool_], metric: bool, settings: GraphSettings
+) -> GraphProblem:
+    of_edge = information if settings.weighted else plain_information
+    return GraphProblem.build(
+        np.array([row[e.u] for e in active]),
+        np.array([row[e.v] for e in active]),
+        stack([e.S_v_u for e in active]),
+        of_edge(active, metric, settings.weights),
+        fixed,
+    )
 
 
 def _check(edge: Edge) -> None:
@@ -111,7 +251,6 @@ def _check(edge: Edge) -> None:
 
 
 def _covariances(found: Believed, ids: Sequence[int]) -> dict[int, Array]:
-    assert found.marginals is not None
     blocks = found.marginals.covariance * widening(float(found.freedom.sum() - found.freedom.min()))
     out = np.zeros((len(ids), 7, 7))
     out[:, : blocks.shape[1], : blocks.shape[2]] = blocks
@@ -201,9 +340,14 @@ def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int)
     deviations = float(np.sqrt(square / 3.0))
     trusted = bool(found.trust[n] > 0.5)
     trust = float((found.limit[n] / (square + found.limit[n])) ** 2)
-    scores = {**edge.scores, "trust": trust, "graph_residual": deviations}
+    factor = float(found.factors[int(edge.kind != "adjacent")])
+    scores = {**edge.scores, "trust": trust, "graph_residual": deviations, "variance_factor": factor}
     if trusted:
         return replace(edge, weight=strength, accepted=True, scores=scores)
     already = "trust" in edge.scores and not edge.accepted
-    reason = f"the rest of the graph contradicts it by {deviations:.1f} deviations (geometry alone: {edge.reason})"
+    reason = _contradicted(edge, deviations)
     return replace(edge, weight=0.0, accepted=False, scores=scores, reason=edge.reason if already else reason)
+
+
+def _contradicted(edge: Edge, deviations: float) -> str:
+    return f"the rest of the graph contradicts it by {deviations:.1f} deviations (geometry alone: {edge.reason})"
