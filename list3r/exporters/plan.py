@@ -17,6 +17,7 @@ from list3r.exporters.palette import Color, instance_color
 from list3r.exporters.plan_frame import PlanFrame, choose_rotation, is_wall, quarter_turn
 from list3r.exporters.plan_labels import Anchor, place_tags
 from list3r.exporters.plan_layout import Layout, PlanSettings, choose_layout
+from list3r.exporters.plan_loops import loop_ends
 from list3r.exporters.plan_map import pale_picture
 from list3r.memory.records import Instance, Support
 from list3r.memory.store import Store
@@ -25,6 +26,7 @@ _INK: Color = (38, 42, 52)
 _GREY: Color = (120, 124, 134)
 _START: Color = (22, 140, 100)
 _END: Color = (196, 48, 72)
+_LOOP: Color = (118, 84, 190)
 _OVERSAMPLING = 2
 """Drawn so many times larger and averaged down: Pillow does not smooth its lines."""
 
@@ -55,6 +57,7 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
     sheet.boxes(things, {i.id for i in tagged})
     moved = {i.id: store.track(i.id)[1] for i in component.instances if i.dynamic}
     sheet.tracks({n: places[np.isfinite(places).all(axis=1)] for n, places in moved.items()})
+    sheet.loops(loop_ends(store, component))
     sheet.camera_path(component)
     sheet.tags(tagged)
     sheet.scale_bar(units(store))
@@ -187,6 +190,21 @@ class _Sheet:
             for side in (-0.5, 0.5):
                 turn = np.array([back[0] - side * back[1], back[1] + side * back[0]])
                 self._stroke(end, end + 12 * k * turn, color, 3)
+
+    def loops(self, ends: NDArray[np.float64]) -> None:
+        """Lines between the cameras of the frames that closed a loop, (L, 2, 3), and what they are over the map."""
+        if not len(ends):
+            return
+        k = _OVERSAMPLING
+        for a, b in zip(self.px(ends[:, 0]), self.px(ends[:, 1]), strict=True):
+            self.draw.line([(float(a[0]), float(a[1])), (float(b[0]), float(b[1]))], fill=(*_LOOP, 120), width=k)
+            for x, y in (a, b):
+                self.draw.ellipse((x - 2.5 * k, y - 2.5 * k, x + 2.5 * k, y + 2.5 * k), fill=(*_LOOP, 200))
+        words = f"{len(ends)} loop{'s' * (len(ends) > 1)}: places seen again"
+        x, y = self.left + float(self.map_size[0]), 25.0 * k
+        start = x - self.draw.textlength(words, font=self.text_font) - 40 * k
+        self.draw.line([(start, y), (start + 32 * k, y)], fill=_LOOP, width=2 * k)
+        self._text((x, y), words, self.text_font, _GREY, anchor="rm")
 
     def camera_path(self, component: Component) -> None:
         """Where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""
