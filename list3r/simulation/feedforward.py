@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.evaluation.covisibility import CovisibilitySettings, covisibility
 from list3r.frames.chunks import ChunkSpan
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import frame_samples
+from list3r.simulation.covisibility import seen_share
 from list3r.simulation.depth_errors import DepthErrorSettings, focal_factor, wrong_depth
 from list3r.simulation.mover_errors import MoverErrorSettings, mover_errors
 from list3r.simulation.pose_errors import PoseErrorSettings, bend, jitter, placements, sides
@@ -124,12 +124,9 @@ class FeedForwardModel:
         return JointWindow(_samples(one, None), _samples(two, None), "relative")
 
     def covisibility(self, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Shares of the standing world that frames truly see in common, the mean of both ways. Shape (F, F)."""
-        video = self._video
-        standing = ~np.isin(video.ids[frames], [m.id for m in video.movers])
-        depth = np.where(standing, video.depth[frames], 0)
-        share = covisibility(depth, video.T_world_cam[frames], video.camera, CovisibilitySettings(points=120))
-        return np.nan_to_num((share + share.T).astype(np.float64) / 2)
+        """Shares of the standing world that frames truly see in common, the lesser of both ways. Shape (F, F)."""
+        share = seen_share(self._video, frames, frames).astype(np.float64)
+        return np.minimum(share, share.T)
 
     def _checked(self, frames: Sequence[int] | range) -> NDArray[np.int64]:
         numbers = np.asarray(list(frames), np.int64)

@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 class PoseErrorSettings:
     """Errors of poses and of the scale of each frame's geometry."""
 
-    bend_deg: float = 0.2
+    bend_deg: float = 0.18
     """Deviation of the rotation between views that share all they see, about the middle of what they see."""
-    bend_shift: float = 0.0025
+    bend_shift: float = 0.0022
     """The same for the shift, as a share of the depth."""
-    bend_scale: float = 0.004
+    bend_scale: float = 0.0036
     """The same for the logarithm of scale."""
     bending: float = 1.0
     """Factor on all three; 0 for poses without bending."""
