@@ -29,7 +29,7 @@ class ChainSettings:
     turn_deg: float = 2.0
     log_scale: float = 0.03
     """Deviation of the logarithm of the scale; none where everything is metric."""
-    most_deviations: float = 6.0
+    most_deviations: float = 4.5
     """Distance, in deviations, beyond which a relation is refused."""
 
 

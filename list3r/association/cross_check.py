@@ -43,9 +43,9 @@ class CrossSettings:
     """Least share of points on a surface among those on a surface or in space seen to be empty."""
     least_landed: int = 3
     """Points of an instance that land on one of the other side before their kinds are compared."""
-    least_kinds: int = 3
+    least_kinds: int = 6
     """Instances that must land on others before their kinds say something."""
-    least_likeness: float = 0.7
+    least_likeness: float = 0.5
     """Least mean rank (1 most alike, 0 least, 0.5 by chance) of the instances that land on each other."""
 
 

@@ -50,9 +50,9 @@ class RevisitSettings:
     """Weight of frame similarity in s_loop (the paper gives none)."""
     least_score: float = 0.8
     """Least s_loop of a candidate that is verified, unless its frames alone are alike enough."""
-    verify: int = 12
+    verify: int = 14
     """Most candidates of a chunk that are verified."""
-    enough: int = 6
+    enough: int = 8
     """Accepted edges after which no further candidate of a chunk is verified."""
     layout_pairs: int = 5
     """Instances that must agree on a layout for its scale to count."""
@@ -105,26 +105,37 @@ def find_loops(
         return []
     look = _Lookout(store, chunk_id, chosen)
     edges: list[Edge] = []
-    for n, scored in enumerate(_ranked(candidates, look, chosen)):
-        alone = scored.candidate.s_det >= STRICT
-        if not alone and (scored.score < chosen.least_score or not chosen.instance_cues):
+    tried = 0
+    for scored in _ranked(candidates, look, chosen):
+        accepted = [e for e in edges if e.accepted]
+        c = scored.candidate
+        if c.s_det < STRICT and (scored.score < chosen.least_score or not chosen.instance_cues):
             edge = look.refused(scored, f"frames and instances are not alike enough (s_loop {scored.score:.2f})")
-        elif n >= chosen.verify or sum(e.accepted for e in edges) >= chosen.enough:
+        elif chosen.verified and any(e.u == c.u for e in accepted):
+            edge = look.refused(scored, "not tried: a better candidate joins the two chunks")
+        elif tried >= chosen.verify or len(accepted) >= chosen.enough:
             edge = look.refused(scored, "not tried: enough better candidates of this chunk were")
         else:
-            edge = look.verified(scored, joint, [e for e in edges if e.accepted])
+            edge = look.verified(scored, joint, accepted)
+            tried += 1
         edges.append(_with_scores(edge, scored))
     return edges
 
 
 def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSettings) -> list[_Scored]:
-    """Candidates in order of s_loop, the best of each pair of chunks first."""
+    """Candidates in order of s_loop, the best one of every pair of chunks before any second one."""
     out = []
     for candidate in candidates:
         cues = look.cues(candidate.u) if settings.instance_cues else NO_CUES
         score = loop_score(candidate.s_det, cues, settings.lambda_) if settings.instance_cues else candidate.s_det
         out.append(_Scored(candidate, cues, score))
-    return sorted(out, key=lambda s: (-s.score, s.candidate.u, s.candidate.frame_u, s.candidate.frame_v))
+    out.sort(key=lambda s: (-s.score, s.candidate.u, s.candidate.frame_u, s.candidate.frame_v))
+    seen: list[int] = []
+    turn = []
+    for scored in out:
+        turn.append(seen.count(scored.candidate.u))
+        seen.append(scored.candidate.u)
+    return [out[n] for n in sorted(range(len(out)), key=lambda n: (turn[n], n))]
 
 
 def _with_scores(edge: Edge, scored: _Scored) -> Edge:
