@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from list3r.association.alignment import Alignment, AlignmentSettings, align
 from list3r.association.support import (
+    BalancedSupport,
     Fit,
     Mask,
     Pairs,
     StaticSupport,
     SupportSettings,
-    balanced_sample,
+    balanced_support,
     confident,
-    expected_deviation,
     shared_pairs,
     static_support,
 )
@@ -121,24 +121,15 @@ def _measure(
 ) -> MeasuredEdge:
     if settings.instance_aware:
         static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
-        rest = static.confident & ~static.removed
-        picked = balanced_sample(pairs, rest, settings.support)
-        off = np.linalg.norm(static.S_v_u.apply(pairs.p_u[picked]) - pairs.p_v[picked], axis=1)
-        deviation = expected_deviation(off, pairs.cam_v[picked, 2])
-        weight = pairs.weight[picked] * _relative_information(deviation)
+        support = balanced_support(pairs, static, camera, settings.support)
     else:
-        sure = confident(pairs, settings.support)
-        static = StaticSupport(Sim3.identity(), sure, np.zeros(len(pairs), bool), frozenset(), frozenset(), 0.0)
-        picked = np.flatnonzero(sure)
-        weight = pairs.weight[picked]
-    found = align(pairs.p_u[picked], pairs.p_v[picked], weight, pairs.frame[picked], metric, settings.alignment)
-    kept = np.zeros(len(pairs), bool)
-    kept[picked] = True
+        static, support = _confident_support(pairs, settings.support)
+    found = align(support.p_u, support.p_v, support.weight, support.frame, metric, settings.alignment)
     return MeasuredEdge(
-        edge=_edge(pairs, static, found, picked, u_id, v_id, settings, kind, frames),
+        edge=_edge(static, support, found, u_id, v_id, settings, kind, frames),
         moving_u=static.moving_u,
         moving_v=static.moving_v,
-        support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, kept),
+        support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, support.used),
     )
 
 
@@ -157,26 +148,29 @@ def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
     return fit
 
 
-def _relative_information(deviation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse variances, 1 for the median pair; no pair has more than ten times its say."""
-    middle = float(np.median(deviation))
-    return np.asarray(np.clip((middle / np.maximum(deviation, 1e-300)) ** 2, 0.1, 10.0))
+def _confident_support(pairs: Pairs, settings: SupportSettings) -> tuple[StaticSupport, BalancedSupport]:
+    """All pairs that confidence alone would take, by their confidence."""
+    sure = confident(pairs, settings)
+    none = np.zeros(len(pairs), bool)
+    static = StaticSupport(Sim3.identity(), sure, none, frozenset(), frozenset(), 0.0)
+    return static, BalancedSupport(pairs.p_u[sure], pairs.p_v[sure], pairs.weight[sure], pairs.frame[sure], sure)
 
 
 def _edge(
-    pairs: Pairs,
     static: StaticSupport,
+    support: BalancedSupport,
     found: Alignment,
-    picked: NDArray[np.int64],
     u_id: int,
     v_id: int,
     settings: EdgeSettings,
     kind: str,
     frames: tuple[int, int] | None,
 ) -> Edge:
-    shared_frames = len(np.unique(pairs.frame[picked]))
+    shared_frames = len(np.unique(support.frame))
     moving = float(static.removed.sum()) / max(1, int(static.confident.sum()))
-    reason = f"{found.inliers} of {len(picked)} points of {shared_frames} shared frames agree to {found.rms:.4f}"
+    reason = (
+        f"{found.inliers} of {len(support.weight)} points of {shared_frames} shared frames agree to {found.rms:.4f}"
+    )
     if static.removed.any():
         reason += f"; {moving:.0%} of what is shared moves and was left out"
     accepted = True
@@ -197,8 +191,8 @@ def _edge(
         accepted=accepted,
         reason=reason,
         scores={
-            "pairs": float(len(picked)),
-            "shared_pairs": float(len(pairs)),
+            "pairs": float(len(support.weight)),
+            "shared_pairs": float(len(static.confident)),
             "shared_frames": float(shared_frames),
             "spread": found.spread,
             "close": found.close,
