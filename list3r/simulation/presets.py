@@ -249,7 +249,7 @@ def _film_kidnap(take: _Take) -> None:
     rooms = tuple(rooms[k] for k in take.rng.permutation(len(rooms)))
     frames, first = int(take.rng.integers(1020, 1220)), int(take.rng.integers(470, 690))
     lengths = [first, frames - first]
-    if take.rng.uniform() < 0.4:
+    if take.rng.uniform() < 0.4 and frames - first > 400:
         second = int(take.rng.integers(190, frames - first - 170))
         lengths = [first, second, frames - first - second]
     director, k = take.director(), 0
@@ -346,7 +346,7 @@ def _film_twins(take: _Take) -> None:
     director, frames = take.director(), int(take.rng.integers(1060, 1260))
     begun = None
     for a, b in pairs:
-        views = director.plan_views(a, 2, 140.0)
+        views = director.plan_views(a, 2 if len(pairs) == 1 else 1, 140.0)
         begun = begun or views
         director.film(views)
         director.film([mapped_view(v, a, b) for v in views])

@@ -177,24 +177,23 @@ class Director:
         return views
 
     def _view(self, room: PlacedRoom, xy: Array, sweep_deg: float) -> View:
+        """A sweep from a place: of several that are drawn the one that looks farthest into the room."""
         points = self._targets(room)
+        away = np.linalg.norm(points[:, :2] - xy, axis=1)
+        points = points[away > min(1.0, float(np.sort(away)[-2]) - 1e-9)]
         offset = points[:, :2] - xy
-        far = np.linalg.norm(offset, axis=1)
-        points, offset = points[far > 1.0], offset[far > 1.0]
-        bearing = np.arctan2(offset[:, 1], offset[:, 0])
-        start = float(self.rng.uniform(-np.pi, np.pi))
-        turn = (bearing - start) % (2 * np.pi)
-        order = [k for k in np.argsort(turn, kind="stable") if turn[k] <= np.deg2rad(sweep_deg)]
-        picked, last = [], -1.0
-        for k in order:
-            if turn[k] - last > np.deg2rad(18):
-                picked.append(k)
-                last = float(turn[k])
-        if len(picked) < 2:
-            picked = list(np.argsort(turn, kind="stable")[:2])
+        bearing, away = np.arctan2(offset[:, 1], offset[:, 0]), np.linalg.norm(offset, axis=1)
+        best: list[int] = []
+        score = -np.inf
+        for start in self.rng.uniform(-np.pi, np.pi, 6):
+            turn = (bearing - start) % (2 * np.pi)
+            picked = _spread(turn, np.deg2rad(sweep_deg))
+            depth = float(np.minimum(away[picked], 2.5).mean() + 0.5 * away[picked].min())
+            if depth > score:
+                best, score = picked, depth
         if self.rng.uniform() < 0.5:
-            picked.reverse()
-        return View((float(xy[0]), float(xy[1])), tuple(_triple(points[k]) for k in picked))
+            best.reverse()
+        return View(_pair(xy), tuple(_triple(points[k]) for k in best))
 
     def _targets(self, room: PlacedRoom) -> Array:
         """What there is to look at in a room: its things, and its corners. Shape (N, 3)."""
@@ -243,6 +242,16 @@ class Director:
             if self.stops:
                 self.walk_to(view.xy, look_round=look_round)
             self.look(view)
+
+
+def _spread(turn: Array, sweep: float) -> list[int]:
+    """Which of the directions `turn` (N,), radians, lie within a sweep and at least 18 degrees apart; two or more."""
+    picked: list[int] = []
+    order = [int(k) for k in np.argsort(turn, kind="stable")]
+    for k in order:
+        if turn[k] <= sweep and (not picked or turn[k] - turn[picked[-1]] > np.deg2rad(18)):
+            picked.append(k)
+    return picked if len(picked) > 1 else order[:2]
 
 
 def mapped_view(view: View, source: PlacedRoom, target: PlacedRoom) -> View:
