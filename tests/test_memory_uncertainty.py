@@ -1,0 +1,48 @@
+"""The position of a thing is as uncertain as the chunks that saw it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import ChunkRow
+from list3r.memory.uncertainty import position_covariance, position_sigma
+
+
+def chunk(S: Sim3, covariance: np.ndarray | None, chunk_id: int = 0) -> ChunkRow:
+    return ChunkRow(chunk_id, 0, 0, 0, 9, 0, S, (50.0, 50.0, 32.0, 24.0), (48, 64), "relative", covariance)
+
+
+def test_it_is_what_sampling_says() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(7, 7)) * 0.003
+    S = Sim3.exp([1, 2, 3, 0.3, -0.2, 0.5, 0.7])
+    center = np.array([2.0, 1.0, -1.0])
+    errors = Sim3.exp(rng.normal(size=(20000, 7)) @ half.T)
+    moved = (S @ errors).apply(np.tile(S.inverse().apply(center[None]), (20000, 1, 1)))[:, 0]
+    expected = position_covariance(chunk(S, half @ half.T), center)
+    assert expected is not None
+    assert np.allclose(np.cov(moved.T), expected, atol=0.05 * np.trace(expected))
+    sigma = position_sigma(center, [chunk(S, half @ half.T)])
+    assert sigma == pytest.approx(np.sqrt(np.linalg.eigvalsh(expected)[-1]))
+
+
+def test_turns_count_with_distance_and_scale_with_the_chunk() -> None:
+    turn = np.diag([0, 0, 0, 0, 0, 1e-4, 0.0])
+    near, far = (position_sigma(np.array([x, 0.0, 0.0]), [chunk(Sim3.identity(), turn)]) for x in (1.0, 5.0))
+    assert near == pytest.approx(0.01)
+    assert far == pytest.approx(0.05)
+    shift = np.diag([1e-4, 1e-4, 1e-4, 0, 0, 0, 0.0])
+    grown = chunk(Sim3.exp([0, 0, 0, 0, 0, 0, np.log(3.0)]), shift)
+    assert position_sigma(np.zeros(3), [grown]) == pytest.approx(0.03)
+
+
+def test_the_worst_chunk_counts_and_silence_stays_silence() -> None:
+    sure, unsure = (chunk(Sim3.identity(), np.eye(7) * s**2) for s in (0.01, 0.1))
+    assert position_sigma(np.zeros(3), [sure, unsure]) == pytest.approx(0.1)
+    silent = chunk(Sim3.identity(), None)
+    assert position_sigma(np.zeros(3), [silent]) is None
+    assert position_sigma(np.zeros(3), []) is None
+    assert position_sigma(np.zeros(3), [silent, sure]) == pytest.approx(0.01)
+    assert position_sigma(np.ones(3), [chunk(Sim3.identity(), np.zeros((7, 7)))]) == 0.0
