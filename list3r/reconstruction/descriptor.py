@@ -1,21 +1,35 @@
-"""A descriptor of a whole frame without weights: what local features occur, and how brightness edges are laid out.
+"""Descriptors of whole frames: what finds a place again. The default is `vlad`; here the protocol and an older kind.
 
-Two halves of equal length: a histogram of local features over cells of seeded random hyperplanes (locality-sensitive
-hashing: Charikar, "Similarity estimation techniques from rounding algorithms", 2002), which does not care where in
-the image a thing is; and a grid of gradient orientations (in the manner of GIST: Oliva, Torralba, "Modeling the shape
-of the scene", 2001), which does.
+`WordsDescriptor` tells what local features occur, and how brightness edges are laid out: a histogram of local features
+over cells of seeded random hyperplanes (locality-sensitive hashing: Charikar, "Similarity estimation techniques from
+rounding algorithms", 2002), which does not care where in the image a thing is; and a grid of gradient orientations (in
+the manner of GIST: Oliva, Torralba, "Modeling the shape of the scene", 2001), which does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.view import Floats
+
+
+class FrameDescriptor(Protocol):
+    """A kind of frame descriptor; `association.frame_search` holds what its cosines mean, by its length."""
+
+    @property
+    def length(self) -> int:
+        """Numbers in a descriptor."""
+        ...
+
+    def __call__(self, color: NDArray[np.uint8], local_descriptors: NDArray[np.uint8]) -> Floats:
+        """Unit-length descriptor of an RGB image (H, W, 3) and its SIFT descriptors (N, 128). Shape (length,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -35,6 +49,22 @@ class DescriptorSettings:
     def length(self) -> int:
         """Numbers in a descriptor."""
         return int(self.tables * 2**self.bits + 8 * self.grid**2)
+
+
+@dataclass(frozen=True)
+class WordsDescriptor:
+    """A `FrameDescriptor` by hashed words and a layout of gradients."""
+
+    settings: DescriptorSettings = field(default_factory=DescriptorSettings)
+
+    @property
+    def length(self) -> int:
+        """Numbers in a descriptor."""
+        return self.settings.length
+
+    def __call__(self, color: NDArray[np.uint8], local_descriptors: NDArray[np.uint8]) -> Floats:
+        """See `frame_descriptor`."""
+        return frame_descriptor(color, local_descriptors, self.settings)
 
 
 def frame_descriptor(

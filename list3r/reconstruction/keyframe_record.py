@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.descriptor import DescriptorSettings, frame_descriptor
+from list3r.reconstruction.descriptor import FrameDescriptor
 from list3r.reconstruction.features import FeatureSettings, detect
 from list3r.reconstruction.view import SensorNoise, shrink_camera, shrink_depth
+from list3r.reconstruction.vlad import VladDescriptor
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class KeyframeSettings:
     """Width of the small depth image, px."""
     jpeg_quality: int = 85
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    descriptor: DescriptorSettings = field(default_factory=DescriptorSettings)
+    descriptor: FrameDescriptor = field(default_factory=VladDescriptor)
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
@@ -154,7 +155,7 @@ def _make_keyframe(
     return Keyframe(
         frame_index=frame.index,
         T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
-        descriptor=frame_descriptor(frame.color, features.descriptors, settings.descriptor),
+        descriptor=settings.descriptor(frame.color, features.descriptors),
         keypoints_xy=features.xy,
         keypoint_descriptors=features.descriptors,
         points_cam=features.points_cam,

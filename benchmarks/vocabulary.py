@@ -1,0 +1,55 @@
+"""Learn the vocabulary of frame descriptors (`list3r/reconstruction/vocabulary.npz`) on simulated rooms.
+
+python benchmarks/vocabulary.py --out list3r/reconstruction/vocabulary.npz
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import faiss
+import numpy as np
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.features import FeatureSettings, detect
+from list3r.reconstruction.vlad import root_sift
+from list3r.simulation.presets import make_shot
+from list3r.simulation.render import Renderer
+
+CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
+VIDEOS = (("loop", 101), ("calm", 102), ("kidnap", 103), ("dynamic", 104))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--words", type=int, default=64)
+    parser.add_argument("--axes", type=int, default=31)
+    parser.add_argument("--every", type=int, default=90, help="frames between pictures")
+    words = parser.parse_args()
+    x = root_sift(np.concatenate([descriptors(*video, words.every) for video in VIDEOS]))
+    mean = x.mean(axis=0)
+    axes = np.linalg.svd((x - mean)[::5], full_matrices=False)[2][: words.axes].T
+    kmeans = faiss.Kmeans(words.axes, words.words, niter=20, seed=1)
+    kmeans.train(np.ascontiguousarray((x - mean) @ axes, np.float32))
+    half = {"mean": mean, "axes": axes, "words": kmeans.centroids}
+    np.savez_compressed(words.out, **{name: value.astype(np.float16) for name, value in half.items()})
+    print(f"{words.words} words of {len(x)} descriptors: {words.out}")
+
+
+def descriptors(preset: str, seed: int, every: int) -> np.ndarray:
+    """SIFT descriptors of some pictures of a simulated video, with the noise of a camera."""
+    shot = make_shot(preset, seed, movers=False)
+    renderer, rng = Renderer(shot.building.world, CAMERA), np.random.default_rng(seed)
+    out = []
+    for pose in shot.T_world_cam[::every]:
+        color = renderer.render(pose).color
+        noisy = np.clip(color + rng.normal(0, 3, color.shape), 0, 255).astype(np.uint8)
+        blank = np.zeros(noisy.shape[:2], np.float32)
+        out.append(detect(noisy, blank, CAMERA, FeatureSettings()).descriptors)
+    return np.concatenate(out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""Local features of a frame as one vector: VLAD over a fixed vocabulary (Jegou et al., "Aggregating local descriptors
+into a compact image representation", 2010, with the normalisation within each word of Arandjelovic, Zisserman, "All
+about VLAD", 2013).
+
+The vocabulary lies beside this file. It was learned by `benchmarks/vocabulary.py` on SIFT descriptors of simulated
+rooms, so that a chunk's descriptors depend on that chunk alone, and frames of different videos can be compared.
+Measured on 200 frames of redkitchen, pairs more than 100 frames apart, revisits share 30 % of their surface: recall at
+precision 0.9 is 0.69 and at 0.99 0.34; of a vocabulary learned on the first 12 or 30 frames of that video itself 0.67
+and 0.72 at precision 0.9; of hashed words with a layout of gradients (`descriptor`) 0.34, and 0.13 at 0.99.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Words of local features."""
+
+    mean: Floats
+    """Mean RootSIFT descriptor. Shape (128,)."""
+    axes: Floats
+    """Principal directions. Shape (128, d)."""
+    words: Floats
+    """Centres of the words along those. Shape (K, d)."""
+
+    @staticmethod
+    @lru_cache(maxsize=1)
+    def built_in() -> Vocabulary:
+        """The vocabulary that comes with the package."""
+        with np.load(Path(__file__).with_name("vocabulary.npz"), allow_pickle=False) as data:
+            return Vocabulary(*(data[name].astype(np.float32) for name in ("mean", "axes", "words")))
+
+
+@dataclass(frozen=True)
+class VladDescriptor:
+    """A `FrameDescriptor` by VLAD: residuals of SIFT descriptors to their words."""
+
+    @property
+    def length(self) -> int:
+        """Numbers in a descriptor."""
+        return int(Vocabulary.built_in().words.size)
+
+    def __call__(self, color: NDArray[np.uint8], local_descriptors: NDArray[np.uint8]) -> Floats:
+        """Unit-length descriptor of a frame's SIFT descriptors (N, 128); zeros without any. Shape (length,)."""
+        v = Vocabulary.built_in()
+        if not len(local_descriptors):
+            return np.zeros(v.words.size, np.float32)
+        x = (root_sift(local_descriptors) - v.mean) @ v.axes
+        word = np.argmin((v.words**2).sum(axis=1) - 2.0 * x @ v.words.T, axis=1)
+        sums = np.zeros(v.words.shape, np.float64)
+        np.add.at(sums, word, x - v.words[word])
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+        rooted = np.sign(sums) * np.sqrt(np.abs(sums))
+        return np.asarray(rooted.ravel() / max(float(np.linalg.norm(rooted)), 1e-9), np.float32)
+
+
+def root_sift(descriptors: NDArray[np.uint8]) -> Floats:
+    """Square roots of SIFT descriptors of unit sum. Shape (N, 128)."""
+    x = descriptors.astype(np.float32)
+    return np.asarray(np.sqrt(x / np.maximum(x.sum(axis=1, keepdims=True), np.float32(1e-6))))
