@@ -84,6 +84,7 @@ def follow_movers(
     for position in np.flatnonzero(masks.any(axis=(1, 2))).tolist():
         blobs = _blobs(masks[position], colors[position], frames, position, s)
         _assign(tracks, blobs, times_s, frames, s)
+    tracks = _together(tracks, s)
     kept = [t for t in tracks if len(t.blobs) >= s.min_frames and _went(t, frames, s)][: s.most_tracks]
     if not kept:
         return None
@@ -201,6 +202,29 @@ def _assign(
     for n, blob in enumerate(blobs):
         if n not in given:
             tracks.append(Followed([blob], [_place(blob, frames)]))
+
+
+def _together(tracks: list[Followed], s: FollowSettings) -> list[Followed]:
+    """Tracks that keep beside each other in most frames of the shorter one are parts of one thing and its track."""
+    out: list[Followed] = []
+    for track in sorted(tracks, key=lambda t: (-len(t.blobs), t.blobs[0].position)):
+        for whole in out:
+            by_frame = {b.position: n for n, b in enumerate(whole.blobs)}
+            shared = [(b, by_frame[b.position]) for b in track.blobs if b.position in by_frame]
+            beside = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
+            if shared and len(shared) >= 0.6 * len(track.blobs) and len(beside) >= 0.6 * len(shared):
+                for blob, n in shared:
+                    whole.blobs[n] = _union(whole.blobs[n], blob)
+                break
+        else:
+            out.append(track)
+    return sorted(out, key=lambda t: t.blobs[0].position)
+
+
+def _union(a: Blob, b: Blob) -> Blob:
+    share = a.mask.sum() / max(1, a.mask.sum() + b.mask.sum())
+    low, high = np.minimum(a.low, b.low), np.maximum(a.high, b.high)
+    return Blob(a.position, a.mask | b.mask, low, high, a.cut | b.cut, share * a.rgb + (1 - share) * b.rgb)
 
 
 def _expected(track: Followed, position: int, times_s: Array) -> Array:

@@ -8,6 +8,7 @@ taken as a hint, for the middle of a thing that sways is never seen through.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -60,6 +61,10 @@ class MovingSettings:
     """Share of its outline at which it may go on, without a step of depth, as a surface that stays: feet on a floor."""
     hinted: float = 0.15
     """The same for a surface that the odometry found to move of its own."""
+    carried: float = 0.6
+    """Share of a surface that must lie on what moved in the frame before, as far away, to go on with it,"""
+    surely_carried: float = 0.8
+    """and of a whole surface that goes on with it though nobody saw through it: a thing that stands still."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
@@ -114,6 +119,10 @@ def find_moving(
         size = (frames.camera.width, frames.camera.height)
         hinted = None if hint is None else cv2.resize(hint.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         out[position] = ask.moving(position, hinted)
+    for order in (posed, posed[::-1]):
+        for before, position in itertools.pairwise(order):
+            if out[before].any():
+                out[position] |= ask.carried_on(position, out[before] & ~out[position], frames.depth[before])
     return out if out.any() else None
 
 
@@ -127,6 +136,7 @@ class _References:
         self._positions = posed[chosen].tolist()
         window = np.ones((settings.clear, settings.clear), np.uint8)
         self._nearest = {p: cv2.erode(frames.depth[p], window) for p in self._positions}
+        self._known: dict[int, tuple[Mask, Mask]] = {}
         self._T_cam_chunk = {p: np.linalg.inv(frames.T_chunk_cam[p]) for p in self._positions}
 
     def anything(self, position: int) -> bool:
@@ -149,12 +159,39 @@ class _References:
             return out
         return np.asarray(cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0)
 
+    def carried_on(self, position: int, before: Mask, depth_before: Floats) -> Mask:
+        """What of a frame goes on with what moved in the frame beside it: surfaces that lie on it mostly, as far away,
+        so that a thing that stands still for a while is not lost.
+        """
+        s, depth = self._s, self._frames.depth[position]
+        out = np.zeros(depth.shape, bool)
+        if before.sum() < s.least_share * before.size:
+            return out
+        near = before & (np.abs(depth - depth_before) < 0.1 * depth)
+        through, stays = self._ask(position, 1)
+        whole = _whole(depth, s)
+        for region in (whole, whole & ~stays, whole & near):
+            count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
+            gone, kept, held = (
+                np.bincount(labels.ravel(), image.ravel(), minlength=count) for image in (through, stays, near)
+            )
+            area = stats[:, cv2.CC_STAT_AREA]
+            good = (gone >= s.hinted * (gone + kept)) & (held >= s.carried * area)
+            if region is whole:
+                good |= held >= s.surely_carried * area
+            good &= area >= s.least_share * region.size
+            good[0] = False
+            out |= good[labels]
+        return out
+
     def _ask(self, position: int, step: int) -> tuple[Mask, Mask]:
         """Which pixels were seen through, and which were seen to stay. Shapes (h, w), thinned out by `step`.
 
         Going away from the frame in time, what was seen through and is there again later was never seen through: so
         a surface that reads badly, or a pose that is wrong, is told from a thing that came or went.
         """
+        if step == 1 and position in self._known:
+            return self._known[position]
         s, frames = self._s, self._frames
         depth = frames.depth[position][::step, ::step]
         shape = depth.shape
@@ -173,7 +210,10 @@ class _References:
                 stays |= same & ~gone
         through = (votes > 0) & ~back & ((votes >= s.votes) | (asked <= s.votes))
         stays = (stays | back) & ~through
-        return _image(through, known, shape), _image(stays, known, shape)
+        found = _image(through, known, shape), _image(stays, known, shape)
+        if step == 1:
+            self._known[position] = found
+        return found
 
     def _beside(self, position: int, side: int) -> list[int]:
         near = [p for p in self._positions if side * (p - position) > 0]
