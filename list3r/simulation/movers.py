@@ -110,7 +110,9 @@ def _viterbi(free: FreeMap, places: Array, cost: Array, seconds: Array) -> Array
     for k in range(1, len(places)):
         a, b = places[k - 1][:, None], places[k][None]
         haste = np.linalg.norm(b - a, axis=2) / seconds[k - 1]
-        move = 2.0 * haste**2 + 40.0 * np.maximum(haste - _HASTE_M_S, 0) + 200.0 * free.crosses_wall(a, b)
+        move = 2.0 * haste**2 + 40.0 * np.maximum(haste - _HASTE_M_S, 0)
+        near = np.nonzero(haste < 2 * _HASTE_M_S)
+        move[near] += 200.0 * free.crosses_wall(places[k - 1][near[0]], places[k][near[1]])
         through = total[:, None] + move
         back.append(through.argmin(axis=0))
         total = through.min(axis=0) + cost[k]

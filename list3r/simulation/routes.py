@@ -50,6 +50,7 @@ class FreeMap:
         """Distance from each cell to what is in the way, metres. Shape (rows along y, columns along x)."""
         cost = 1 + 6 * np.exp(-((self.clearance_m / _COMFORT_M) ** 2)) + (self.clearance_m <= 0) * _THROUGH_FURNITURE
         self._graph, self._passable = _grid_graph(np.where(solid, np.inf, cost)), ~solid
+        self._near_wall = cv2.dilate(solid.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
     def _fill(self, image: NDArray[np.uint8], corners: Array) -> None:
         hull = cv2.convexHull(((corners - self._origin) / _CELL_M - 0.5).astype(np.float32))
@@ -73,12 +74,14 @@ class FreeMap:
         return np.asarray(self.clearance_m[cell[..., 0], cell[..., 1]])
 
     def crosses_wall(self, a: Array, b: Array) -> NDArray[np.bool_]:
-        """Whether the straight way between places is barred. Shapes (..., 2), broadcast -> (...)."""
-        a, b = np.broadcast_arrays(a, b)
-        barred = np.zeros(a.shape[:-1], dtype=bool)
-        for share in np.linspace(0, 1, 9):
-            cell = self.cells(a + share * (b - a))
-            barred |= ~self._passable[cell[..., 0], cell[..., 1]]
+        """Whether the straight way between places up to 3 m apart is barred. Shapes (..., 2), broadcast -> (...)."""
+        start, step = (a - self._origin) / _CELL_M, (b - a) / _CELL_M
+        rows, columns = self._near_wall.shape
+        barred = np.zeros(np.broadcast_shapes(a.shape, b.shape)[:-1], dtype=bool)
+        for share in np.linspace(0, 1, 11):
+            x = np.clip((start[..., 0] + share * step[..., 0]).astype(np.int32), 0, columns - 1)
+            y = np.clip((start[..., 1] + share * step[..., 1]).astype(np.int32), 0, rows - 1)
+            barred |= self._near_wall[y, x]
         return barred
 
     def open_places(self, room: PlacedRoom, least_m: float) -> Array:
