@@ -44,7 +44,7 @@ def test_its_track_is_where_it_was() -> None:
 
 
 def test_a_mover_over_half_of_the_picture_does_not_make_the_room_move() -> None:
-    samples = film((*BOXES, Thing(MOVER, (-1.4, 0.2, 2.0), (0.9, 1.2), (0.06, 0.0, 0.0))), noise=0.005)
+    samples = film((*BOXES, Thing(MOVER, (-1.4, 0.2, 2.0), (0.9, 1.2), (0.09, 0.0, 0.0))), noise=0.005)
     assert moving(samples) == [MOVER]
 
 

@@ -45,8 +45,8 @@ class MotionSettings:
     least_pairs: int = 6
     """Fewest pairs of frames on which an instance is judged."""
     pair_quantile: float = 0.75
-    """The instance is judged by this quantile over its pairs of frames: it may stand still for most of the chunk."""
-    least_share: float = 0.5
+    """An instance is judged by this quantile over its pairs of frames: it may stand still for most of the chunk."""
+    least_share: float = 0.4
     """Share of the points seen again that are seen through, from which the instance moves."""
     smoothing_frames: int = 3
     """Frames on either side that steady a position, the fuller views counting for more."""
@@ -279,15 +279,18 @@ def _found_again(
 
 
 def _judge(again: Floats, through: Floats, visible: Floats, settings: MotionSettings) -> Floats:
-    """Quantile over pairs of frames that both show the instance of the share seen through. Shape (I,)."""
+    """Quantile of the share seen through, over the half of an instance's pairs of frames that lie farther apart. (I,).
+
+    Both frames of a pair show the instance; what moves slowly still hides behind itself from one frame to the next.
+    """
     total = again + through
     both = (visible[:, :, None] >= 3) & (visible[:, None, :] >= 3) & (total >= settings.least_points)
     share = through / np.maximum(total, 1.0)
-    return np.array(
-        [
-            float(np.quantile(share[k][both[k]], settings.pair_quantile))
-            if both[k].sum() >= settings.least_pairs
-            else 0.0
-            for k in range(len(share))
-        ]
-    )
+    number = np.arange(both.shape[1])
+    lag = np.abs(number[:, None] - number[None, :])
+    out = np.zeros(len(share))
+    for k in range(len(share)):
+        if both[k].sum() >= settings.least_pairs:
+            far = both[k] & (lag >= np.median(lag[both[k]]))
+            out[k] = np.quantile(share[k][far], settings.pair_quantile)
+    return out

@@ -56,6 +56,8 @@ class SupportSettings:
     """Largest regions that are tried as what stands still."""
     patches: tuple[int, int] = (8, 6)
     """Columns and rows of patches, each of which is one correspondence in each frame and region."""
+    prior_patches: int = 60
+    """Patches of a region that tell as much of its errors as all regions together do (errors last over frames)."""
     least_patches: int = 300
     """Fewer patches than this are taken apart into their pairs again."""
     budget: int = 6000
@@ -308,7 +310,7 @@ def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settin
     nor a confident thing crowds out the rest. How far patches of a region err, and pairs within them, is measured by
     how much the two chunks disagree on them within frames, not taken from the model's confidence: things that it
     doubts without cause come in again. All frames have the same say, because the error of its pose is common to all
-    that a frame shows.
+    that a frame shows; and near patches have no more than far ones, which hold rotation and scale.
     """
     usable = _standing(pairs, static)
     regions = divide(pairs, pairs.instance_u, camera, settings)
@@ -316,8 +318,6 @@ def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settin
     patch, count = _patches(pairs, regions, usable, camera, settings)
     trust = _within_patch(off, patch, count, usable)
     weight = _information(off, patch, regions, trust, settings)
-    depth = np.bincount(patch, usable * pairs.cam_v[:, 2], count) / np.maximum(np.bincount(patch, usable, count), 1)
-    weight = weight / np.maximum(depth[patch], 1e-9) ** 2
     _, frame = np.unique(pairs.frame, return_inverse=True)
     weight = weight / np.maximum(np.bincount(frame.ravel(), weight), 1e-300)[frame.ravel()]
     weight = np.asarray(weight, np.float64)
@@ -484,7 +484,7 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
         n, m = int(mine.sum()), int(patches.sum())
         s[k] = (n * _variance(within[mine]) + 20 * s_all) / (n + 20)
         own = max(_variance(whole[patches]) - s[k] / max(_median(number[patches]), 1.0), 0.05 * t_all) if m else 0.0
-        t[k] = (m * own + 10 * t_all) / (m + 10)
+        t[k] = (m * own + settings.prior_patches * t_all) / (m + settings.prior_patches)
     pair_t, pair_s = np.maximum(t, floor)[regions.of_pair], np.maximum(s, floor)[regions.of_pair]
     return np.asarray(trust / (number[patch] * pair_t + pair_s))
 
