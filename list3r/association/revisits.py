@@ -28,6 +28,7 @@ from list3r.association.instance_cues import (
     loop_score,
 )
 from list3r.association.joint_window import JointReconstructor, Objection, Place, WindowSettings, joint_edge, no_edge
+from list3r.association.scaled_verification import verify_scaled
 from list3r.association.verification import VerificationSettings, verify
 from list3r.frames.base import Camera
 from list3r.memory.chunk_verbs import LocalNode
@@ -191,14 +192,16 @@ class _Lookout:
         keyframe_u, keyframe_v = self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
         if all(k.depth_small.size and len(k.keypoints_xy) for k in (keyframe_u, keyframe_v)):
             metric = u.scale_kind == v.scale_kind == "metric"
-            edge = verify(keyframe_u, keyframe_v, c.u, self._id, metric, self._settings.verification)
+            check = verify if metric else verify_scaled
+            edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification)
             edge = _objected(edge, objection) if self._settings.verified else edge
         if joint is None or (edge is not None and edge.accepted):
             edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
         else:
             ends = self._place(u, c.frame_u), self._place(v, c.frame_v)
             edge = joint_edge(joint, *ends, objection if self._settings.verified else None, self._settings.window)
-        off = {} if way is None else {"way": way.deviations(edge.S_v_u)}
+        measured = bool(edge.S_v_u.translation.any())
+        off = {"way": way.deviations(edge.S_v_u)} if way is not None and measured else {}
         return replace(edge, scores=edge.scores | off)
 
     def _objection(self, cues: InstanceCues, way: Prediction | None, S_v_u: Sim3) -> str | None:

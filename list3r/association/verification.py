@@ -76,7 +76,7 @@ def verify(
     chosen = settings or VerificationSettings()
     build = _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id)
     if not metric:
-        return build.rejected("the chunks have no metric scale; a revisit of them needs a joint window")
+        return build.rejected("the chunks have no metric scale")
     matched = match(keyframe_u.keypoint_descriptors, keyframe_v.keypoint_descriptors, chosen.features.ratio)
     a, b = keyframe_u.points_cam[matched[:, 0]], keyframe_v.points_cam[matched[:, 1]]
     pose = relative_pose(a, b, chosen.features, chosen.noise)
@@ -94,6 +94,11 @@ def verify(
         _check(side_v, side_u, found.T_model_cam, chosen),
     )
     return build.judged(T_v_u, found, checks, pose, chosen)
+
+
+def rejected(keyframe_u: Keyframe, keyframe_v: Keyframe, u_id: int, v_id: int, reason: str) -> Edge:
+    """A loop edge between two chunks that is kept only for the record."""
+    return _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id).rejected(reason)
 
 
 def _side(keyframe: Keyframe, noise: SensorNoise) -> _Side:
