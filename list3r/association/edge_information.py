@@ -57,7 +57,7 @@ def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -
     measured = np.array([e.covariance is not None for e in edges], bool)
     if measured.any():
         covariance[measured] = _bent(np.array([e.covariance for e in edges if e.covariance is not None]), settings)
-    for k in np.flatnonzero(~measured):
+    for k in np.flatnonzero(~measured).tolist():
         covariance[k] = _unmeasured(edges[k], metric, settings)
     inverse = np.linalg.inv(covariance[:, :size, :size])
     inverse = (inverse + np.swapaxes(inverse, 1, 2)) / 2.0

@@ -26,6 +26,10 @@ _NONE = 1e-9
 """What edges that are not believed weigh, so that what hangs on them alone stays put."""
 
 
+_SETTLED = 0.05
+"""Change of the logarithm of a variance factor that no longer matters."""
+
+
 @dataclass(frozen=True)
 class TrustSettings:
     """When an edge is believed."""
@@ -44,8 +48,8 @@ class TrustSettings:
     """Largest factor by which the chain may have drifted more than stated (deviations, not squares)."""
     prior_freedom: float = 10.0
     """Degrees of freedom that speak for the stated errors of edges."""
-    rounds: int = 3
-    """Times that errors are scaled and edges judged anew."""
+    rounds: int = 8
+    """Most times that errors are scaled and edges judged anew."""
     iterations: int = 20
     """Most steps of a solution; each stage of the annealing takes a tenth."""
 
@@ -92,7 +96,10 @@ def judge(
         scaled = problem.scaled(factors[kinds])
         poses, trust = _harden(scaled, poses, limit, robust, settings)
         known, squares = marginals(scaled, poses, np.maximum(trust, _NONE)), scaled.squares(poses)
-        factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, factors, settings.prior_freedom)
+        before = factors
+        factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, before, settings.prior_freedom)
+        if np.abs(np.log(factors / before)).max() < _SETTLED:
+            break
     scaled = problem.scaled(factors[kinds])
     known = marginals(scaled, poses, np.maximum(trust, _NONE))
     return Believed(poses, trust, scaled.squares(poses), limit, factors, freedom, known)

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from list3r.association.edge_information import WeightSettings, information, plain_information
 from list3r.association.graph_solver import GraphProblem, adjoint, stack, unstack
 from list3r.association.loop_trust import Believed, Tree, TrustSettings, judge
-from list3r.association.marginals import marginals, widening
+from list3r.association.marginals import widening
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
@@ -106,8 +106,9 @@ def extend(
     """Place one more chunk in a graph whose other chunks lie as `placed` says (as `optimize` or `extend` put them).
 
     A chunk that hangs on one edge is chained: that is the optimum. One with loops that agree with the map is fitted to
-    it alone; if its edges do not fit then, all chunks are solved from where they lie; if it joins components, from the
-    beginning. Only the edges of the new chunk are judged; `optimize` at the end of a session judges all.
+    it alone; if its edges do not fit then, all chunks move by a Gauss-Newton step; if it joins components, all are
+    solved from the beginning. Only the edges of the new chunk are judged, and covariances of the others stay:
+    `optimize` at the end of a session judges all.
     """
     chosen = settings or GraphSettings()
     mine = [k for k, e in enumerate(edges) if new in (e.u, e.v) and e.accepted]
@@ -132,14 +133,14 @@ def extend(
     if len(active) > 1:
         poses = problem.solve(poses, np.ones(len(active)), 5)
     squares = problem.squares(poses)
+    covariance = _hanging(placed.covariances[here], active[first], here, problem.information[first])
     if len(active) > 1 and float(squares.max()) > chi2.ppf(0.95, problem.size):
-        return _resolved(new, chunk_ids, edges, mine, placed, start, metric, chosen)
+        return _resolved(new, chunk_ids, edges, mine, placed, start, covariance, metric, chosen)
     out = list(edges)
     for n, k in enumerate(mine):
         scores = {**edges[k].scores, "graph_residual": float(np.sqrt(squares[n] / 3.0))}
         scores |= {"trust": 1.0, "variance_factor": float(factors[int(loop[n])])}
         out[k] = replace(edges[k], scores=scores)
-    covariance = _hanging(placed.covariances[here], active[first], here, problem.information[first])
     return _with(placed, new, unstack(poses, ids)[new], placed.components[here], out, covariance)
 
 
@@ -150,10 +151,11 @@ def _resolved(
     mine: Sequence[int],
     placed: GraphResult,
     start: Sim3,
+    covariance: Array,
     metric: bool,
     settings: GraphSettings,
 ) -> GraphResult:
-    """All chunks solved from where they lie, with edges believed as before and the new chunk's loops judged."""
+    """All chunks moved by a step; edges are believed as before, but the new chunk's loops are judged."""
     ids = sorted(chunk_ids)
     known = set(ids)
     used = [k for k, e in enumerate(edges) if e.accepted and e.u in known and e.v in known]
@@ -168,7 +170,7 @@ def _resolved(
     limit = float(chi2.ppf(settings.trust.loop_quantile, problem.size))
     trust = np.ones(len(used))
     for _ in range(3):
-        poses = problem.solve(poses, trust, 3)
+        poses = problem.solve(poses, trust, 1)
         squares = problem.squares(poses)
         after = np.where(fresh & (squares > limit), 1e-9, 1.0)
         if (after == trust).all():
@@ -181,12 +183,8 @@ def _resolved(
         believed = bool(trust[n] == 1.0)
         reason = edge.reason if believed else _contradicted(edge, deviations)
         out[used[n]] = replace(edge, accepted=believed, scores=scores, reason=reason)
-    blocks = marginals(problem, poses, trust).covariance
-    covariances = np.zeros((len(ids), 7, 7))
-    covariances[:, : problem.size, : problem.size] = blocks * widening(settings.trust.prior_freedom)
-    residual = float(np.sqrt((trust * squares).mean()))
-    by_id = dict(zip(ids, covariances, strict=True))
-    return GraphResult(unstack(poses, ids), component, tuple(out), residual, by_id)
+    placed_all = GraphResult(unstack(poses, ids), component, tuple(out), placed.residual, dict(placed.covariances))
+    return _with(placed_all, new, placed_all.S_graph_chunk[new], component[new], out, covariance)
 
 
 def _other(edge: Edge, chunk: int) -> int:
