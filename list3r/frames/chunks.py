@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from list3r.memory.errors import OptionError
 
@@ -33,8 +35,22 @@ class ChunkSpan:
     stop: int
 
 
-def plan_chunks(frame_count: int, settings: ChunkSettings) -> list[ChunkSpan]:
-    """The spans that cover `frame_count` frames; the last one may be shorter, never only overlap."""
+def plan_chunks(frame_count: int, settings: ChunkSettings, cuts: Sequence[int] = ()) -> list[ChunkSpan]:
+    """The spans that cover `frame_count` frames; the last one may be shorter, never only overlap.
+
+    `cuts` are positions before which the video jumps (`frames.cuts`): no span holds frames of both sides, and spans on
+    either side of a cut do not overlap. A shot shorter than a chunk is one chunk.
+    """
+    inside = sorted({int(cut) for cut in cuts if 0 < cut < frame_count})
+    spans: list[ChunkSpan] = []
+    for start, stop in pairwise([0, *inside, frame_count]):
+        spans += _plan_shot(start, stop, settings, len(spans))
+    return spans
+
+
+def _plan_shot(start: int, stop: int, settings: ChunkSettings, first: int) -> list[ChunkSpan]:
+    """The spans of frames [start, stop) without a jump, numbered from `first`."""
     step = settings.length - settings.overlap
-    count = max(1, -(-(frame_count - settings.overlap) // step))
-    return [ChunkSpan(k, k * step, min(k * step + settings.length, frame_count)) for k in range(count)]
+    count = max(1, -(-(stop - start - settings.overlap) // step))
+    begins = [start + k * step for k in range(count)]
+    return [ChunkSpan(first + k, a, min(a + settings.length, stop)) for k, a in enumerate(begins)]

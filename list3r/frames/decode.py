@@ -21,6 +21,17 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
+def read_gray(path: Path, reduction: int) -> NDArray[np.uint8]:
+    """A grey image, each side reduced by 1, 2, 4 or 8: a JPEG takes less to decode then. Raises `FrameError`."""
+    flags = {
+        1: cv2.IMREAD_GRAYSCALE,
+        2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
+        4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
+        8: cv2.IMREAD_REDUCED_GRAYSCALE_8,
+    }
+    return np.asarray(_decode(path, flags[reduction]), np.uint8)
+
+
 def read_raw_depth(path: Path) -> NDArray[Any]:
     """Depth as stored, any number type. Shape (H, W). Raises `FrameError`."""
     if path.suffix.lower() == ".npy":

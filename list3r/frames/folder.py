@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.decode import clean_depth, read_color, read_raw_depth
+from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_depth
 from list3r.frames.layout import FrameFile, Layout, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
 from list3r.frames.rig import build_rig, merge_optics
@@ -76,6 +76,13 @@ class FolderSource:
             raise FrameError(f"{file.color.name} has no depth image")
         raw = read_raw_depth(file.depth)
         return read_color(file.color), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
+
+    def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
+        """The colour image in grey as stored, each side reduced by 1, 2, 4 or 8; None where it cannot be decoded."""
+        try:
+            return read_gray(self._layout.files[self._numbers[position]].color, reduction)
+        except FrameError:
+            return None
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]

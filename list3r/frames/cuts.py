@@ -1,0 +1,239 @@
+"""Shot cuts: where a video jumps to another place, so that no chunk spans a jump.
+
+A false cut tears a video apart that one camera walk holds together; a missed one only costs the frames behind it in one
+chunk. So a frame is suspected cheaply, by a thumbnail or a descriptor that is far less like the one before than frames
+around are to each other, and for pictures believed only when local features on either side know nothing of each other.
+One spoilt frame (black, flash, blur) is looked past.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Frame, FrameSource
+
+Floats = NDArray[np.float32]
+Gray = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class CutSettings:
+    """When a jump is believed."""
+
+    window: int = 12
+    """Frames to either side whose likeness is what is usual there."""
+    look_past: int = 3
+    """Spoilt frames in a row (black, flash, blur) that make no cut."""
+    least_shot: int = 5
+    """Frames between two cuts; what is shorter is a flash and stays in one of its neighbours' shots."""
+    factor: float = 3.0
+    """A suspect is so many times less like the frame before than is usual around it."""
+    thumbnail_likeness: float = 0.9
+    """Correlation, best over small shifts, from which thumbnails are alike whatever is usual: of consecutive frames of
+    hand-held video at 3 to 30 a second 99 in 100 are above, of frames of different places 1 in 100."""
+    descriptor_likeness: float = 0.75
+    """Cosine from which frame descriptors are alike whatever is usual."""
+    features: int = 500
+    """Local features on a frame where a suspect is looked at."""
+    ratio: float = 0.85
+    """Lowe's ratio of best to second best distance."""
+    least_features: int = 60
+    """A frame with fewer (a plain wall, darkness, blur) tells nothing."""
+    least_agreeing: int = 14
+    """Matches that agree on one epipolar geometry or homography: from so many on two frames see the same. Unrelated
+    frames give up to 12 by chance."""
+    agreeing_share: float = 0.12
+    """The same as a share of the matches that agree between neighbours on either side, if that is more."""
+
+
+class ThumbnailSource(FrameSource, Protocol):
+    """A source that can decode small grey pictures for less than whole frames."""
+
+    def read_gray(self, position: int, reduction: int) -> Gray | None:
+        """The colour image in grey, each side reduced by about `reduction` (1, 2, 4 or 8); None where it is bad."""
+        ...
+
+
+def find_cuts(source: FrameSource, settings: CutSettings | None = None) -> tuple[int, ...]:
+    """Positions of `source` before which the video jumps, ascending.
+
+    Reads every frame once, small where the source can (a `ThumbnailSource`: 0.6 ms a JPEG of 640 x 480), and the few
+    around a suspect again. The same source gives the same cuts.
+    """
+    chosen = settings or CutSettings()
+    count = source.info.frame_count
+    thumbnails = _thumbnails(source, count)
+    likeness = np.ones(count)
+    known = [k for k in range(count) if thumbnails[k] is not None]
+    for a, b in pairwise(known):
+        likeness[b] = _thumbnail_likeness(thumbnails[a], thumbnails[b])
+    looks = _Looks(source, chosen)
+
+    def alike(a: int, b: int) -> bool:
+        one, two = thumbnails[a], thumbnails[b]
+        if one is None or two is None:
+            return False
+        return _thumbnail_likeness(one, two) >= chosen.thumbnail_likeness or looks.same_place(a, b)
+
+    suspects = _suspects(likeness, chosen.thumbnail_likeness, chosen)
+    return _spaced([k for k in suspects if _jumps(k, count, alike, chosen)], alike, chosen)
+
+
+def cuts_by_descriptor(descriptors: Floats, settings: CutSettings | None = None) -> tuple[int, ...]:
+    """Positions before which the video jumps, ascending, by unit-length descriptors of all frames. Shape (F, D)."""
+    chosen = settings or CutSettings()
+    if len(descriptors) < 2:
+        return ()
+    likeness = np.r_[1.0, np.einsum("fd,fd->f", descriptors[1:], descriptors[:-1])]
+
+    def alike(a: int, b: int) -> bool:
+        return bool(descriptors[a] @ descriptors[b] >= chosen.descriptor_likeness)
+
+    suspects = _suspects(likeness, chosen.descriptor_likeness, chosen)
+    return _spaced([k for k in suspects if _jumps(k, len(descriptors), alike, chosen)], alike, chosen)
+
+
+Alike = Callable[[int, int], bool]
+
+
+def _suspects(likeness: NDArray[np.float64], enough: float, settings: CutSettings) -> list[int]:
+    """Frames far less like the one before than is usual around them; 1 is alike, of F frames the first is."""
+    unlike = 1.0 - likeness
+    out = []
+    for k in np.flatnonzero(likeness < enough):
+        around = unlike[max(1, k - settings.window) : k + settings.window + 1]
+        if unlike[k] > settings.factor * float(np.median(around)):
+            out.append(int(k))
+    return out
+
+
+def _jumps(cut: int, count: int, alike: Alike, settings: CutSettings) -> bool:
+    """True when nothing just before the cut is like anything just after it, looking past spoilt frames on one side."""
+    after = ((cut - 1, cut + k) for k in range(settings.look_past + 1) if cut + k < count)
+    before = ((cut - k, cut) for k in range(2, settings.look_past + 2) if cut - k >= 0)
+    return not any(alike(a, b) for a, b in (*after, *before))
+
+
+def _spaced(cuts: Sequence[int], alike: Alike, settings: CutSettings) -> tuple[int, ...]:
+    """Cuts with no shot between them that is too short to be one: the frames of a flash belong to neither side."""
+    out: list[int] = []
+    for cut in cuts:
+        if out and cut - out[-1] < settings.least_shot:
+            first = out.pop()
+            if not alike(first - 1, cut):
+                out.append(cut)
+        else:
+            out.append(cut)
+    return tuple(out)
+
+
+# ---------------------------------------------------------------------------------------------- pictures
+
+
+def _thumbnails(source: FrameSource, count: int) -> list[Gray | None]:
+    """Small grey pictures of all frames, 48 wide; None where a frame is bad."""
+    read_gray = getattr(source, "read_gray", None)
+    if read_gray is not None:
+        return [_small(read_gray(k, 8)) for k in range(count)]
+    return [_small(_grey(f)) if isinstance(f, Frame) else None for f in source.read(0, count)]
+
+
+def _grey(frame: Frame) -> Gray:
+    return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _small(gray: Gray | None) -> Gray | None:
+    if gray is None:
+        return None
+    height, width = gray.shape
+    size = (48, 36) if width >= height else (36, 48)
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def _thumbnail_likeness(a: Gray | None, b: Gray | None) -> float:
+    """Correlation of the middle of each with the best place in the other: blind to exposure, patient with turning.
+
+    A picture without contrast is like anything: it tells nothing.
+    """
+    assert a is not None and b is not None
+    if a.shape != b.shape:
+        return 0.0
+    best = 0.0
+    for one, two in ((a, b), (b, a)):
+        height, width = one.shape
+        middle = one[height // 4 : -(height // 4), width // 4 : -(width // 4)]
+        if middle.std() < 2.0:
+            return 1.0
+        scores = cv2.matchTemplate(two, np.ascontiguousarray(middle), cv2.TM_CCOEFF_NORMED)
+        best = max(best, float(scores[np.isfinite(scores)].max(initial=0.0)))
+    return best
+
+
+class _Looks:
+    """Local features of the few frames round suspects."""
+
+    def __init__(self, source: FrameSource, settings: CutSettings) -> None:
+        self._source, self._settings = source, settings
+        self._sift = cv2.SIFT.create(nfeatures=settings.features, contrastThreshold=0.015)
+        self._count = source.info.frame_count
+        self._known: dict[int, tuple[Floats, Floats]] = {}
+        self._agreeing: dict[tuple[int, int], int] = {}
+
+    def same_place(self, a: int, b: int) -> bool:
+        """True unless both frames have something to say and agree on nothing."""
+        if min(len(self._features(k)[0]) for k in (a, b)) < self._settings.least_features:
+            return True
+        usual = min(self.agreeing(a - 1, a) if a > 0 else 0, self.agreeing(b, b + 1) if b + 1 < self._count else 0)
+        return self.agreeing(a, b) >= max(self._settings.least_agreeing, self._settings.agreeing_share * usual)
+
+    def agreeing(self, a: int, b: int) -> int:
+        """Matches that agree on one epipolar geometry, or on one homography where all is flat or far."""
+        if (a, b) not in self._agreeing:
+            self._agreeing[a, b] = self._match(a, b)
+        return self._agreeing[a, b]
+
+    def _match(self, a: int, b: int) -> int:
+        (xy_a, d_a), (xy_b, d_b) = self._features(a), self._features(b)
+        if min(len(xy_a), len(xy_b)) < 8:
+            return 0
+        likeness = d_a @ d_b.T
+        forth = likeness.argmax(axis=1)
+        rows = np.flatnonzero(likeness.argmax(axis=0)[forth] == np.arange(len(d_a)))
+        top = np.partition(likeness[rows], -2, axis=1)[:, -2:]
+        distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
+        rows = rows[distance[:, 1] < self._settings.ratio * distance[:, 0]]
+        if len(rows) < 8:
+            return 0
+        p, q = xy_a[rows], xy_b[forth[rows]]
+        found = (
+            cv2.findFundamentalMat(p, q, cv2.FM_RANSAC, 1.5, 0.999, 2000)[1],
+            cv2.findHomography(p, q, cv2.RANSAC, 3.0, maxIters=2000)[1],
+        )
+        return max(0 if inside is None else int(inside.sum()) for inside in found)
+
+    def _features(self, position: int) -> tuple[Floats, Floats]:
+        """Positions (N, 2), px, and RootSIFT descriptors (N, 128)."""
+        if position not in self._known:
+            gray = self._gray(position)
+            points, found = ((), None) if gray is None else self._sift.detectAndCompute(gray, None)
+            if found is None:
+                self._known[position] = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
+            else:
+                root = np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-6))
+                self._known[position] = np.array([k.pt for k in points], np.float32), root.astype(np.float32)
+        return self._known[position]
+
+    def _gray(self, position: int) -> Gray | None:
+        read_gray = getattr(self._source, "read_gray", None)
+        if read_gray is not None:
+            found: Gray | None = read_gray(position, 1)
+            return found
+        frame = next(iter(self._source.read(position, position + 1)), None)
+        return _grey(frame) if isinstance(frame, Frame) else None
