@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from list3r.evaluation.trajectory import (
+    Delta,
     Trajectory,
     associate,
+    coverage,
     evaluate_trajectory,
     read_tum,
     write_tum,
@@ -140,6 +142,59 @@ def test_too_few_common_moments_and_lines_are_errors() -> None:
         evaluate_trajectory(truth, truth, delta_frames=0)
 
 
+@pytest.mark.parametrize(
+    ("text", "delta"),
+    [
+        ("1", Delta()),
+        ("10f", Delta(10)),
+        ("0.5m", Delta(0.5, "m")),
+        (" 2 s ", Delta(2, "s")),
+        ("1e-1m", Delta(0.1, "m")),
+    ],
+)
+def test_deltas_are_read(text: str, delta: Delta) -> None:
+    assert Delta.parse(text) == delta
+
+
+@pytest.mark.parametrize("text", ["", "m", "-1", "0", "1.5", "0m", "1km", "nan", "1.2.3s", "inf"])
+def test_deltas_that_are_none_are_named(text: str) -> None:
+    with pytest.raises(OptionError, match="delta"):
+        Delta.parse(text)
+
+
+def test_a_delta_in_seconds_relates_poses_that_far_apart() -> None:
+    truth = random_walk(4, 61)
+    estimate = disturbed(truth, 4)
+    one = evaluate_trajectory(truth, estimate, delta=Delta(0.1, "s"))
+    assert one.rpe_translation_m.rmse == pytest.approx(
+        evaluate_trajectory(truth, estimate, delta_frames=3).rpe_translation_m.rmse
+    )
+    assert str(one.delta) == "0.1 s"
+    with pytest.raises(OptionError, match="apart"):
+        evaluate_trajectory(truth, estimate, delta=Delta(50, "s"))
+    with pytest.raises(OptionError, match="apart"):
+        evaluate_trajectory(truth, estimate, delta=Delta(61))
+
+
+def test_rpe_of_a_scaled_estimate_is_told_both_ways() -> None:
+    truth = random_walk(6)
+    errors = evaluate_trajectory(truth, moved(truth, Sim3.exp(np.array([0, 0, 0, 0, 0, 0, np.log(2)]))))
+    assert errors.rpe_translation_sim3_m.max < 1e-9
+    assert errors.rpe_translation_m.rmse > 0.01
+
+
+def test_frames_that_are_missing_are_told() -> None:
+    truth = random_walk(7, 301)
+    rows = np.array([k for k in range(301) if not (100 <= k < 160 or 200 <= k < 209 or k >= 270)])
+    found = coverage(truth, truth.at(rows))
+    assert found.gaps == 2
+    assert found.longest_gap_s == pytest.approx(61 / 30)
+    assert found.truth == pytest.approx(1 - (61 + 10 + 31) / 300)
+    whole = coverage(truth, truth.at(np.arange(0, 301, 4)))
+    assert (whole.truth, whole.gaps, whole.longest_gap_s) == (1.0, 0, 0.0)
+    assert coverage(truth, truth.at(np.array([5]))).truth == 0.0
+
+
 # ----------------------------------------------------------------------------------------------- against evo
 
 
@@ -195,6 +250,27 @@ def test_random_trajectories_agree_with_evo(tmp_path: Path, seed: int, delta: in
     write_tum(tmp_path / "truth.txt", truth)
     write_tum(tmp_path / "estimate.txt", estimate.at(keep))
     assert_like_evo(tmp_path / "truth.txt", tmp_path / "estimate.txt", delta)
+
+
+@pytest.mark.parametrize("length", [0.1, 0.5])
+def test_rpe_over_metres_agrees_with_evo(tmp_path: Path, length: float) -> None:
+    pytest.importorskip("evo")
+    from evo.core import metrics
+    from evo.core.units import Unit
+    from evo.tools import file_interface
+
+    truth = random_walk(8, 200)
+    write_tum(tmp_path / "truth.txt", truth)
+    write_tum(tmp_path / "estimate.txt", disturbed(truth, 8))
+    both = tuple(file_interface.read_tum_trajectory_file(tmp_path / f"{n}.txt") for n in ("truth", "estimate"))
+    rpe = metrics.RPE(
+        metrics.PoseRelation.translation_part, length, Unit.meters, all_pairs=True, pairs_from_reference=True
+    )
+    rpe.process_data(both)
+    ours = evaluate_trajectory(
+        read_tum(tmp_path / "truth.txt"), read_tum(tmp_path / "estimate.txt"), delta=Delta(length, "m")
+    )
+    assert ours.rpe_translation_m.rmse == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
 
 
 @pytest.mark.data

@@ -119,7 +119,8 @@ def _print_revisits(scores: RevisitScores, frames: int, chunks: int) -> None:
     ]
     print_table(rows, ["", "true", "accepted", "right", "open", "precision", "recall"])
     print(f"pairs of chunks that were proposed: recall {share(scores.proposed_recall)}")
-    if scores.rankings:
+    cues = {k: r for k, r in scores.rankings.items() if k.startswith("s_") or k == "cosine"}
+    if cues:
         print(f"\nranked by one score: recall at precision {s.precision:g}")
         print_table(
             [
@@ -130,7 +131,7 @@ def _print_revisits(scores: RevisitScores, frames: int, chunks: int) -> None:
                     "-" if r.chunk_threshold is None else f"{r.chunk_threshold:.3f}",
                     share(r.average_precision),
                 ]
-                for name, r in scores.rankings.items()
+                for name, r in cues.items()
             ],
             ["score", "pairs of chunks", "frame pairs", "from", "average precision"],
         )

@@ -58,7 +58,7 @@ def page_axes(T_world_cam: Array) -> tuple[Array, str]:
     up = -T_world_cam[:, :3, 1].mean(axis=0)
     length = float(np.linalg.norm(up))
     if not length > 0.3:
-        return np.eye(3)[:2], "seen along z"
+        return UPRIGHT
     up = up / length
     axis = int(np.argmax(np.abs(up)))
     if abs(up[axis]) > np.cos(np.deg2rad(30)):
@@ -165,20 +165,22 @@ def instances_figure(
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    figure, axis = _sheet(figsize=(9.0, 8.0))
+    corners = [footprint(box) for box, _ in (*truth.values(), *estimate.values())]
+    extent = np.ptp(np.concatenate(corners), axis=0) if corners else np.ones(2)
+    ratio = float(np.clip(extent[1] / max(extent[0], 1e-9), 0.3, 1.3))
+    figure, axis = _sheet(figsize=(9.5, 8.5 * ratio + 1.6))
     found, used = {t for t, _, _ in matches}, {e for _, e, _ in matches}
-    order = sorted(truth, key=lambda k: -float(np.prod(truth[k][0].size[:2])))
-    for k in order:
+    for k in sorted(truth, key=lambda k: -float(np.prod(truth[k][0].size[:2]))):
         color = _FOUND if k in found else _MISSED
-        corners = footprint(truth[k][0])
-        axis.fill(*corners.T, facecolor=color, alpha=0.22, edgecolor=color, linewidth=1.0)
+        outline = footprint(truth[k][0])
+        axis.fill(*outline.T, facecolor=color, alpha=0.22, edgecolor=color, linewidth=1.0)
         if k not in found:
-            _tag(axis, corners.mean(axis=0), f"{truth[k][1]} ({k})", _MISSED)
+            _tag(axis, outline.mean(axis=0), f"{truth[k][1]} ({k})", _MISSED)
     for k in sorted(estimate, key=lambda k: -float(np.prod(estimate[k][0].size[:2]))):
-        corners = footprint(estimate[k][0])
+        outline = footprint(estimate[k][0])
         color, style = (_FOUND, "-") if k in used else (_FALSE, "--")
-        axis.plot(*np.vstack([corners, corners[:1]]).T, color=color, linewidth=1.3, linestyle=style)
-        _tag(axis, corners[2], str(k), color)
+        axis.plot(*np.vstack([outline, outline[:1]]).T, color=color, linewidth=1.3, linestyle=style)
+        _tag(axis, outline[2], str(k), color)
     axis.set_aspect("equal")
     axis.set_title(title, fontsize=11)
     axis.set_xlabel("m, seen along -z", fontsize=9)
@@ -188,7 +190,7 @@ def instances_figure(
         Line2D([], [], color=_FOUND, label="estimated, matched"),
         Line2D([], [], color=_FALSE, linestyle="--", label=f"estimated, false ({len(estimate) - len(used)})"),
     ]
-    axis.legend(handles=handles, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncol=4, frameon=False)
+    figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncol=4, frameon=False)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,9 @@ def read_cloud(path: str | Path) -> PointCloud:
     if ending not in ENDINGS:
         raise SourceError(f"{path} ends in {ending or 'nothing'}; give a cloud ({', '.join(ENDINGS)}) or a memory")
     try:
-        points, normals, words = _read(path, ending)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            points, normals, words = _read(path, ending)
     except SourceError:
         raise
     except Exception as error:  # the readers of five formats raise whatever they like
