@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from list3r.simulation.furnisher import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, moved
 from list3r.simulation.layout import Placer, Room
-from list3r.simulation.rooms import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, make_room, moved
+from list3r.simulation.rooms import make_room
 from list3r.simulation.things import Thing
 from list3r.simulation.world import World
 

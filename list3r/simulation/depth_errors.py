@@ -125,5 +125,5 @@ def _doubt(
     factor = np.minimum(median * np.exp(spread * rng.standard_normal(top + 1)), 1.0)
     for thing in video.world.things:
         doubted[thing.id] &= thing.structure is None
-    doubted[0] = False
+    doubted[[0, *(m.id for m in video.movers)]] = False
     return np.where(doubted, factor, 1.0).astype(np.float32)[video.ids[frames]]

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
+from list3r.simulation.runs import runs_of
 from list3r.simulation.video import MoverTruth, SimulatedVideo
 
 Floats = NDArray[np.float32]
@@ -21,15 +23,18 @@ Floats = NDArray[np.float32]
 class MoverErrorSettings:
     """Errors on things that move."""
 
-    lag_s: float = 0.35
+    lag_s: float = 0.5
     """Deviation of how late (or early) a chunk places a mover, seconds."""
     frozen_share: float = 0.35
     """Share of the chunks that place a mover partly where it was on average."""
     frozen_window_s: float = 2.0
     """Over how long that average is taken, seconds."""
     depth: float = 0.20
-    """Deviation of the logarithm of a chunk's factor on a mover's depth: pi^3-class models err by a fifth of the depth
-    in scenes full of movers (Sintel), by a twentieth where little moves (Bonn)."""
+    """Deviation of the logarithm of the factor on a mover's depth: pi^3-class models err by a fifth of the depth in
+    scenes full of movers (Sintel), by a twentieth where little moves (Bonn)."""
+    steady_share: float = 0.7
+    """Share of that deviation that a chunk keeps to; the rest comes and goes over `lasting_frames`."""
+    lasting_frames: float = 20.0
     least_confidence: float = 0.35
     """The factor on a mover's confidence lies between this and 1, the same for a chunk."""
     pull: float = 0.04
@@ -64,7 +69,7 @@ def mover_errors(
             settings.lag_s * rng.standard_normal(),
             rng.random() < settings.frozen_share,
             rng.uniform(0.4, 1.0),
-            np.exp(settings.depth * rng.standard_normal()),
+            np.exp(settings.depth * _steady(frames, settings, rng)),
             rng.uniform(settings.least_confidence, 1.0),
         )
         mask = ids == mover.id
@@ -75,12 +80,22 @@ def mover_errors(
         if frozen:
             placed = placed + amount * (_average(video, mover, frames, settings.frozen_window_s) - placed)
         moves = np.ptp(mover.T_world_object[frames, :3, 3], axis=0).max() > 1e-3
-        depth[mask] = far if moves else 1.0
-        sure[mask] = confidence if moves else 1.0
+        if moves:
+            depth = np.where(mask, far[:, None, None], depth).astype(np.float32)
+            sure[mask] = confidence
         shift += mask[..., None] * (placed - true).astype(np.float32)[:, None, None]
         share = mask.mean(axis=(1, 2))
         pull += settings.pull * share[:, None] * (true - true.mean(axis=0))
     return MoverErrors(shift, depth, sure, pull)
+
+
+def _steady(frames: NDArray[np.int64], settings: MoverErrorSettings, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Noise of unit deviation, part of it the same in all frames. Shape (F,)."""
+    own = rng.standard_normal(len(frames))
+    for run in runs_of(frames):
+        own[run] = gaussian_filter1d(own[run], settings.lasting_frames / 2, mode="wrap")
+    own /= max(float(np.sqrt(np.mean(own**2))), 1e-9)
+    return settings.steady_share * rng.standard_normal() + np.sqrt(1 - settings.steady_share**2) * own
 
 
 def _late(video: SimulatedVideo, mover: MoverTruth, frames: NDArray[np.int64], lag_s: float) -> NDArray[np.float64]:

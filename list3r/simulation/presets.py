@@ -235,6 +235,9 @@ def _film_loop(take: _Take) -> None:
     director.film(first)
     for room in (*there[1:], *back):
         director.film(director.plan_views(room, 1, 90.0))
+    if not back:
+        director.walk_to(there[-1].doorways[0])
+        director.walk_to(there[0].doorways[0])
     director.film(first[:1])
     take.fit(director, round(frames * take.rng.uniform(0.74, 0.82)))
     director.film(first[1:])
