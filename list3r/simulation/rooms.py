@@ -182,11 +182,12 @@ def _storage(g: Furnisher) -> None:
 
 def _empty(g: Furnisher) -> None:
     """Two or three things in a bare room."""
-    groups = [groups.plant_group, groups.bench_group, groups.armchair_group, groups.basket_group, groups.cartons_group]
-    groups.append(groups.cabinet_group("cabinet", 0.9, 0.44, 0.8, "box"))
-    order = g.p.rng.permutation(len(groups))
+    low = groups.cabinet_group("cabinet", 0.9, 0.44, 0.8, "box")
+    known = (groups.plant_group, groups.bench_group, groups.armchair_group, groups.basket_group, groups.cartons_group)
+    choice = [*known, low]
+    order = g.p.rng.permutation(len(choice))
     for k in order[: int(g.p.rng.integers(2, 4))]:
-        g.along_wall(groups[k])
+        g.along_wall(choice[k])
     _decorate(g, 1)
 
 
