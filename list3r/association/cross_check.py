@@ -7,7 +7,7 @@ other saw to be empty, and what lands on a surface is a thing of another kind. B
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from list3r.memory.records import FrameSamples
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+_SAME_SIDE = -0.2
+"""Least cosine between two rays to a point for both to see the same side of its surface (a wall has two)."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,59 @@ def cross_check(
         likeness=likeness,
         kinds=kinds,
     )
+
+
+def shared_view(
+    S_v_u: Sim3, u: Side, v: Side, frames: tuple[Ints, Ints], settings: CrossSettings | None = None
+) -> float:
+    """Largest share of surface that a frame of u and a frame of v both see through a relation, in [0, 1].
+
+    Of the two shares of a pair of frames the smaller one counts. `frames` are those of u and of v that are compared.
+    """
+    chosen = settings or CrossSettings()
+    near = replace(chosen, points=4000, frames=10)
+    part_u, part_v = _only(u, frames[0]), _only(v, frames[1])
+    there, back = _seen(S_v_u, part_u, part_v, near), _seen(S_v_u.inverse(), part_v, part_u, near)
+    return float(np.minimum(there, back.T).max()) if there.size and back.size else 0.0
+
+
+def _only(side: Side, frames: Ints) -> Side:
+    """Ten of the given frames of a side, or fewer."""
+    kept = frames[np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 10)).astype(np.int64))]
+    s = side.samples
+    rows, cameras = np.isin(s.frame, kept), np.isin(s.camera_frames, kept)
+    part = replace(
+        s,
+        frame=s.frame[rows],
+        pixel=s.pixel[rows],
+        points=s.points[rows],
+        confidence=s.confidence[rows],
+        instance=s.instance[rows],
+        camera_frames=s.camera_frames[cameras],
+        T_chunk_cam=s.T_chunk_cam[cameras],
+    )
+    return replace(side, samples=part)
+
+
+def _seen(S: Sim3, source: Side, target: Side, settings: CrossSettings) -> Array:
+    """Share of each source frame's points that lie on what each target frame sees. Shape (Gs, Gt)."""
+    points, frame, _ = _points(source, settings)
+    grids = _grids(target, settings)
+    names = source.samples.camera_frames
+    out = np.zeros((len(names), len(grids.frames)))
+    if not len(points) or not out.size:
+        return out
+    there, row = S.apply(points), np.searchsorted(names, frame)
+    agree, _, _ = _verdicts(there, grids, target.camera, settings)
+    from_source = _unit(there - S.apply(source.samples.T_chunk_cam[row, :3, 3]))
+    from_target = _unit(there[:, None] - target.samples.T_chunk_cam[None, :, :3, 3])
+    same_side = np.einsum("ni,ngi->ng", from_source, from_target) > _SAME_SIDE
+    np.add.at(out, row, agree & same_side)
+    return np.asarray(out / np.maximum(np.bincount(row, minlength=len(names)), 1)[:, None])
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
 
 
 @dataclass(frozen=True)

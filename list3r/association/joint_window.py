@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.association.alignment import align
 from list3r.association.chain import adjoint
-from list3r.association.cross_check import CrossSettings, Side, cross_check
+from list3r.association.cross_check import CrossSettings, Side, cross_check, shared_view
 from list3r.association.edges import EdgeSettings, measure_edge
 from list3r.association.support import shared_samples
 from list3r.memory.errors import DegenerateError
@@ -49,6 +49,8 @@ class WindowSettings:
     """Least confidence m of either side's alignment."""
     rough_pairs: int = 600
     """Pairs of points of the first estimate of either side."""
+    least_shared: float = 0.15
+    """Least share of surface that two of the window's frames must both see: what shares nothing is invented."""
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     cross: CrossSettings = field(default_factory=CrossSettings)
 
@@ -122,6 +124,7 @@ class _Verdict:
     ) -> None:
         self._u, self._v, self._made_from, self._objection = u, v, made_from, objection
         self._settings = settings.cross
+        self._least_shared = settings.least_shared
         self.scores: dict[str, float] = {}
         self.seen = ""
 
@@ -129,8 +132,12 @@ class _Verdict:
         """Why it cannot be, or None."""
         if self._objection is not None and (against := self._objection(S_v_u)):
             return against
+        shared = shared_view(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
+        self.scores = {"shared_view": shared}
+        if shared < self._least_shared:
+            return f"no two frames of the places see the same through it ({shared:.0%} of their surface at most)"
         check = cross_check(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
-        self.scores = {"overlap": check.overlap, "agreement": check.agreement, "kinds": float(check.kinds)}
+        self.scores |= {"overlap": check.overlap, "agreement": check.agreement, "kinds": float(check.kinds)}
         if np.isfinite(check.likeness):
             self.scores["likeness"] = check.likeness
         self.seen = f"{check.overlap:.0%} of the surface is seen by both chunks, {check.agreement:.0%} of it agrees"
