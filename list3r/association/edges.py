@@ -60,7 +60,7 @@ class EdgeSupport:
     confident: Mask
     """What confidence alone would take. Shape (N,)."""
     removed: Mask
-    """Confident, but on a region that moves. Shape (N,)."""
+    """On a region that moves. Shape (N,)."""
     kept: Mask
     """What the edge stands on. Shape (N,)."""
 
@@ -71,9 +71,9 @@ class MeasuredEdge:
 
     edge: Edge
     moving_u: frozenset[int]
-    """Local ids of chunk u that the two chunks place inconsistently."""
+    """Local ids of chunk u that plainly move; what is merely inconsistent leaves the support without being named."""
     moving_v: frozenset[int]
-    """Local ids of chunk v that the two chunks place inconsistently."""
+    """Local ids of chunk v that plainly move."""
     support: EdgeSupport
 
 
@@ -152,7 +152,8 @@ def _confident_support(pairs: Pairs, settings: SupportSettings) -> tuple[StaticS
     """All pairs that confidence alone would take, by their confidence."""
     sure = confident(pairs, settings)
     none = np.zeros(len(pairs), bool)
-    static = StaticSupport(Sim3.identity(), sure, none, frozenset(), frozenset(), 0.0)
+    nobody: frozenset[int] = frozenset()
+    static = StaticSupport(Sim3.identity(), sure, none, nobody, nobody, nobody, nobody, 0.0)
     return static, BalancedSupport(pairs.p_u[sure], pairs.p_v[sure], pairs.weight[sure], pairs.frame[sure], sure)
 
 
@@ -167,7 +168,7 @@ def _edge(
     frames: tuple[int, int] | None,
 ) -> Edge:
     shared_frames = len(np.unique(support.frame))
-    moving = float(static.removed.sum()) / max(1, int(static.confident.sum()))
+    moving = float((static.removed & static.confident).sum()) / max(1, int(static.confident.sum()))
     reason = (
         f"{found.inliers} of {len(support.weight)} points of {shared_frames} shared frames agree to {found.rms:.4f}"
     )
@@ -197,7 +198,7 @@ def _edge(
             "spread": found.spread,
             "close": found.close,
             "moving": moving,
-            "removed_instances": float(max(len(static.moving_u), len(static.moving_v))),
+            "removed_instances": float(max(len(static.left_out_u), len(static.left_out_v))),
             "delta_max_px": static.delta_max_px,
         },
         frames=frames,

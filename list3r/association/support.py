@@ -50,6 +50,9 @@ class SupportSettings:
     """... and by no less than this share of the image's width."""
     least_depth: float = 0.01
     """... or, along the ray, this share of its depth."""
+    plainly: float = 3.0
+    """So many times beyond that limit a region plainly moves; short of it it may as well be wrongly followed or
+    badly reconstructed. Both leave the support."""
     rounds: int = 2
     """Rounds of alignment and removal."""
     hypotheses: int = 6
@@ -124,8 +127,13 @@ class Inconsistency:
     """Displacement across the ray relative to the frame, px. Shape (R,)."""
     along: Floats
     """Displacement along the ray relative to the frame, as a share of the depth. Shape (R,)."""
-    moving: Mask
-    """Shape (R,)."""
+    excess: Floats
+    """How many times what a static region is off by at most; 0 where there are too few pairs to judge. Shape (R,)."""
+
+    @property
+    def moving(self) -> Mask:
+        """Shape (R,)."""
+        return np.asarray(self.excess > 1.0)
 
 
 @dataclass(frozen=True)
@@ -137,11 +145,15 @@ class StaticSupport:
     confident: Mask
     """Pairs that confidence alone would take. Shape (N,)."""
     removed: Mask
-    """Confident pairs on regions that move. Shape (N,)."""
+    """Pairs on regions that move. Shape (N,)."""
+    left_out_u: frozenset[int]
+    """Local ids of chunk u whose regions were removed."""
+    left_out_v: frozenset[int]
+    """Local ids of chunk v whose regions were removed."""
     moving_u: frozenset[int]
-    """Local ids of chunk u whose regions move."""
+    """Those of chunk u that plainly move."""
     moving_v: frozenset[int]
-    """Local ids of chunk v whose regions move."""
+    """Those of chunk v that plainly move."""
     delta_max_px: float
     """Largest delta of a region that stays."""
 
@@ -235,7 +247,7 @@ def static_support(
     determines a similarity.
     """
     sure = confident(pairs, settings)
-    known = np.zeros(len(pairs), bool) if known is None else sure & known
+    known = np.zeros(len(pairs), bool) if known is None else known
     if not (sure & ~known).any():
         raise DegenerateError("no shared point that stands still has enough confidence in both chunks")
     by_u = divide(pairs, pairs.instance_u, camera, settings)
@@ -246,7 +258,7 @@ def static_support(
     for _ in range(settings.rounds):
         of_u = inconsistency(pairs, sure, by_u, S_v_u, camera, settings, removed)
         of_v = inconsistency(pairs, sure, by_v, S_v_u, camera, settings, removed)
-        removed_now = known | (sure & (of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair]))
+        removed_now = known | of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair]
         if np.array_equal(removed_now, removed):
             break
         removed = removed_now
@@ -257,8 +269,10 @@ def static_support(
         S_v_u=S_v_u,
         confident=sure,
         removed=removed,
-        moving_u=_ids(by_u, of_u),
-        moving_v=_ids(by_v, of_v),
+        left_out_u=_ids(by_u, of_u, 1.0),
+        left_out_v=_ids(by_v, of_v, 1.0),
+        moving_u=_ids(by_u, of_u, settings.plainly),
+        moving_v=_ids(by_v, of_v, settings.plainly),
         delta_max_px=float(np.nanmax(staying)) if np.isfinite(staying).any() else 0.0,
     )
 
@@ -299,8 +313,8 @@ def inconsistency(
     mean_delta = np.bincount(regions.of_pair, delta * sure, len(regions.count)) / np.maximum(
         np.bincount(regions.of_pair, sure, len(regions.count)), 1
     )
-    moving = judged & ((across > limit_across) | (along > limit_along))
-    return Inconsistency(mean_delta, across, along, moving)
+    excess = np.where(judged, np.maximum(across / limit_across, along / limit_along), 0.0)
+    return Inconsistency(mean_delta, across, along, excess)
 
 
 def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settings: SupportSettings) -> BalancedSupport:
@@ -312,7 +326,7 @@ def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settin
     doubts without cause come in again. All frames have the same say, because the error of its pose is common to all
     that a frame shows; and near patches have no more than far ones, which hold rotation and scale.
     """
-    usable = _standing(pairs, static)
+    usable = ~static.removed
     regions = divide(pairs, pairs.instance_u, camera, settings)
     off = _relative_to_frame(pairs, static.S_v_u, usable) / np.maximum(pairs.cam_v[:, 2:], 1e-9)
     patch, count = _patches(pairs, regions, usable, camera, settings)
@@ -418,12 +432,6 @@ def _limit(
     return max(settings.factor * middle, middle + settings.deviations * deviation, least)
 
 
-def _standing(pairs: Pairs, static: StaticSupport) -> Mask:
-    """All pairs, doubted ones as well, but for those on instances and blocks that move."""
-    moving = np.isin(pairs.instance_u, list(static.moving_u)) | np.isin(pairs.instance_v, list(static.moving_v))
-    return np.asarray(~moving & ~static.removed)
-
-
 def _patches(
     pairs: Pairs, regions: Regions, usable: Mask, camera: Camera, settings: SupportSettings
 ) -> tuple[Ints, int]:
@@ -494,8 +502,8 @@ def _variance(squares: Floats) -> float:
     return _median(squares) / 0.455 if len(squares) else 0.0
 
 
-def _ids(regions: Regions, found: Inconsistency) -> frozenset[int]:
-    return frozenset(int(k) for k in regions.label[found.moving] if k >= 0)
+def _ids(regions: Regions, found: Inconsistency, excess: float) -> frozenset[int]:
+    return frozenset(int(k) for k in regions.label[found.excess > excess] if k >= 0)
 
 
 def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
