@@ -114,6 +114,7 @@ def align(
     known = measure_uncertainty(
         pairs.u, back, pairs.weight, trust, limit / scale, pairs.group, metric, chosen.bending_gain
     )
+    _check_extent(pairs.u, back, pairs.weight * trust)
     _check_determined(known.covariance, metric, chosen)
     residual = np.full(len(every.u), np.inf)
     residual[used] = pairs.residual(S_v_u)
@@ -293,6 +294,17 @@ def _refine(
         if moved < 1e-7 * spread:
             break
     return S_v_u, trust, limit
+
+
+def _check_extent(p: Array, q: Array, weight: Array) -> None:
+    """Raise `DegenerateError` for a line that only noise makes thick: both sides do not agree on what makes it so."""
+    w = weight / weight.sum()
+    dp, dq = p - w @ p, q - w @ q
+    together = (w[:, None] * dp).T @ dq
+    _, across, along = np.linalg.eigvalsh((together + together.T) / 2.0)
+    noise = float(w @ ((dp - dq) ** 2).sum(axis=1)) / 3.0
+    if across < min(0.25 * noise, 0.01 * along):
+        raise DegenerateError("beside their noise the points lie on one line and leave the rotation about it open")
 
 
 def _check_determined(covariance: Array, metric: bool, settings: AlignmentSettings) -> None:
