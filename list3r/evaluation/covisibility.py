@@ -30,6 +30,9 @@ class CovisibilitySettings:
     tolerance: float = 0.05
     """Greatest difference of depths of one surface, as a share of the depth: the noise of sensors and of true poses
     stays below it indoors, the gap between a thing and what it hides above it."""
+    most_deg: float = 75.0
+    """Greatest angle between two lines of sight at which a surface counts as seen again: two cameras that face each
+    other down a corridor see the same walls, but nobody knows them again."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def covisibility(
 ) -> Shares:
     """Shares (F, F) from depth maps (F, h, w) along z, 0 where unknown, poses (F, 4, 4) and the camera of the maps.
 
-    A point of frame i is seen in frame j when it lies in j's picture, on the same side of the surface, and j's depth
+    A point of frame i is seen in frame j when it lies in j's picture, seen from about the same side, and j's depth
     there agrees: within the tolerance of the span of the four pixels around it, so that a steep surface on a coarse
     map is not lost. Where j has no depth the point tells nothing and is left out, though at most half of them.
     Rows and columns of frames without a finite pose or without depth are NaN. Raises `OptionError` for shapes that do
@@ -84,7 +87,7 @@ def covisibility(
     for i in rows:
         rays = grids[i] @ poses[i, :3, :3].T
         world = rays + poses[i, :3, 3]
-        share[i, rows] = _seen_shares(world, rays, T_cam_world[rows], camera, low, high, rows, chosen.tolerance)
+        share[i, rows] = _seen_shares(world, rays, T_cam_world[rows], camera, low, high, rows, chosen)
         share[i, i] = 1.0
     return share
 
@@ -117,12 +120,14 @@ def _seen_shares(
     low: Shares,
     high: Shares,
     rows: NDArray[np.int64],
-    tolerance: float,
+    settings: CovisibilitySettings,
 ) -> Array:
     """Share of world points (P, 3), found along rays (P, 3), that each of G frames sees. Shape (G,)."""
     p = np.einsum("gij,pj->gpi", T_cam_world[:, :3, :3], world) + T_cam_world[:, None, :3, 3]
     z = p[..., 2]
-    facing = np.einsum("gij,pj,gpi->gp", T_cam_world[:, :3, :3], rays, p, optimize=True) > 0
+    along = np.einsum("gij,pj,gpi->gp", T_cam_world[:, :3, :3], rays, p, optimize=True)
+    lengths = np.linalg.norm(rays, axis=1) * np.linalg.norm(p, axis=2)
+    facing = along >= np.cos(np.deg2rad(settings.most_deg)) * lengths
     ahead = (z > 1e-9) & facing
     safe = np.where(ahead, z, 1.0)
     x, y = camera.fx * p[..., 0] / safe + camera.cx, camera.fy * p[..., 1] / safe + camera.cy
@@ -132,7 +137,7 @@ def _seen_shares(
     frames = np.broadcast_to(rows[:, None], z.shape)
     near, far = low[frames, line, column], high[frames, line, column]
     unknown = inside & (far <= 0)
-    seen = inside & (z >= near * (1 - tolerance)) & (z <= far * (1 + tolerance))
+    seen = inside & (z >= near * (1 - settings.tolerance)) & (z <= far * (1 + settings.tolerance))
     count = np.maximum(len(world) - unknown.sum(axis=1), len(world) / 2)
     return np.asarray(seen.sum(axis=1) / count)
 
