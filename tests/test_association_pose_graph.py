@@ -148,14 +148,14 @@ def test_a_loop_that_moves_the_map_moves_all_of_it() -> None:
 # ------------------------------------------------------------------------------------------------- covariances
 
 
-@pytest.mark.parametrize(("loops", "stated"), [(30, 1.0), (30, 0.5), (0, 1.0)])
+@pytest.mark.parametrize(("loops", "stated"), [(30, 1.0), (30, 0.7), (0, 1.0)])
 def test_true_positions_lie_inside_the_stated_region(loops: int, stated: float) -> None:
-    exact = GraphSettings(weights=WeightSettings(bend=1e-6))
+    exact = GraphSettings(weights=WeightSettings(bend=1e-6, own_bend=0.0))
     inside = []
     for seed in range(10):
         truth, edges = graph(seed + 20, loops=loops, stated=stated)
         inside.append(normalised(solved(truth, edges, exact), truth) < chi2.ppf(0.95, 3))
-    assert 0.88 <= np.concatenate(inside).mean() <= 1.0
+    assert 0.9 <= np.concatenate(inside).mean() <= 1.0
 
 
 def test_marginals_are_the_blocks_of_the_inverse() -> None:

@@ -4,12 +4,13 @@ its confidence (paper A.4).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.graph_solver import adjoint
 from list3r.memory.geometry import skew
 from list3r.memory.records import Edge
 
@@ -32,6 +33,10 @@ class WeightSettings:
     bend: float = 0.006
     """Deviation of a chunk's shape between the places where two edges hold it, as a share of the support's radius for
     shifts, in radians for turns, and of the logarithm of scale: a prior that loops correct."""
+    own_bend: float = 0.015
+    """Deviation of a chunk's frame, as its edges see it, from its own cameras, in the same units as `bend`. It does not
+    weigh edges: it is part of what a chunk's covariance states, once for the chunk and once for the first chunk, which
+    everything is relative to. Chosen on four simulated videos (seed 101)."""
     unmeasured: float = 0.02
     """The same for the error of an edge without a covariance at confidence 1."""
 
@@ -50,7 +55,10 @@ def edge_weights(confidence: Array, settings: WeightSettings) -> Array:
 def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
     """Inverse covariances of the edges' tangent errors with bending, in u's units.
 
-    Shape (E, D, D), D = 6 if metric else 7. BASIS
+    Shape (E, D, D), D = 6 if metric else 7. The paper's sharpened confidence (A.4) is not multiplied in. 24 simulated
+    graphs of 60 chunks and 40 loops, mean ATE: plain 0.0535, confidence 0.0522, the paper's weight 0.0504, information
+    0.0398, information times the paper's weight 0.0395; but with 30 % false loops that agree 0.0430 and 0.159. Three
+    videos of the simulated feed-forward model: plain 0.056, information 0.030, times the paper's weight 0.033.
     """
     size = 6 if metric else 7
     covariance = np.empty((len(edges), 7, 7))
@@ -64,6 +72,23 @@ def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -
     if settings.sharpen:
         inverse *= np.maximum(edge_weights(np.array([e.confidence for e in edges]), settings), 1e-6)[:, None, None]
     return np.asarray(inverse)
+
+
+def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settings: WeightSettings) -> Array:
+    """Covariances of chunks' frames from their own bending, about the middle of what their edges stand on, chunk units.
+
+    Shape (K, 7, 7), 0 for chunks without an edge that states a covariance.
+    """
+    out, seen = np.zeros((count, 7, 7)), np.zeros(count)
+    stated = [(e, e.covariance) for e in edges if e.covariance is not None]
+    if stated:
+        shapes = _bent(np.array([C for _, C in stated]), settings) - np.array([C for _, C in stated])
+        for (edge, _), shape in zip(stated, shapes, strict=True):
+            moved = adjoint(edge.S_v_u)
+            for chunk, here in ((edge.u, shape), (edge.v, moved @ shape @ moved.T)):
+                out[row[chunk]] += here
+                seen[row[chunk]] += 1
+    return np.asarray(out * (settings.own_bend / settings.bend) ** 2 / np.maximum(seen, 1)[:, None, None])
 
 
 def plain_information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from list3r.association.edge_information import WeightSettings, information, plain_information
-from list3r.association.graph_solver import GraphProblem, adjoint, stack, unstack
+from list3r.association.edge_information import WeightSettings, information, own_shapes, plain_information
+from list3r.association.graph_solver import GraphProblem, adjoint, stack, take, unstack
 from list3r.association.loop_trust import Believed, Tree, TrustSettings, judge
 from list3r.association.marginals import widening
 from list3r.memory.errors import DegenerateError
@@ -92,7 +92,10 @@ def optimize(
         out[k] = _judged(edges[k], float(strength[n]), float(found.squares[n]), found, n)
     count = max(float(found.trust @ found.marginals.redundancy), 1e-9)
     residual = float(np.sqrt(found.trust @ found.squares / max(count, 1.0)))
-    return GraphResult(unstack(found.poses, ids), component, tuple(out), residual, _covariances(found, ids))
+    own = own_shapes(active, row, len(ids), chosen.weights)
+    first = np.array([row[component[chunk]] for chunk in ids])
+    covariances = dict(zip(ids, _covariances(found, own, first), strict=True))
+    return GraphResult(unstack(found.poses, ids), component, tuple(out), residual, covariances)
 
 
 def extend(
@@ -248,11 +251,17 @@ def _check(edge: Edge) -> None:
         raise DegenerateError(f"the edge between chunks {edge.u} and {edge.v} ({edge.kind}) holds a number not finite")
 
 
-def _covariances(found: Believed, ids: Sequence[int]) -> dict[int, Array]:
-    blocks = found.marginals.covariance * widening(float(found.freedom.sum() - found.freedom.min()))
-    out = np.zeros((len(ids), 7, 7))
-    out[:, : blocks.shape[1], : blocks.shape[2]] = blocks
-    return dict(zip(ids, out, strict=True))
+def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array:
+    """What is stated of each chunk: its place in the graph, its own bending, and that of the first chunk, `first` (K,),
+    which moves all others. Shape (K, 7, 7)."""
+    size = found.marginals.covariance.shape[1]
+    own = own * found.factors[0]
+    from_first = adjoint(found.poses.inverse() @ take(found.poses, first))
+    out = own + from_first @ own[first] @ np.swapaxes(from_first, 1, 2)
+    out[:, size:], out[:, :, size:] = 0.0, 0.0
+    out[:, :size, :size] += found.marginals.covariance
+    out[first] = 0.0
+    return np.asarray(out * widening(float(found.freedom.sum() - found.freedom.min())))
 
 
 def _strengths(information: Array, found: Believed, loop: NDArray[np.bool_]) -> Array:
