@@ -119,7 +119,9 @@ def _print_revisits(scores: RevisitScores, frames: int, chunks: int) -> None:
     ]
     print_table(rows, ["", "true", "accepted", "right", "open", "precision", "recall"])
     print(f"pairs of chunks that were proposed: recall {share(scores.proposed_recall)}")
-    cues = {k: r for k, r in scores.rankings.items() if k.startswith("s_") or k == "cosine"}
+    cues = {k: r for k, r in scores.rankings.items() if k.startswith("s_")} or {
+        k: r for k, r in scores.rankings.items() if k == "cosine"
+    }
     if cues:
         print(f"\nranked by one score: recall at precision {s.precision:g}")
         print_table(
