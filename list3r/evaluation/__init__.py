@@ -1,1 +1,1 @@
-"""Measures against known truth: trajectories, clouds, instances, relations. Nothing here knows the store."""
+"""Measures against known truth: trajectories, clouds, instances, relations, revisits. Nothing here knows the store."""
