@@ -17,7 +17,13 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DepthErrorSettings:
-    """Errors of depth as shares of it, and confidence."""
+    """Errors of depth as shares of it, and confidence.
+
+    Together they put depth off by 3 % on average. Confidence ranks pixels by their true error with a Spearman
+    coefficient of 0.35 to 0.5. It lies in three ways: bland surfaces that are wrong and confident, runs of frames that
+    are (`PoseErrorSettings.glitch_rate`), and good things that are doubted, which the paper names as what costs
+    confidence-only support its tables and chairs (3.2).
+    """
 
     noise: float = 0.006
     """Deviation of depth near the camera."""

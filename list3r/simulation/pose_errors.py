@@ -25,7 +25,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseErrorSettings:
-    """Errors of poses and of the scale of each frame's geometry."""
+    """Errors of poses and of the scale of each frame's geometry.
+
+    The three of `bend_` were set together so that a chunk of 100 frames and a chain of chunks err as published (see
+    `feedforward`); their ratios are those of views of a scene: a turn of 0.18 degrees shifts what is 2.3 m away by
+    7 mm, 0.3 % of the depth, as much as the shift and the scale.
+    """
 
     bend_deg: float = 0.18
     """Deviation of the rotation between views that share all they see, about the middle of what they see."""
