@@ -199,6 +199,8 @@ def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> _Known:
 def _descriptors(store: DescriptorStore, chunk_ids: Sequence[int]) -> tuple[Ints, Floats]:
     """Keys and unit descriptors of some chunks; what is not finite becomes zero and resembles nothing."""
     keys, descriptors = store.keyframe_descriptors(chunk_ids)
-    descriptors = np.asarray(descriptors, np.float32).reshape(len(keys), -1)
+    if not len(keys):
+        return keys, np.zeros((0, 0), np.float32)
+    descriptors = np.asarray(descriptors, np.float32)
     sound = np.where(np.isfinite(descriptors).all(axis=1, keepdims=True), descriptors, np.float32(0))
     return keys, np.asarray(sound / np.maximum(np.linalg.norm(sound, axis=1, keepdims=True), np.float32(1e-12)))

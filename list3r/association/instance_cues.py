@@ -86,7 +86,7 @@ def instance_set(
     usable = sorted(usable, key=lambda n: (-len(n.frames), n.local_id))[: settings.most_instances]
     usable.sort(key=lambda n: n.local_id)
     length = len(usable[0].feature) if usable else 0
-    feature = np.array([n.feature for n in usable], np.float64).reshape(-1, length)
+    feature = np.array([n.feature for n in usable], np.float64).reshape(len(usable), length)
     low_high = np.array([np.quantile(n.support.points, [0.1, 0.9], axis=0) for n in usable]).reshape(-1, 2, 3)
     up = -T_chunk_cam[:, :3, 1].sum(axis=0) if len(T_chunk_cam) else np.zeros(3)
     return InstanceSet(

@@ -50,11 +50,14 @@ class RevisitSettings:
     lambda_: float = 0.5
     """Weight of frame similarity in s_loop (the paper gives none)."""
     least_score: float = 0.8
-    """Least s_loop of a candidate that is verified, unless its frames alone are alike enough."""
+    """Least s_loop of a candidate that is worth a joint window, unless its frames alone are alike enough."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
     enough: int = 8
     """Accepted edges after which no further candidate of a chunk is verified."""
+    second_opinion: bool = False
+    """Try a joint window also where keyframes with features and depth were compared in vain. For RGB-D that costs
+    seconds a candidate and finds little more (redkitchen)."""
     layout_pairs: int = 5
     """Instances that must agree on a layout for its scale to count."""
     most_scale_ratio: float = 1.6
@@ -110,7 +113,7 @@ def find_loops(
     for scored in _ranked(candidates, look, chosen):
         accepted = [e for e in edges if e.accepted]
         c = scored.candidate
-        if c.s_det < STRICT and (scored.score < chosen.least_score or not chosen.instance_cues):
+        if c.s_det < STRICT and look.unlikely(scored):
             edge = look.refused(scored, f"frames and instances are not alike enough (s_loop {scored.score:.2f})")
         elif chosen.verified and any(e.u == c.u for e in accepted):
             edge = look.refused(scored, "not tried: a better candidate joins the two chunks")
@@ -159,6 +162,11 @@ def _objected(edge: Edge, objection: Objection) -> Edge:
     return replace(edge, accepted=False, weight=0.0, reason=f"{against} ({edge.reason})")
 
 
+def _tells(keyframe: Keyframe) -> bool:
+    """Whether a keyframe has local features and depth."""
+    return bool(keyframe.depth_small.size) and len(keyframe.keypoints_xy) > 0
+
+
 class _Lookout:
     """The new chunk, and the stored ones it is compared with, read once each."""
 
@@ -178,6 +186,15 @@ class _Lookout:
             self._cues[u] = compare_instances(there, here, self._settings.cues)
         return self._cues[u]
 
+    def unlikely(self, scored: _Scored) -> bool:
+        """Whether a candidate is not worth a try: instances only rank those whose keyframes tell cheaply and surely."""
+        if not self._settings.instance_cues:
+            return True
+        return scored.score < self._settings.least_score and not all(map(_tells, self._keyframes(scored.candidate)))
+
+    def _keyframes(self, c: Candidate) -> tuple[Keyframe, Keyframe]:
+        return self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
+
     def refused(self, scored: _Scored, reason: str) -> Edge:
         """An edge that is kept only for the record."""
         return no_edge(self._id_of(scored), (self._id, scored.candidate.frame_v), reason)
@@ -189,13 +206,13 @@ class _Lookout:
         way = predict([*self._edges, *found], c.u, self._id, self._settings.chain)
         objection = partial(self._objection, scored.cues, way)
         edge = None
-        keyframe_u, keyframe_v = self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
-        if all(k.depth_small.size and len(k.keypoints_xy) for k in (keyframe_u, keyframe_v)):
+        keyframe_u, keyframe_v = self._keyframes(c)
+        if _tells(keyframe_u) and _tells(keyframe_v):
             metric = u.scale_kind == v.scale_kind == "metric"
             check = verify if metric else verify_scaled
             edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification)
             edge = _objected(edge, objection) if self._settings.verified else edge
-        if joint is None or (edge is not None and edge.accepted):
+        if joint is None or (edge is not None and (edge.accepted or not self._settings.second_opinion)):
             edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
         else:
             ends = self._place(u, c.frame_u), self._place(v, c.frame_v)
