@@ -7,8 +7,8 @@ two overlapping chunks err differently on the frames they share. It never admits
 belong together: over a jump cut, and in a joint window of two places, it makes a relation up.
 
 Where the defaults come from: pi^3 in chunks of 100 frames, chained, errs by 0.04 to 0.15 m on the rooms of 7-Scenes
-and by 0.05 to 0.16 m on TUM fr1 (ATE after Sim(3)). The depth of such models is off by about 4 % on average on
-sequences of a moving camera indoors (Bonn, sensor noise included). Measured here on seeds 101 to 103 by
+and by 0.05 to 0.16 m on TUM fr1 (ATE after Sim(3)); its points lie 0.05 m from the truth (Chamfer, NRGBD), 2 % of the
+depth of a room. Measured here on seeds 101 to 103 by
 `benchmarks/feedforward.py`: 0.03 to 0.04 m within a chunk of `calm`, depth off by 3 %, scale drift of 0.5 to 1 % from
 end to end of a chunk, neighbours aligned to 0.03 to 0.05 m and 0.6 %, the chain of a calm walk 0.09 m off, one round
 through several rooms 0.12 to 0.23 m.

@@ -30,8 +30,8 @@ class MoverErrorSettings:
     frozen_window_s: float = 2.0
     """Over how long that average is taken, seconds."""
     depth: float = 0.20
-    """Deviation of the logarithm of the factor on a mover's depth: pi^3-class models err by a fifth of the depth in
-    scenes full of movers (Sintel), by a twentieth where little moves (Bonn)."""
+    """Deviation of the logarithm of the factor on a mover's depth. No published figure was at hand: it is set to
+    several times the error on what stands still, as parallax and motion cannot be told apart there."""
     steady_share: float = 0.7
     """Share of that deviation that a chunk keeps to; the rest comes and goes over `lasting_frames`."""
     lasting_frames: float = 20.0

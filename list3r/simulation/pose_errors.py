@@ -29,7 +29,7 @@ class PoseErrorSettings:
 
     The three of `bend_` were set together so that a chunk of 100 frames and a chain of chunks err as published (see
     `feedforward`); their ratios are those of views of a scene: a turn of 0.18 degrees shifts what is 2.3 m away by
-    7 mm, 0.3 % of the depth, as much as the shift and the scale.
+    7 mm, 0.3 % of the depth, about as much as the shift and the scale.
     """
 
     bend_deg: float = 0.18
