@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from list3r.association.motion import flag_moving, motion_track, seen_through
+from list3r.frames.base import Frame
+from list3r.frames.source import SourceOptions, open_source
+from list3r.instances.library import build_library
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples, LocalLibrary
+from list3r.reconstruction.keyframe_record import frame_samples
+from list3r.reconstruction.rgbd import RgbdReconstructor
 from tests.association_scenes import BOX, BOXES, CAMERA, MOVER, Thing, film, library_of
 
 GAUGE = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.4])
@@ -89,3 +95,20 @@ def test_what_is_flagged_stays_flagged() -> None:
     flagged = flag_moving(samples, known, CAMERA)
     assert [i.local_id for i in flagged.instances if i.dynamic] == [BOX]
     assert next(i for i in flagged.instances if i.dynamic).motion is not None
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["redkitchen", "cabinet"])
+def test_real_rooms_in_which_nothing_moves_have_no_mover(name: str) -> None:
+    place = Path(__file__).parents[2] / "shared" / "data" / name
+    if not place.exists():
+        pytest.skip(f"needs {place}")
+    source = open_source(str(place), SourceOptions())
+    camera = source.info.camera
+    assert camera is not None
+    frames = [f for f in source.read(0, 24) if isinstance(f, Frame)]
+    reconstruction = RgbdReconstructor(poses="estimate")(frames, camera)
+    library = build_library(frames, reconstruction)
+    flagged = flag_moving(frame_samples(reconstruction, library), library, reconstruction.camera)
+    assert len(flagged.instances) >= 3
+    assert not any(i.dynamic for i in flagged.instances)
