@@ -267,6 +267,18 @@ def test_an_edge_without_confidence_holds_nothing_back() -> None:
     assert all(np.isfinite(S.as_matrix()).all() for S in result.S_graph_chunk.values())
 
 
+def test_a_loop_that_says_nothing_is_dropped_unless_it_is_all_there_is() -> None:
+    truth, edges = graph(13, count=12, loops=4)
+    assert edges[-1].covariance is not None
+    vague = replace(edges[-1], covariance=edges[-1].covariance * 1e8)
+    result = solved(truth, [*edges[:-1], vague])
+    assert not result.edges[-1].accepted
+    assert "too uncertain" in result.edges[-1].reason
+    needed = replace(vague, u=0, v=12)
+    alone = optimize(range(13), [*edges[:-1], needed], {0: truth[0]}, metric=False)
+    assert set(alone.components.values()) == {0}
+
+
 def test_an_edge_that_is_not_finite_is_refused_by_name() -> None:
     truth, edges = graph(12, count=5, loops=0)
     for broken in (

@@ -33,7 +33,7 @@ class WeightSettings:
     bend: float = 0.006
     """Deviation of a chunk's shape between the places where two edges hold it, as a share of the support's radius for
     shifts, in radians for turns, and of the logarithm of scale: a prior that loops correct."""
-    own_bend: float = 0.015
+    own_bend: float = 0.013
     """Deviation of a chunk's frame, as its edges see it, from its own cameras, in the same units as `bend`. It does not
     weigh edges: it is part of what a chunk's covariance states, once for the chunk and once for the first chunk, which
     everything is relative to. Chosen on four simulated videos (seed 101)."""

@@ -79,6 +79,13 @@ def optimize(
     for edge in active:
         _check(edge)
     component = _components(ids, active)
+    out = list(edges)
+    for n in sorted(_weak(active, ids, metric, chosen), reverse=True):
+        scores = {**active[n].scores, "trust": 0.0}
+        reason = f"too uncertain beside the other edges (geometry alone: {active[n].reason})"
+        reason = active[n].reason if "trust" in active[n].scores and not active[n].accepted else reason
+        out[used[n]] = replace(active[n], weight=0.0, accepted=False, scores=scores, reason=reason)
+        del used[n], active[n]
     start, tree = _chain(ids, active, component, initial)
     if not active:
         return GraphResult(start, component, tuple(edges), 0.0, dict.fromkeys(ids, np.zeros((7, 7))))
@@ -86,8 +93,7 @@ def optimize(
     problem = _problem(active, row, np.array([component[chunk] == chunk for chunk in ids]), metric, chosen)
     loop = np.array([e.kind != "adjacent" for e in active])
     found = judge(problem, stack([start[k] for k in ids]), tree, loop, chosen.robust, chosen.trust)
-    out = list(edges)
-    strength = _strengths(problem.information, found, loop)
+    strength = _strengths(problem.information / found.factors[loop.astype(np.int64), None, None])
     for n, k in enumerate(used):
         out[k] = _judged(edges[k], float(strength[n]), float(found.squares[n]), found, n)
     count = max(float(found.trust @ found.marginals.redundancy), 1e-9)
@@ -264,11 +270,20 @@ def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array
     return np.asarray(out * widening(float(found.freedom.sum() - found.freedom.min())))
 
 
-def _strengths(information: Array, found: Believed, loop: NDArray[np.bool_]) -> Array:
+def _strengths(information: Array) -> Array:
     """Information of each edge on the turn (which has no unit), by geometric mean, the strongest 1. Shape (E,)."""
-    turn = information[:, 3:6, 3:6] / found.factors[loop.astype(np.int64), None, None]
-    size = np.cbrt(np.maximum(np.linalg.det(turn), 0.0))
+    size = np.cbrt(np.maximum(np.linalg.det(information[:, 3:6, 3:6]), 0.0))
     return np.asarray(size / max(float(size.max()), 1e-300))
+
+
+def _weak(edges: Sequence[Edge], ids: Sequence[int], metric: bool, settings: GraphSettings) -> list[int]:
+    """Numbers of the loops that say next to nothing; none where the graph would fall apart without them."""
+    if not settings.weighted or not any(_kind(e) for e in edges):
+        return []
+    strength = _strengths(information(edges, metric, settings.weights))
+    weak = [k for k, e in enumerate(edges) if _kind(e) and strength[k] < settings.least_weight]
+    rest = [e for k, e in enumerate(edges) if k not in set(weak)]
+    return weak if _components(ids, rest) == _components(ids, edges) else []
 
 
 def _components(ids: Sequence[int], edges: Sequence[Edge]) -> dict[int, int]:
