@@ -27,6 +27,7 @@ from list3r.memory.settling import Settled, SettlingSettings, settle
 from list3r.memory.store import Store
 from list3r.memory.structure import StructureSettings, classify_structure, flagged_only
 from list3r.memory.summaries import ChunkSummary, cameras_of, chunk_summaries, light_of, world_unit
+from list3r.memory.uncertainty import position_sigma
 
 
 @dataclass(frozen=True)
@@ -309,10 +310,13 @@ def _write(
         store.drop_instance(old, dict(ids.aliases).get(old))
     labels = {i.id: i.label for i in store.instances()}
     light = light_of(summaries)
-    store.put_instances(
+    rows = {c.chunk_id: c for c in store.chunks()}
+    seen_in = {n: [rows[k] for k in sorted({k for k, _ in g})] for g, n in zip(groups, ids.of_group, strict=True)}
+    records = [
         _moved(_record(t, labels.get(t.body.id), times, unit, light, metric=metric), settled.S_exact_settled[t.anchor])
         for t in things
-    )
+    ]
+    store.put_instances(replace(r, position_sigma_m=position_sigma(r.center, seen_in[r.id])) for r in records)
     store.clear_observations()
     store.set_observations(
         Observation(n, *key) for group, n in zip(groups, ids.of_group, strict=True) if n is not None for key in group
