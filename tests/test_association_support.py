@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from list3r.association.alignment import align
+from list3r.association.balance import balanced_support
 from list3r.association.support import (
     Mask,
     Pairs,
     SupportSettings,
-    balanced_support,
     confident,
     divide,
     inconsistency,

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.alignment import Alignment, AlignmentSettings, align
+from list3r.association.balance import BalancedSupport, balanced_support
 from list3r.association.support import (
-    BalancedSupport,
     Fit,
     Mask,
     Pairs,
     StaticSupport,
     SupportSettings,
-    balanced_support,
     confident,
     shared_pairs,
     static_support,
