@@ -56,6 +56,8 @@ class Blob:
     """Whether the border of the picture cuts it: left, top, right, bottom. Shape (4,)."""
     rgb: Array
     """Mean colour. Shape (3,)."""
+    thickness: float
+    """How far its surface reaches back along a row of the picture, median over rows: what is seen of its depth."""
 
 
 @dataclass
@@ -99,7 +101,7 @@ def middles(blobs: Sequence[Blob], T_chunk_cam: Array) -> Array:
     """Middle of each blob in the chunk, with what the border of the picture cut off added. Shape (V, 3).
 
     Of a blob that is cut on one side the other side is known, and the full width and height from frames that saw it
-    whole (or most of it).
+    whole (or most of it). The back of a thing is hidden: it is taken to be at least half as deep as it is wide.
     """
     extent = np.array([b.high - b.low for b in blobs])
     cut = np.array([b.cut for b in blobs])
@@ -116,6 +118,7 @@ def middles(blobs: Sequence[Blob], T_chunk_cam: Array) -> Array:
             if first != last and extent[n, axis] < full[axis]:
                 half = full[axis] / 2.0
                 middle[axis] = blob.high[axis] - half if first else blob.low[axis] + half
+        middle[2] += max(0.0, 0.25 * min(full[0], float(extent[n, 0])) - 0.5 * blob.thickness)
         T = T_chunk_cam[blob.position]
         out[n] = T[:3, :3] @ middle + T[:3, 3]
     return out
@@ -130,7 +133,8 @@ def measure_blob(mask: NDArray[np.bool_], color: NDArray[np.uint8], frames: Smal
     height, width = depth.shape
     points = (depth[..., None] * pixel_rays(frames.camera))[inside]
     near, far = np.quantile(points[:, 2], [0.1, 0.9])
-    points = points[(points[:, 2] > near - 0.3) & (points[:, 2] < far + 0.3)].astype(np.float64)
+    close = (points[:, 2] > near - 0.3) & (points[:, 2] < far + 0.3)
+    points, row = points[close].astype(np.float64), np.nonzero(inside)[0][close]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     known_rows, known_columns = np.flatnonzero((depth > 0).any(axis=1)), np.flatnonzero((depth > 0).any(axis=0))
@@ -143,7 +147,14 @@ def measure_blob(mask: NDArray[np.bool_], color: NDArray[np.uint8], frames: Smal
         ]
     )
     small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
-    return Blob(position, mask, low, high, cut, small[mask].mean(axis=0))
+    return Blob(position, mask, low, high, cut, small[mask].mean(axis=0), _thickness(points[:, 2], row))
+
+
+def _thickness(z: Array, row: NDArray[np.int64]) -> float:
+    order = np.argsort(row, kind="stable")
+    start = np.flatnonzero(np.diff(row[order], prepend=-1))
+    deep = np.maximum.reduceat(z[order], start) - np.minimum.reduceat(z[order], start)
+    return float(np.median(deep))
 
 
 def _blobs(
@@ -224,7 +235,15 @@ def _together(tracks: list[Followed], s: FollowSettings) -> list[Followed]:
 def _union(a: Blob, b: Blob) -> Blob:
     share = a.mask.sum() / max(1, a.mask.sum() + b.mask.sum())
     low, high = np.minimum(a.low, b.low), np.maximum(a.high, b.high)
-    return Blob(a.position, a.mask | b.mask, low, high, a.cut | b.cut, share * a.rgb + (1 - share) * b.rgb)
+    return Blob(
+        a.position,
+        a.mask | b.mask,
+        low,
+        high,
+        a.cut | b.cut,
+        share * a.rgb + (1 - share) * b.rgb,
+        max(a.thickness, b.thickness),
+    )
 
 
 def _expected(track: Followed, position: int, times_s: Array) -> Array:

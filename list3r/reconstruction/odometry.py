@@ -24,7 +24,7 @@ changed nothing there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -109,7 +109,14 @@ class Segment:
 class Tracker:
     """Follows one chunk. `segments` holds the outcome, in order of time."""
 
-    def __init__(self, frames: Sequence[Frame], camera: Camera, settings: OdometrySettings) -> None:
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        camera: Camera,
+        settings: OdometrySettings,
+        known: Mapping[int, Mask] | None = None,
+    ) -> None:
+        """`known` are masks of any size, by position, of what is known to move: the camera is followed without it."""
         self.frames, self.camera, self.settings = frames, camera, settings
         self.small = shrink_camera(camera, settings.working_width)
         self.segments: list[Segment] = []
@@ -117,6 +124,11 @@ class Tracker:
         self._views: dict[int, View] = {}
         self._moving: dict[int, Mask] = {}
         self._movers = MoverMemory(settings.movers, settings.noise)
+        size = (self.small.width, self.small.height)
+        self._known = {
+            k: cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            for k, mask in (known or {}).items()
+        }
 
     def run(self) -> list[Segment]:
         """Follow all frames, then join the segments that can be joined; the largest comes first."""
@@ -159,6 +171,8 @@ class Tracker:
         if not self._usable(position):
             return
         moving = self._movers.expect(self._whole_view(position))
+        if position in self._known:
+            moving = self._known[position] if moving is None else moving | self._known[position]
         for segment in self._open_segments():
             self._set_moving(position, moving)
             found = self._follow(segment, position)
@@ -197,6 +211,8 @@ class Tracker:
         samples = segment.model.samples(T_segment_cam, self.small, self.settings.sweep_samples)
         usual = fit(samples, view, mask, T_segment_cam, self.settings.movers, self.settings.noise).outside
         mask = self._movers.keep(view, mask, T_segment_cam, usual, self.segments.index(segment))
+        if position in self._known:
+            mask = mask | self._known[position]
         self._moving[position] = mask
         segment.model.forget(view, mask, T_segment_cam)
 

@@ -56,14 +56,20 @@ class RgbdReconstructor:
         """
         if not any(frame.depth is not None for frame in frames):
             raise TrackingError("the frames have no depth; the rgbd reconstruction needs it")
-        hints: Mapping[int, NDArray[np.bool_]] = {}
-        if self.poses == "given":
-            T, posed, keyframes = self._given(frames, camera)
-        else:
-            T, posed, keyframes, hints = self._estimate(frames, camera)
         shape = (camera.height, camera.width)
         depth = np.stack([np.zeros(shape, np.float32) if f.depth is None else f.depth for f in frames])
-        moving = self._moving(frames, depth, T, posed, camera, hints)
+        if self.poses == "given":
+            T, posed, keyframes = self._given(frames, camera)
+            moving = self._moving(frames, T, posed, camera, {})
+        else:
+            T, posed, keyframes, left_out = self._estimate(frames, camera)
+            moving = self._moving(frames, T, posed, camera, left_out)
+            if moving is not None:
+                known = {k: _rim(m > 0) for k, m in enumerate(moving) if m.any()}
+                T, posed, keyframes, left_out = self._estimate(frames, camera, known)
+                moving = self._moving(frames, T, posed, camera, left_out)
+        if moving is not None:
+            _take_out(depth, moving)
         return Reconstruction(
             frame_indices=np.array([frame.index for frame in frames], np.int64),
             posed=posed,
@@ -79,31 +85,24 @@ class RgbdReconstructor:
     def _moving(
         self,
         frames: Sequence[Frame],
-        depth: NDArray[np.float32],
         T_chunk_cam: NDArray[np.float64],
         posed: NDArray[np.bool_],
         camera: Camera,
         hints: Mapping[int, NDArray[np.bool_]],
     ) -> NDArray[np.uint8] | None:
-        """Number what moves, and take it out of `depth`, in place: what is left is the scene that stays."""
+        """Number what moves, see `Reconstruction.moving`."""
         small = SmallFrames.of([f.depth for f in frames], T_chunk_cam, posed, camera, self.settings.moving.width)
         masks = find_moving(small, hints, self.settings.moving)
         if masks is None:
             return None
         times_s = np.array([f.time_s for f in frames])
-        moving = follow_movers(masks, [f.color for f in frames], times_s, small, self.settings.follow)
-        if moving is None:
-            return None
-        for position in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
-            rim = cv2.dilate((moving[position] > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-            full = cv2.resize(rim, None, fx=small.stride, fy=small.stride, interpolation=cv2.INTER_NEAREST)
-            depth[position][full[: camera.height, : camera.width] > 0] = 0.0
-        return moving
+        return follow_movers(masks, [f.color for f in frames], times_s, small, self.settings.follow)
 
     def _estimate(
-        self, frames: Sequence[Frame], camera: Camera
+        self, frames: Sequence[Frame], camera: Camera, known: Mapping[int, NDArray[np.bool_]] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], Mapping[int, NDArray[np.bool_]]]:
-        tracker = Tracker(frames, camera, self.settings.odometry)
+        """Poses, which frames have one, keyframes, and what was left out of each frame; without what `known` holds."""
+        tracker = Tracker(frames, camera, self.settings.odometry, known)
         segments = tracker.run()
         if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
             raise TrackingError(
@@ -128,6 +127,19 @@ class RgbdReconstructor:
                 f"none of the frames {frames[0].index} to {frames[-1].index} has a valid pose; use --poses estimate"
             )
         return T, posed, select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry)
+
+
+def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
+def _take_out(depth: NDArray[np.float32], moving: NDArray[np.uint8]) -> None:
+    """Make depth (F, H, W) unknown, in place, where something moves: what is left is the scene that stays."""
+    height, width = depth.shape[1:]
+    stride = -(-width // moving.shape[2])
+    for position in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
+        full = np.kron(_rim(moving[position] > 0), np.ones((stride, stride), bool))
+        depth[position][full[:height, :width]] = 0.0
 
 
 def is_rigid(T: NDArray[np.float64]) -> bool:
