@@ -5,6 +5,13 @@ Frame descriptors propose with a relaxed threshold (`frame_search`); the two chu
 features and depth where they have them (`verification`), else by a joint window (`joint_window`); and nothing is
 believed that the way the camera went contradicts (`chain`). Every candidate becomes an edge, accepted or not, with its
 scores and the reason.
+
+Chosen on 13 simulated videos (seeds 101 to 106; twins, kidnap, loop, corridor, sparse, calm), pairs of chunks against
+true covisibility: ranked by s_loop alone with lambda 0, 0.3, 0.5, 0.7, 1 the average precision is 0.915, 0.924, 0.935,
+0.947, 0.922 without twins and 0.617, 0.580, 0.554, 0.510, 0.446 with twin rooms, so 0.5. A least s_loop of 0.7, 0.8, 0.9
+keeps 98, 90, 82 % of the true pairs and 37, 29, 11 % of the false ones (without twins). No score tells twin rooms
+apart: at precision 0.99 frame similarity finds 2 % of all true pairs and s_loop 3 %. After verification 82 % are found
+at precision 0.996 and no twin is taken for the other (without twins: frame similarity 44 %, verified 79 %).
 """
 
 from __future__ import annotations
@@ -49,7 +56,7 @@ class RevisitSettings:
     """False: every relation that can be measured is accepted, as in VGGT-Long."""
     lambda_: float = 0.5
     """Weight of frame similarity in s_loop (the paper gives none)."""
-    least_score: float = 0.8
+    least_score: float = 0.7
     """Least s_loop of a candidate that is worth a joint window, unless its frames alone are alike enough."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
