@@ -76,8 +76,9 @@ class GraphProblem:
         damping = 0.0
         e = self.residuals(poses)
         cost = self._cost(e, trust)
-        system = self._normal_equations(e, trust)
+        system = None
         for _ in range(iterations):
+            system = system or self._normal_equations(e, trust)
             tried = self._step(poses, system, damping)
             new = None if tried is None else self.residuals(tried)
             new_cost = np.inf if new is None else self._cost(new, trust)
@@ -86,11 +87,10 @@ class GraphProblem:
                 if damping > 1e6:
                     break
                 continue
-            gain, poses, cost = cost - new_cost, tried, new_cost
+            gain, poses, cost, e, system = cost - new_cost, tried, new_cost, new, None
             damping = 0.0 if damping <= 1e-6 else damping / 10.0
             if gain <= _CONVERGED * cost + 1e-18:
                 break
-            system = self._normal_equations(new, trust)
         return poses
 
     def factor(self, poses: Sim3, trust: Array) -> BlockFactor:
