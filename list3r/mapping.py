@@ -7,6 +7,7 @@ as one that was never interrupted.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from list3r.association.joint_window import JointReconstructor
 from list3r.association.pose_graph import GraphSettings, optimize
 from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.frames.base import Camera
+from list3r.instances.overlays import write_support
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
@@ -40,11 +42,12 @@ def add_chunk(
     settings: AssociationSettings | None = None,
     *,
     library: bool = True,
+    debug_dir: Path | None = None,
 ) -> int:
     """Add one chunk to the memory, all of it or nothing; its id.
 
     `joint` makes joint windows of frames of two places, for revisits of chunks without metric scale. Without `library`
-    the chunks are only placed.
+    the chunks are only placed. What the edge to the chunk before stands on is drawn into `debug_dir`/edges.
     """
     chosen = settings or AssociationSettings()
     with store.transaction():
@@ -52,7 +55,7 @@ def add_chunk(
         if store.get_value("poses") == "given":
             store.add_edges(_edge_of_given_poses(store, session_id))
         else:
-            store.add_edges(_adjacent_edge(store, session_id, chosen.edges))
+            store.add_edges(_adjacent_edge(store, session_id, chosen.edges, debug_dir))
             store.add_edges(find_loops(store, chunk_id, joint, chosen.revisits))
         place_chunks(store, chosen.graph)
         if library:
@@ -60,7 +63,7 @@ def add_chunk(
     return chunk_id
 
 
-def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings) -> list[Edge]:
+def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_dir: Path | None) -> list[Edge]:
     """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it.
 
     What moved between the two is flagged on the way.
@@ -86,6 +89,9 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings) -> lis
         return []
     for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):
         store.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
+    if debug_dir is not None:
+        pictures = [k for c in (u, v) for k in store.keyframes(c.chunk_id)]
+        write_support(found, pictures, _camera(v), debug_dir)
     return [found.edge]
 
 

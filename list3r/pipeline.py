@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -17,11 +18,13 @@ from typing import Self
 from threadpoolctl import threadpool_limits
 
 from list3r import __version__
+from list3r.association.joint_rgbd import RgbdJointReconstructor
 from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
+from list3r.frames.cuts import find_cuts
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
-from list3r.mapping import add_chunk
+from list3r.mapping import add_chunk, finish_session
 from list3r.memory.codec import to_json
 from list3r.memory.connection import remove_memory
 from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
@@ -87,25 +90,37 @@ def build(
     check_buildable(info, settings)
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: at least 1 process is needed")
-    spans = plan_chunks(info.frame_count, settings.chunks)
     if debug_dir is not None:
         _make_folder(Path(debug_dir))
-    count = min(workers or default_workers(), len(spans))
-    pool = OrderedPool(process_chunk, count)
-    try:
-        with _open_target(Path(memory), info, settings, resume=resume, force=force) as target:
-            session = _session(target.store, info, settings)
-            done = {c.index for c in target.store.chunks(session)}
-            tasks = [
-                ChunkTask(str(source), options, span, settings, None if debug_dir is None else str(debug_dir))
-                for span in spans
-                if span.index not in done
-            ]
-            with threadpool_limits(1):
-                _add_all(target, session, tasks, pool, info, progress)
-            return _finish(target.store, session, info, spans, done, started)
-    finally:
-        pool.stop()
+    with _open_target(Path(memory), info, settings, resume=resume, force=force) as target:
+        session = _session(target.store, info, settings)
+        spans = plan_chunks(info.frame_count, settings.chunks, _cuts(target.store, source, options, settings))
+        done = {c.index for c in target.store.chunks(session)}
+        tasks = [
+            ChunkTask(str(source), options, span, settings, None if debug_dir is None else str(debug_dir))
+            for span in spans
+            if span.index not in done
+        ]
+        if tasks:
+            pool = OrderedPool(process_chunk, min(workers or default_workers(), len(tasks)))
+            try:
+                with threadpool_limits(1):
+                    _add_all(target, session, tasks, pool, info, progress)
+            finally:
+                pool.stop()
+        return _finish(target.store, session, info, spans, done, started)
+
+
+def _cuts(store: Store, source: str | Path, options: SourceOptions, settings: BuildSettings) -> tuple[int, ...]:
+    """Where the video jumps, found once; given poses know where the camera is on either side."""
+    if settings.poses == "given":
+        return ()
+    known = store.get_value("cuts")
+    if known is None:
+        known = [] if store.chunks() else list(find_cuts(open_source(source, options)))
+        with store.transaction():
+            store.set_value("cuts", known)
+    return tuple(known)
 
 
 def _add_all(
@@ -117,13 +132,15 @@ def _add_all(
     progress: Progress | None,
 ) -> None:
     """Add the chunks in order, with one thread, so that sums do not depend on the machine."""
+    joint = RgbdJointReconstructor(target.store, {session: tasks[0].options})
+    debug_dir = None if tasks[0].debug_dir is None else Path(tasks[0].debug_dir)
     bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
     if progress is not None:
         progress(len(target.store.frames(session)), info.frame_count)
     for span, result in zip((t.span for t in tasks), pool.map(tasks), strict=True):
         bad.update(index for index, _ in result.bad_frames)
         check_bad_share(len(bad), info.frame_count)
-        add_chunk(target.store, session, result)
+        add_chunk(target.store, session, result, joint, debug_dir=debug_dir)
         target.keep()
         if progress is not None:
             progress(span.stop, info.frame_count)
@@ -273,11 +290,11 @@ def _finish(
             f"the camera could not be followed in any of the {len(frames)} frames of {info.path}; "
             "check the depth scale and intrinsics with `list3r inspect`"
         )
-    with store.transaction():
-        store.complete_session(session)
+    with threadpool_limits(1):
+        finish_session(store, session)
     seconds = time.monotonic() - started
     fresh = sum(s.stop - s.start for s in spans if s.index not in done)
-    overlap = sum(1 for s in spans if s.index not in done and s.index > 0) * _overlap(spans)
+    overlap = sum(max(0, a.stop - b.start) for a, b in pairwise(spans) if b.index not in done)
     components = len({c.component for c in store.chunks()})
     lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
     return BuildReport(
@@ -299,12 +316,11 @@ def _finish(
     )
 
 
-def _overlap(spans: list[ChunkSpan]) -> int:
-    return spans[0].stop - spans[1].start if len(spans) > 1 else 0
-
-
 def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...]:
     notes = []
+    cuts = store.get_value("cuts", [])
+    if cuts:
+        notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
     if bad:
         notes.append(f"{_count(bad, 'frame')} could not be decoded, skipped: {_listed(store)}")
     if lost and store.get_value("poses") == "given":

@@ -38,7 +38,7 @@ def ask(*arguments: str | Path) -> Any:
 
 COMMANDS = (
     "inspect build demo info list show export verify doctor query.nearest query.within query.relations query.similar"
-    " eval.trajectory eval.instances"
+    " eval.trajectory eval.cloud eval.instances eval.revisits"
 ).split()
 
 

@@ -178,7 +178,9 @@ def choose(
 def _is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bool:
     if there.chunk_id >= here.chunk_id:
         return False
-    return there.session_id != here.session_id or here.index - there.index > settings.exclude_chunks
+    return there.session_id != here.session_id or (
+        here.index - there.index > settings.exclude_chunks or there.last_frame < here.first_frame
+    )
 
 
 def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> _Known:

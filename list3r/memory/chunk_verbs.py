@@ -232,6 +232,11 @@ class ChunkVerbs(Connection):
             [(None if m is None else pack(asdict(m)), chunk_id, n) for n, m in motions.items()],
         )
 
+    def dynamic_locals(self, chunk_id: int) -> list[int]:
+        """Local ids of a chunk's instances that move."""
+        query = "SELECT local_id FROM local_instances WHERE chunk_id = ? AND dynamic ORDER BY local_id"
+        return [int(n) for (n,) in self._rows(query, (chunk_id,))]
+
     def motion_track(self, chunk_id: int, local_id: int) -> MotionTrack | None:
         """Where a moving local instance was, chunk coordinates; None for one that does not move."""
         query = "SELECT motion FROM local_instances WHERE chunk_id = ? AND local_id = ?"
