@@ -8,7 +8,7 @@ scores and the reason.
 
 Chosen on 13 simulated videos (seeds 101 to 106; twins, kidnap, loop, corridor, sparse, calm), pairs of chunks against
 true covisibility: ranked by s_loop alone with lambda 0, 0.3, 0.5, 0.7, 1 the average precision is 0.915, 0.924, 0.935,
-0.947, 0.922 without twins and 0.617, 0.580, 0.554, 0.510, 0.446 with twin rooms, so 0.5. A least s_loop of 0.7, 0.8, 0.9
+0.947, 0.922 without twins and 0.617, 0.580, 0.554, 0.510, 0.446 in twins, so 0.5. A least s_loop of 0.7, 0.8, 0.9
 keeps 98, 90, 82 % of the true pairs and 37, 29, 11 % of the false ones (without twins). No score tells twin rooms
 apart: at precision 0.99 frame similarity finds 2 % of all true pairs and s_loop 3 %. After verification 82 % are found
 at precision 0.996 and no twin is taken for the other (without twins: frame similarity 44 %, verified 79 %).
