@@ -123,7 +123,13 @@ def _measure(
         support = balanced_support(pairs, static, camera, settings.support)
     else:
         static, support = _confident_support(pairs, settings.support)
-    found = align(support.p_u, support.p_v, support.weight, support.frame, metric, settings.alignment)
+    try:
+        found = align(support.p_u, support.p_v, support.weight, support.frame, metric, settings.alignment)
+    except DegenerateError:
+        if not settings.instance_aware or not static.removed.any():
+            raise
+        static, support = _confident_support(pairs, settings.support)
+        found = align(support.p_u, support.p_v, support.weight, support.frame, metric, settings.alignment)
     return MeasuredEdge(
         edge=_edge(static, support, found, u_id, v_id, settings, kind, frames),
         moving_u=static.moving_u,

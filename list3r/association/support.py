@@ -245,8 +245,11 @@ def static_support(
         removed_now = known | of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair]
         if np.array_equal(removed_now, removed):
             break
+        try:
+            S_v_u = fit(pairs, sure & ~removed_now)
+        except DegenerateError:
+            break
         removed = removed_now
-        S_v_u = fit(pairs, sure & ~removed)
     assert of_u is not None and of_v is not None
     staying = np.concatenate([of_u.delta_px[~of_u.moving], of_v.delta_px[~of_v.moving]])
     return StaticSupport(
