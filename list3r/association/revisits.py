@@ -121,7 +121,8 @@ def find_loops(
         accepted = [e for e in edges if e.accepted]
         c = scored.candidate
         if c.s_det < STRICT and look.unlikely(scored):
-            edge = look.refused(scored, f"frames and instances are not alike enough (s_loop {scored.score:.2f})")
+            who, name = ("frames and instances", "s_loop") if chosen.instance_cues else ("the frames", "s_det")
+            edge = look.refused(scored, f"{who} are not alike enough ({name} {scored.score:.2f})")
         elif chosen.verified and any(e.u == c.u for e in accepted):
             edge = look.refused(scored, "not tried: a better candidate joins the two chunks")
         elif tried >= chosen.verify or len(accepted) >= chosen.enough:
