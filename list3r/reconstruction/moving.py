@@ -110,8 +110,8 @@ def find_moving(
     posed = np.flatnonzero(frames.posed).tolist()
     if not hints:
         searched = posed[:: s.search_step]
-        hits = sum(ask.anything(position) for position in searched)
-        if hits < min(s.search_frames, len(searched)):
+        hits = [p for p in searched if ask.anything(p)]
+        if sum(bool(ask.moving(p, None).any()) for p in hits) < min(s.search_frames, len(searched)):
             return None
     out = np.zeros(frames.depth.shape, bool)
     for position in posed:
