@@ -103,13 +103,16 @@ def variant_settings(variant: str) -> Any:
     from list3r.mapping import AssociationSettings
 
     full = AssociationSettings()
-    plain_loops = replace(full.revisits, instance_cues=False, verified=False)
     plain_edges = replace(full.edges, instance_aware=False)
+    plain_windows = replace(full.revisits.window, edges=plain_edges)
+    plain_loops = replace(full.revisits, instance_cues=False, verified=False)
     plain_graph = replace(full.graph, weighted=False, robust=False)
     step = {"baseline": 0, "iasm-only": 0, "ilrd": 1, "iasm": 2, "cwgo": 3}[variant]
+    aware = step >= 2 or variant == "iasm-only"
+    loops = full.revisits if step >= 1 else plain_loops
     return AssociationSettings(
-        revisits=full.revisits if step >= 1 else plain_loops,
-        edges=full.edges if step >= 2 or variant == "iasm-only" else plain_edges,
+        revisits=loops if aware else replace(loops, window=plain_windows),
+        edges=full.edges if aware else plain_edges,
         graph=full.graph if step >= 3 else plain_graph,
     )
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from list3r.association.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
@@ -81,6 +82,7 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     clock.mark("instances")
     keyframes = make_keyframes(frames, reconstruction, keep_jpeg=task.settings.keep_pictures)
     samples = frame_samples(reconstruction, library)
+    library = flag_moving(samples, library, camera)
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")

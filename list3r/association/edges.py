@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from list3r.association.alignment import Alignment, AlignmentSettings, align
 from list3r.association.balance import BalancedSupport, balanced_support
+from list3r.association.plain_alignment import plain_align
 from list3r.association.support import (
     Fit,
     Mask,
@@ -35,7 +36,7 @@ class EdgeSettings:
     """How an edge is measured."""
 
     instance_aware: bool = True
-    """False for the paper's baseline: all pairs that are confident enough, whatever they belong to (VGGT-Long)."""
+    """False for the paper's baseline: all pairs that are confident enough, aligned as VGGT-Long does."""
     least_pairs: int = 60
     """Fewest pairs that an edge stands on."""
     least_inliers: float = 0.3
@@ -124,18 +125,25 @@ def _measure(
     else:
         static, support = _confident_support(pairs, settings.support)
     try:
-        found = align(support.p_u, support.p_v, support.weight, support.frame, metric, settings.alignment)
+        found = _align(support, metric, settings)
     except DegenerateError:
         if not settings.instance_aware or not static.removed.any():
             raise
         static, support = _confident_support(pairs, settings.support)
-        found = align(support.p_u, support.p_v, support.weight, support.frame, metric, settings.alignment)
+        found = _align(support, metric, settings)
     return MeasuredEdge(
         edge=_edge(static, support, found, u_id, v_id, settings, kind, frames),
         moving_u=static.moving_u,
         moving_v=static.moving_v,
         support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, support.used),
     )
+
+
+def _align(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
+    s = support
+    if settings.instance_aware:
+        return align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment)
+    return plain_align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment.residual_scale)
 
 
 def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
