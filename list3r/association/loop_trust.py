@@ -51,7 +51,7 @@ class TrustSettings:
     rounds: int = 8
     """Most times that errors are scaled and edges judged anew."""
     iterations: int = 20
-    """Most steps of a solution; each stage of the annealing takes a tenth."""
+    """Most steps of a solution; each stage of the annealing takes a quarter."""
 
 
 @dataclass(frozen=True)
@@ -135,18 +135,20 @@ def _first(
     limit: Array,
     settings: TrustSettings,
 ) -> tuple[Sim3, Array]:
-    """Anneal from all edges, and from the loops within what the chain can have drifted; the better of the two."""
+    """Anneal from all edges, from all with adjacent ones held, and from the loops within what the chain can have
+    drifted; the explanation of least cost."""
     ones = np.ones(len(loop))
     within = ~loop
     within[loop] = chain_squares(problem, start, tree, loop) <= limit[loop]
     found = []
-    for first in (ones, within.astype(np.float64)):
+    held = np.where(loop, limit, np.inf)
+    for first, kernel in ((ones, limit), (ones, held), (within.astype(np.float64), limit)):
         poses = start if first.all() else problem.solve(start, np.maximum(first, _NONE), settings.iterations)
-        poses, _ = _anneal(problem, poses, limit, settings, gated=not first.all())
+        poses, _ = _anneal(problem, poses, kernel, settings, gated=not first.all())
         poses, trust = _harden(problem, poses, limit, True, settings)
         cost = float(np.minimum(problem.squares(poses), limit).sum())
         found.append((cost, poses, trust))
-        if within.all():
+        if trust.all():
             break
     return min(found, key=lambda f: f[0])[1:]
 
@@ -157,7 +159,7 @@ def _anneal(
     """Tighten the kernel step by step; from a gated start only the last stages."""
     worst = float((problem.squares(poses) / limit).max())
     mu = 2.0 if gated else max(2.0 * worst, 1.0)
-    steps = settings.iterations // 10
+    steps = settings.iterations // 4
     trust = (mu / (problem.squares(poses) / limit + mu)) ** 2 if gated else np.ones(len(limit))
     while True:
         poses = problem.solve(poses, np.maximum(trust, _NONE), steps)
