@@ -35,7 +35,7 @@ TITLES = {
     "cwgo": "+ CWGO (full)",
     "iasm-only": "baseline + IASM alone",
 }
-SHOWN = ("ate_sim3_m", "rte_m", "rre_deg", "completeness_cm", "chamfer_cm", "f_at_5cm", "false_loops", "true_loops")
+SHOWN = ("ate_sim3_m", "rte_m", "rre_deg", "completeness_cm", "chamfer_cm", "f_at_5cm", "false_loops", "worst_loop_m")
 
 
 def main() -> None:
@@ -58,10 +58,12 @@ def main() -> None:
             rows += done
             ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
             print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
+    judgements = [(r["preset"], r["variant"], r.pop("judgement")) for r in rows]
     summary = summarise(rows, presets, variants)
     print_tables(summary, presets, variants)
+    revisits = revisit_table(judgements, presets, variants[-1])
     print(machine())
-    write_json(words.json, {"summary": summary, "runs": rows})
+    write_json(words.json, {"summary": summary, "revisits": revisits, "runs": rows})
     if words.plot is not None:
         plot(words.plot, rows, presets, variants)
 
@@ -146,13 +148,19 @@ class _Truth:
     """Measures of a memory against a simulated video."""
 
     def __init__(self, video: Any) -> None:
+        from list3r.evaluation.covisibility import Covisibility
+        from list3r.simulation.covisibility import seen_share
+
         self.frames = len(video.time_s)
         self._video = video
         self._cloud = _true_cloud(video)
+        rows = np.arange(0, self.frames, 10)
+        self._covisibility = Covisibility(rows, video.time_s[rows], seen_share(video, rows, rows))
 
     def measure(self, store: Any) -> dict[str, Any]:
         """Errors of all frames in the one frame of the memory: parts that were not joined count as they lie."""
         from list3r.evaluation.cloud import evaluate_cloud
+        from list3r.evaluation.revisits import Candidates, judge, score
         from list3r.evaluation.trajectory import Trajectory, align, evaluate_trajectory
 
         placed = store.camera_poses()
@@ -164,8 +172,11 @@ class _Truth:
         scaled = Trajectory(estimate.time_s, _moved(S_truth_world, poses))
         errors = evaluate_trajectory(truth, scaled, delta_frames=30)
         cloud = evaluate_cloud(self._cloud, S_truth_world.apply(_points(store)))
-        loops = [e for e in store.edges() if e.kind == "loop"]
-        good = [self._true_loop(store, e) for e in loops if e.accepted]
+        edges = store.edges()
+        loops = [e for e in edges if e.kind == "loop"]
+        spans = {c.chunk_id: (c.first_frame, c.last_frame) for c in store.chunks()}
+        judged = judge(Candidates.of_edges(edges), self._covisibility, spans)
+        revisits = score([judged])
         return {
             "posed": len(rows) / self.frames,
             "components": len({c.component for c in store.chunks()}),
@@ -176,17 +187,44 @@ class _Truth:
             "chamfer_cm": round(cloud.chamfer_cm, 3),
             "f_at_5cm": round(100 * cloud.f_score, 2),
             "candidates": len(loops),
-            "true_loops": sum(good),
-            "false_loops": len(good) - sum(good),
+            "true_loops": revisits.chunks.correct,
+            "false_loops": len(revisits.wrong),
+            "worst_loop_m": round(max((self._loop_error(store, e) for e in loops if e.accepted), default=0.0), 3),
+            "revisits": revisits.chunks.true,
+            "judgement": judged,
         }
 
-    def _true_loop(self, store: Any, edge: Any) -> bool:
-        """Whether the two frames see the same place: any share of one's surface is seen by the other."""
-        from list3r.simulation.covisibility import covisibility
+    def _loop_error(self, store: Any, edge: Any) -> float:
+        """How far a loop edge puts the camera of its frame in v from the truth, as seen from u; metres."""
+        ends = [store.frame_samples(k) for k in (edge.u, edge.v)]
+        to_truth = [self._placed(samples, frame) for samples, frame in zip(ends, edge.frames, strict=True)]
+        if None in to_truth:
+            return 0.0
+        k = int(np.searchsorted(ends[1].camera_frames, edge.frames[1]))
+        center = ends[1].T_chunk_cam[k, :3, 3]
+        error = (to_truth[0] @ edge.S_v_u.inverse()).apply(center) - to_truth[1].apply(center)
+        return float(np.linalg.norm(error))
 
-        u, v = edge.frames
-        window = [np.clip(np.arange(f - 10, f + 11, 5), 0, self.frames - 1) for f in (u, v)]
-        return bool(covisibility(self._video, *window).max() >= 0.05)
+    def _placed(self, samples: Any, frame: int) -> Any:
+        """The similarity from a chunk to the truth by what it saw within ten frames of one; None with too little."""
+        from list3r.memory.errors import DegenerateError
+        from list3r.memory.geometry import umeyama
+
+        video, near = self._video, np.abs(samples.frame - frame) <= 10
+        index, pixel, camera = samples.frame[near], samples.pixel[near], video.camera
+        row, column = pixel // camera.width, pixel % camera.width
+        z = video.depth[index, row, column].astype(np.float64)
+        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
+        T = video.T_world_cam[index]
+        points = np.einsum("nij,nj->ni", T[:, :3, :3], z[:, None] * rays) + T[:, :3, 3]
+        known = (z > 0) & ~np.isin(video.ids[index, row, column], [m.id for m in video.movers])
+        try:
+            found = umeyama(samples.points[near][known], points[known], with_scale=True)
+            off = np.linalg.norm(found.apply(samples.points[near][known]) - points[known], axis=1)
+            good = off <= 2 * np.median(off)
+            return umeyama(samples.points[near][known][good], points[known][good], with_scale=True)
+        except DegenerateError:
+            return None
 
 
 def _rigid(S: Any) -> Array:
@@ -251,6 +289,33 @@ def print_tables(summary: dict[str, Any], presets: Sequence[str], variants: Sequ
             entry = summary[preset][variant]
             cells = "".join(f"{entry[k]['mean']:12.3f} ({entry[k]['std']:.3f})" for k in SHOWN)
             print(f"{TITLES[variant]:24}{cells}{entry['ate_ratio']:12.3f}")
+
+
+def revisit_table(
+    judgements: Sequence[tuple[str, str, Any]], presets: Sequence[str], variant: str
+) -> dict[str, dict[str, Any]]:
+    """Pairs of chunks found again: what one variant accepts, and frame similarity alone at its best threshold of
+    precision 0.99, with the same descriptors; pooled over the seeds and over all presets."""
+    from list3r.evaluation.revisits import score
+
+    print(f"\nrevisits (pairs of chunks) of {TITLES[variant]}, and of frame similarity alone at precision 0.99")
+    table = {}
+    for name in [*presets, "all"]:
+        chosen = [j for preset, v, j in judgements if v == variant and name in (preset, "all")]
+        found = score(chosen)
+        alone = found.rankings["s_det"].chunk_recall if "s_det" in found.rankings else None
+        table[name] = {
+            "revisits": found.chunks.true,
+            "precision": found.chunks.precision,
+            "recall": found.chunks.recall,
+            "false": len(found.wrong),
+            "frame_similarity_recall": alone,
+        }
+        print(
+            f"{name:10}"
+            + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in table[name].items())
+        )
+    return table
 
 
 def plot(path: Path, rows: Sequence[dict[str, Any]], presets: Sequence[str], variants: Sequence[str]) -> None:

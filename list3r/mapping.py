@@ -117,13 +117,14 @@ def place_chunks(store: Store, settings: GraphSettings | None = None) -> None:
     initial = _graph_poses(store)
     graph = optimize([c.chunk_id for c in chunks], edges, initial, metric=metric, settings=settings)
     store.add_edges(graph.edges)
-    store.place_chunks(graph.S_graph_chunk, graph.components)
+    known = {} if store.get_value("poses") == "given" else graph.covariances
+    store.place_chunks(graph.S_graph_chunk, graph.components, known)
     store.set_value("T_world_graph", np.eye(4).tolist())
     gravity = estimate_gravity(store)
     T_world_graph = world_from_graph(gravity)
     store.set_value("T_world_graph", T_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
-    store.place_chunks({k: T_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components)
+    store.place_chunks({k: T_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
 
 
 def finish_session(

@@ -95,7 +95,8 @@ def _steady(frames: NDArray[np.int64], settings: MoverErrorSettings, rng: np.ran
     for run in runs_of(frames):
         own[run] = gaussian_filter1d(own[run], settings.lasting_frames / 2, mode="wrap")
     own /= max(float(np.sqrt(np.mean(own**2))), 1e-9)
-    return settings.steady_share * rng.standard_normal() + np.sqrt(1 - settings.steady_share**2) * own
+    lasting = settings.steady_share * rng.standard_normal()
+    return np.asarray(lasting + np.sqrt(1 - settings.steady_share**2) * own)
 
 
 def _late(video: SimulatedVideo, mover: MoverTruth, frames: NDArray[np.int64], lag_s: float) -> NDArray[np.float64]:
