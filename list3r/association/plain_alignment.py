@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.alignment import Alignment
+from list3r.association.alignment_covariance import measure_uncertainty
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 
@@ -25,7 +26,7 @@ def plain_align(
 ) -> Alignment:
     """The alignment of pairs (N, 3) with weights (N,) of frames (N,).
 
-    Its covariance says nothing: the identity. `residual_scale` is sigma_r as a share of the spread of v. Raises
+    Its covariance is that of a robust fit to the pairs within three robust deviations. `residual_scale` is sigma_r as a share of the spread of v. Raises
     `DegenerateError` when the pairs have no weight or no extent.
     """
     S_v_u = _ratio_of_radii(p_u, p_v, weight, metric)
@@ -39,7 +40,7 @@ def plain_align(
     inside = residual < 3 * sigma
     return Alignment(
         S_v_u=S_v_u,
-        covariance=np.eye(7),
+        covariance=_covariance(p_u, S_v_u.inverse().apply(p_v), weight, residual / float(S_v_u.scale), group, metric),
         confidence=float(share @ np.exp(-residual / sigma)),
         residual=residual,
         inside=inside,
@@ -49,6 +50,14 @@ def plain_align(
         groups=len(np.unique(group)),
         bending=1.0,
     )
+
+
+def _covariance(
+    p_u: Array, q_u: Array, weight: Array, residual: Array, group: NDArray[np.int64], metric: bool
+) -> Array:
+    limit = max(3 * 1.4826 * float(np.median(residual)), 1e-9)
+    trust = np.maximum(0.0, 1.0 - (residual / limit) ** 2) ** 2
+    return measure_uncertainty(p_u, q_u, weight, trust, limit, group, metric).covariance
 
 
 def _ratio_of_radii(p_u: Array, p_v: Array, weight: Array, metric: bool) -> Sim3:
