@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.chunk_verbs import ChunkVerbs
-from list3r.memory.codec import dequantise, raw_array, to_json
+from list3r.memory.codec import dequantise, raw_array, to_json, unpack_sim3
+from list3r.memory.embedding_verbs import EmbeddingVerbs
 from list3r.memory.errors import UnknownIdError
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import BestView, Instance, MergeDecision, Observation, Relation, Support
@@ -22,7 +22,11 @@ _COLUMNS = (
 )
 
 
-class InstanceVerbs(ChunkVerbs):
+_BATCH = 500
+"""Rows asked for by id in one statement."""
+
+
+class InstanceVerbs(EmbeddingVerbs):
     """Reading and writing the library. Writing verbs are called inside `transaction()`."""
 
     # ------------------------------------------------------------------ instances
@@ -36,6 +40,16 @@ class InstanceVerbs(ChunkVerbs):
         """One instance; an alias gives the instance it was merged into. Raises `UnknownIdError`."""
         resolved = self.resolve(instance_id)
         return _instance(self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id = ?", (resolved,))[0])
+
+    def instances_of(self, ids: Sequence[int]) -> list[Instance]:
+        """The instances of these ids that are there, in the order of `ids`; aliases are not resolved."""
+        found: dict[int, Instance] = {}
+        for start in range(0, len(ids), _BATCH):
+            part = [int(i) for i in ids[start : start + _BATCH]]
+            marks = ",".join("?" * len(part))
+            for row in self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id IN ({marks})", tuple(part)):
+                found[row[0]] = _instance(row)
+        return [found[i] for i in map(int, ids) if i in found]
 
     def resolve(self, instance_id: int) -> int:
         """The id that stands for an id today. Raises `UnknownIdError` for an id the memory has never held."""
@@ -65,6 +79,7 @@ class InstanceVerbs(ChunkVerbs):
 
     def drop_instance(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
+        self.vectors_touched.append(int(instance_id))
         for table, column in (("instances", "id"), ("instance_boxes", "id"), ("embeddings", "instance")):
             self._database.execute(f"DELETE FROM {table} WHERE {column} = ?", (instance_id,))
         self._database.execute("DELETE FROM relations WHERE subject = ? OR object = ?", (instance_id, instance_id))
@@ -90,6 +105,54 @@ class InstanceVerbs(ChunkVerbs):
         arguments = tuple(float(x) for pair in zip(low, high, strict=True) for x in pair)
         return [r[0] for r in self._rows(query, arguments)]
 
+    def boxes_in_box(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        structure: bool = True,
+        min_confidence: float = 0.0,
+        state: str | None = None,
+        component: int | None = None,
+        limit: int = -1,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Ids (N,) and boxes (N, 2, 3) of the instances whose boxes meet a box, at most `limit`, in no order.
+
+        The boxes are those of the R*Tree: single precision, rounded outward. Without `structure` things only.
+        """
+        low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+        arguments: list[float | int | str] = [float(x) for pair in zip(low, high, strict=True) for x in pair]
+        clauses = ""
+        if not structure:
+            clauses += " AND i.structure IS NULL"
+        if min_confidence > 0.0:
+            clauses, arguments = f"{clauses} AND i.confidence >= ?", [*arguments, min_confidence]
+        if state is not None:
+            clauses, arguments = f"{clauses} AND i.state = ?", [*arguments, state]
+        if component is not None:
+            clauses, arguments = f"{clauses} AND i.component = ?", [*arguments, component]
+        join = " CROSS JOIN instances i ON i.id = b.id" if clauses else ""
+        query = (
+            f"SELECT b.id, b.min_x, b.min_y, b.min_z, b.max_x, b.max_y, b.max_z FROM instance_boxes b{join}"
+            " WHERE b.max_x >= ? AND b.min_x <= ? AND b.max_y >= ? AND b.min_y <= ? AND b.max_z >= ? AND b.min_z <= ?"
+            f"{clauses} LIMIT ?"
+        )
+        rows = np.array(self._rows(query, (*arguments, limit)), dtype=np.float64).reshape(-1, 7)
+        return rows[:, 0].astype(np.int64), rows[:, 1:].reshape(-1, 2, 3)
+
+    def world_bounds(self) -> NDArray[np.float64] | None:
+        """Box around the boxes of all instances, read off the root of the R*Tree; None without any. Shape (2, 3)."""
+        rows = self._rows("SELECT data FROM instance_boxes_node WHERE nodeno = 1")
+        if not rows or len(rows[0][0]) < 4:
+            return None
+        data = rows[0][0]
+        count = int.from_bytes(data[2:4], "big")
+        cell = np.dtype([("id", ">i8"), ("span", ">f4", 6)])
+        if count == 0 or len(data) < 4 + count * cell.itemsize:
+            return None
+        span = np.frombuffer(data, cell, count, 4)["span"].astype(np.float64)
+        return np.stack([span[:, 0::2].min(axis=0), span[:, 1::2].max(axis=0)])
+
     # ------------------------------------------------------------------ observations and supports
 
     def set_observations(self, observations: Iterable[Observation]) -> None:
@@ -111,9 +174,9 @@ class InstanceVerbs(ChunkVerbs):
 
     def support(self, instance_id: int) -> Support:
         """All surface points of an instance, in the world as it is placed now; of what moves, where it was last."""
-        chunks = {c.chunk_id: c.S_world_chunk for c in self.chunks()}
         instance = self.instance(instance_id)
         parts = self._support_parts(instance.id)
+        chunks = self._poses({k for k, _ in parts})
         found = Support(
             np.concatenate([chunks[k].apply(s.points) for k, s in parts]).astype(np.float32)
             if parts
@@ -126,6 +189,27 @@ class InstanceVerbs(ChunkVerbs):
         slack = 0.05 * float(np.linalg.norm(np.ptp(instance.aabb, axis=0)))
         here = np.all((found.points >= instance.aabb[0] - slack) & (found.points <= instance.aabb[1] + slack), axis=1)
         return Support(found.points[here], found.confidence[here], found.rgb[here])
+
+    def surface_points(self, instance_id: int) -> NDArray[np.float32]:
+        """Support points of one instance (no alias) in the world, without their colours. Shape (N, 3)."""
+        query = (
+            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points FROM observations o"
+            " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
+        )
+        rows = self._rows(query, (int(instance_id),))
+        if not rows:
+            return np.zeros((0, 3), np.float32)
+        placed = self._poses({row[0] for row in rows})
+        parts = [
+            placed[k].apply(dequantise(grid, points, count, f"the support of local instance {k}:{n}"))
+            for k, n, count, grid, points in rows
+        ]
+        return np.concatenate(parts).astype(np.float32)
+
+    def _poses(self, chunk_ids: Iterable[int]) -> dict[int, Sim3]:
+        """S_world_chunk of some chunks."""
+        query = "SELECT S_world_chunk FROM chunks WHERE chunk_id = ?"
+        return {k: unpack_sim3(self._rows(query, (k,))[0][0]) for k in sorted(chunk_ids)}
 
     def node_checksums(self) -> dict[int, int]:
         """A checksum, by chunk id, of what each chunk measured and of which of its local instances move."""
@@ -190,25 +274,6 @@ class InstanceVerbs(ChunkVerbs):
             " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
         )
         return [_support_part(row) for row in self._rows(query, (instance_id,))]
-
-    # ------------------------------------------------------------------ embeddings
-
-    def put_embeddings(self, space: str, ids: Sequence[int], vectors: NDArray[np.float32]) -> None:
-        """Set the vectors of instances in a named space. `vectors` has shape (N, D)."""
-        self._database.executemany(
-            "INSERT OR REPLACE INTO embeddings VALUES (?, ?, ?)",
-            [(int(i), space, v.astype("<f4").tobytes()) for i, v in zip(ids, vectors, strict=True)],
-        )
-
-    def embeddings(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Ids of shape (N,) and vectors of shape (N, D) of a named space."""
-        rows = self._rows("SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance", (space,))
-        ids = np.array([r[0] for r in rows], dtype=np.int64)
-        return ids, np.array([np.frombuffer(r[1], "<f4") for r in rows], dtype=np.float32)
-
-    def embedding_spaces(self) -> list[str]:
-        """The named spaces that hold vectors."""
-        return [r[0] for r in self._rows("SELECT DISTINCT space FROM embeddings ORDER BY space")]
 
     # ------------------------------------------------------------------ relations
 
