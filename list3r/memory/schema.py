@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
 APPLICATION_ID = 0x4C335231
 """ASCII "L3R1", written to the header of the SQLite file."""
 
@@ -72,6 +77,40 @@ MIGRATIONS: tuple[str, ...] = (
     ALTER TABLE local_instances ADD COLUMN dynamic INTEGER NOT NULL DEFAULT 0;
     ALTER TABLE local_instances ADD COLUMN motion BLOB;
     """,
+    # 3: checksums of all rows
+    """
+    CREATE TABLE sums (
+        name TEXT NOT NULL, part INTEGER NOT NULL, crcs BLOB NOT NULL, PRIMARY KEY (name, part)) WITHOUT ROWID;
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)
+
+
+@contextmanager
+def scratch_database(version: int) -> Iterator[sqlite3.Connection]:
+    """An empty database of a schema version, in memory."""
+    database = sqlite3.connect(":memory:", isolation_level=None)
+    try:
+        for migration in MIGRATIONS[:version]:
+            database.executescript(migration)
+        yield database
+    finally:
+        database.close()
+
+
+@cache
+def expected_schema(version: int) -> dict[tuple[str, str], str]:
+    """What a file of a schema version consists of: (type, name) and the statement that made it."""
+    with scratch_database(version) as database:
+        return read_schema(database)
+
+
+def read_schema(database: sqlite3.Connection) -> dict[tuple[str, str], str]:
+    """What a database consists of: (type, name) and the statement that made it, its spaces made one."""
+    rows = database.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchall()
+    return {
+        (str(kind), str(name)): " ".join(str(sql or table).split())
+        for kind, name, table, sql in rows
+        if not (kind == "table" and str(name).startswith("sqlite_stat"))
+    }
