@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.errors import OptionError, UnknownIdError
+from list3r.memory.records import BestView, Instance
+from list3r.memory.store import Store
+from list3r.queries.words import is_colored, is_named, wanted_words
 
 STATES = ("present", "moved", "removed", "added", "unseen")
 
@@ -30,6 +33,27 @@ class Match:
     """Between centres of boxes (or from the point asked about to the centre)."""
     reason: str
     """Why it is here, in words."""
+    view: BestView | None = None
+    """The frame that the question was about, with the thing's box in it; None for questions about no frame."""
+
+    @property
+    def best_view(self) -> BestView | None:
+        """The picture to look at: of the frame asked about, else where the thing is seen best."""
+        return self.view or self.instance.best_view
+
+
+class FilterOptions(TypedDict, total=False):
+    """The filters that every query takes by name, see `Filters`."""
+
+    structure: bool
+    min_confidence: float
+    state: str | None
+    label: str | None
+    color: str | None
+    min_size: float | None
+    max_size: float | None
+    component: int | None
+    dynamic: bool | None
 
 
 @dataclass(frozen=True)
@@ -40,22 +64,61 @@ class Filters:
     """Whether floor, walls and the like may answer."""
     min_confidence: float = 0.0
     state: str | None = None
+    """present, moved, removed, added or unseen."""
+    label: str | None = None
+    """Words that the label or the description must all bear."""
+    color: str | None = None
+    """A colour: "red" also takes what is dark red."""
+    min_size: float | None = None
+    """Longest edge at least this, world units."""
+    max_size: float | None = None
+    """Longest edge at most this, world units."""
+    component: int | None = None
+    """Only this part of a memory whose parts are not joined, see `Instance.component`."""
+    dynamic: bool | None = None
+    """Only what was seen moving (True), or what was not (False)."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_confidence <= 1.0:
             raise OptionError(f"min_confidence {self.min_confidence} must lie between 0 and 1")
         if self.state is not None and self.state not in STATES:
             raise OptionError(f"state {self.state!r} is not known; choose one of: {', '.join(STATES)}")
+        for words in (self.label, self.color):
+            if words is not None:
+                wanted_words(words)
+        for name, length in (("min_size", self.min_size), ("max_size", self.max_size)):
+            if length is not None:
+                checked_length(length, name)
 
     def select(self, instances: Iterable[Instance]) -> list[Instance]:
         """Those that pass."""
-        return [
-            i
-            for i in instances
-            if (self.structure or i.structure is None)
+        return [i for i in instances if self.passes(i)]
+
+    def passes(self, i: Instance) -> bool:
+        """Whether a question is about this one."""
+        size = float(np.max(i.box.size))
+        return (
+            (self.structure or i.structure is None)
             and i.confidence >= self.min_confidence
             and (self.state is None or i.state == self.state)
-        ]
+            and (self.label is None or is_named(i, self.label))
+            and (self.color is None or is_colored(i, self.color))
+            and (self.min_size is None or size >= self.min_size)
+            and (self.max_size is None or size <= self.max_size)
+            and (self.component is None or i.component == self.component)
+            and (self.dynamic is None or i.dynamic == self.dynamic)
+        )
+
+
+_LARGEST_ID = 2**63 - 1
+"""Of what a file holds."""
+
+
+def checked_instance(store: Store, instance_id: int) -> Instance:
+    """The instance of an id or of an alias. Raises `UnknownIdError`, also for a number that no id can be."""
+    if not 0 <= int(instance_id) <= _LARGEST_ID:
+        raise UnknownIdError(f"{store.path} has no instance {instance_id}; `list3r list {store.path}` shows the ids")
+    return store.instance(int(instance_id))
 
 
 def checked_count(k: int) -> int:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,8 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
-from list3r.queries.match import Filters, Match, checked_count, checked_length, checked_point
-from list3r.queries.surfaces import distance_between, distance_to_point
+from list3r.queries.best_first import box_gaps, nearest_first
+from list3r.queries.match import (
+    FilterOptions,
+    Filters,
+    Match,
+    checked_count,
+    checked_instance,
+    checked_length,
+    checked_point,
+)
+from list3r.queries.surfaces import distance_between, distance_to_point, surface_of
 from list3r.queries.words import STRUCTURE, wanted_words, word_score
 
 
@@ -23,16 +33,16 @@ def nearest(
     words: str | None = None,
     k: int = 5,
     max_distance: float | None = None,
-    min_confidence: float = 0.0,
-    structure: bool = False,
-    state: str | None = None,
+    **options: Unpack[FilterOptions],
 ) -> list[Match]:
     """The k things nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
     With `words` only things whose label or description bears one of them; with words alone those that they name best
     (most words, then confidence), without distances. The words must all be found where any thing bears them all. Words
     that name a kind of structure ("floor", "wall") ask for structure too. `max_distance` bounds the distance between
-    surfaces. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that was never given.
+    surfaces. What moves is taken where it was last seen; near an instance only what shares its component answers. For
+    the filters see `Filters`. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that
+    was never given.
     """
     k = checked_count(k)
     if point is not None and instance_id is not None:
@@ -43,18 +53,43 @@ def nearest(
         if point is None and instance_id is None:
             raise OptionError("a largest distance needs a point or an instance to measure from")
         max_distance = checked_length(max_distance, "max_distance")
-    filters = Filters(structure or _names_structure(words), min_confidence, state)
-    origin = None if instance_id is None else store.instance(instance_id)
-    candidates = [i for i in filters.select(store.instances()) if origin is None or i.id != origin.id]
-    named = _named(candidates, words) if words is not None else [(i, 1.0, "") for i in candidates]
-    if origin is not None:
-        candidates = [i for i, _, _ in named if i.component == origin.component]
-        return _by_distance(store, _reasons(named), candidates, k, max_distance, origin)
-    if point is not None:
-        place = checked_point(point, "point")
-        return _by_distance(store, _reasons(named), [i for i, _, _ in named], k, max_distance, place)
-    ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
-    return [Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]]
+    options["structure"] = options.get("structure", False) or _names_structure(words)
+    filters = Filters(**options)
+    origin = None if instance_id is None else checked_instance(store, instance_id)
+    place = None if point is None else checked_point(point, "point")
+    if words is None:
+        near = _near(store, origin, place, k, max_distance, filters)
+        return [_match(i, distance, "", origin, place) for distance, i in near]
+    named = _named([i for i in filters.select(store.instances()) if origin is None or i.id != origin.id], words)
+    if origin is None and place is None:
+        ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
+        return [Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]]
+    bearing = [i for i, _, _ in named if origin is None or i.component == origin.component]
+    reasons = {i.id: reason for i, _, reason in named}
+    found = _by_distance(bearing, _measure(store, origin, place), _aabb(origin, place), k, max_distance)
+    return [_match(i, distance, reasons[i.id], origin, place) for distance, i in found]
+
+
+def _near(
+    store: Store,
+    origin: Instance | None,
+    place: NDArray[np.float64] | None,
+    k: int,
+    limit: float | None,
+    filters: Filters,
+) -> list[tuple[float, Instance]]:
+    """The k nearest of all, found through the R*Tree."""
+    return nearest_first(
+        store,
+        _aabb(origin, place),
+        k,
+        _measure(store, origin, place),
+        filters=filters,
+        leave_out=None if origin is None else origin.id,
+        component=filters.component if origin is None else origin.component,
+        limit=limit,
+        touch=0.0 if origin is None else surface_of(store, origin).spacing,
+    )
 
 
 def _named(candidates: Sequence[Instance], words: str) -> list[tuple[Instance, float, str]]:
@@ -74,54 +109,56 @@ def _names_structure(words: str | None) -> bool:
     return words is not None and not STRUCTURE.isdisjoint(wanted_words(words))
 
 
-def _reasons(named: Sequence[tuple[Instance, float, str]]) -> dict[int, str]:
-    return {i.id: reason for i, _, reason in named}
-
-
 def _by_distance(
-    store: Store,
-    reasons: dict[int, str],
     candidates: Sequence[Instance],
+    measure: Callable[[Instance], float],
+    aabb: NDArray[np.float64],
     k: int,
     limit: float | None,
-    origin: Instance | NDArray[np.float64],
-) -> list[Match]:
-    """The k nearest. Boxes bound the distance from below, so only what can still win has its surface looked at."""
-    bound = [(_box_distance(i, origin), n) for n, i in enumerate(candidates)]
-    found: list[tuple[float, int, Match]] = []
-    for least, n in sorted(bound):
-        full = len(found) >= k and least > found[k - 1][0] + 1e-9
-        if full or (limit is not None and least > limit + _slack(candidates[n])):
-            if full:
-                break
-            continue
-        match = _measure(store, candidates[n], origin, reasons)
-        assert match.distance_m is not None
-        if limit is None or match.distance_m <= limit:
-            found.append((match.distance_m, candidates[n].id, match))
-            found.sort(key=lambda f: f[:2])
-    return [m for _, _, m in found[:k]]
+) -> list[tuple[float, Instance]]:
+    """The k nearest of some. Boxes bound the distance from below, so only what can still win has its surface looked
+    at.
+    """
+    if not candidates:
+        return []
+    gaps = box_gaps(np.array([i.aabb for i in candidates]), aabb)
+    found: list[tuple[float, int, Instance]] = []
+    for n in np.argsort(gaps, kind="stable"):
+        if len(found) >= k and gaps[n] > found[k - 1][0] + 1e-9:
+            break
+        distance = measure(candidates[n])
+        if limit is None or distance <= limit:
+            found = sorted([*found, (distance, candidates[n].id, candidates[n])], key=lambda f: f[:2])[:k]
+    return [(distance, i) for distance, _, i in found]
 
 
-def _measure(store: Store, i: Instance, origin: Instance | NDArray[np.float64], reasons: dict[int, str]) -> Match:
-    if isinstance(origin, Instance):
-        surface, center = distance_between(store, i, origin), float(np.linalg.norm(i.center - origin.center))
-        whence = f"from #{origin.id}"
+def _aabb(origin: Instance | None, place: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """The box of what is asked about. Shape (2, 3)."""
+    if origin is not None:
+        return origin.aabb
+    assert place is not None
+    return np.stack([place, place])
+
+
+def _measure(store: Store, origin: Instance | None, place: NDArray[np.float64] | None) -> Callable[[Instance], float]:
+    """What tells how far the surface of an instance is."""
+    if origin is not None:
+        known = origin
+        return lambda i: distance_between(store, i, known)
+    assert place is not None
+    point = place
+    return lambda i: distance_to_point(store, i, point)
+
+
+def _match(
+    i: Instance, surface: float, named: str, origin: Instance | None, place: NDArray[np.float64] | None
+) -> Match:
+    """An answer, with its distance in words."""
+    if origin is not None:
+        offset, whence = i.center - origin.center, f"from #{origin.id}"
     else:
-        surface, center = distance_to_point(store, i, origin), float(np.linalg.norm(i.center - origin))
-        whence = "from the point"
-    named = f", {reasons[i.id]}" if reasons[i.id] else ""
-    reason = f"surface {surface:.2f}, centre {center:.2f} {whence}{named}"
+        assert place is not None
+        offset, whence = i.center - place, "from the point"
+    center = float(np.linalg.norm(offset))
+    reason = f"surface {surface:.2f}, centre {center:.2f} {whence}" + (f", {named}" if named else "")
     return Match(i, round(1.0 / (1.0 + surface), 4), surface, center, reason)
-
-
-def _slack(instance: Instance) -> float:
-    """How far surface points may lie outside the trimmed box."""
-    return 0.02 * float(np.max(instance.box.size)) + 1e-9
-
-
-def _box_distance(instance: Instance, origin: Instance | NDArray[np.float64]) -> float:
-    low, high = (origin.aabb[0], origin.aabb[1]) if isinstance(origin, Instance) else (origin, origin)
-    extra = _slack(origin) if isinstance(origin, Instance) else 0.0
-    gap = np.maximum(0.0, np.maximum(low - instance.aabb[1], instance.aabb[0] - high))
-    return max(0.0, float(np.linalg.norm(gap)) - 2.0 * (_slack(instance) + extra))

@@ -1,28 +1,222 @@
-"""Relations of a memory."""
+"""Relations of a memory: those that it stores, and those that hold from a viewpoint or between two things."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
 from list3r.memory.errors import OptionError
-from list3r.memory.records import Relation
+from list3r.memory.records import Instance, Relation
+from list3r.memory.relation_scene import RelationSettings
 from list3r.memory.relations import PREDICATES
 from list3r.memory.store import Store
+from list3r.queries.camera import Camera, camera_of_frame, last_camera
+from list3r.queries.match import checked_instance, checked_point
+from list3r.queries.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
+from list3r.queries.words import wanted_words, words_of
+
+VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "under", "attached_to"))
+"""Predicates that exist only where gravity is known or estimated."""
+ALL_PREDICATES = (*(p for p in PREDICATES if p != "between"), *VIEWPOINT, "between")
+
+Place = int | str | Sequence[float] | Camera
+"""Where to look from: an instance's id, "camera" (where it was last), "camera:FRAME", a point x, y, z, or a camera."""
+
+
+class Relations(list[Relation]):
+    """A list of relations with what can be said of the question as a whole."""
+
+    def __init__(self, found: Iterable[Relation] = (), state: str = "known", reason: str = "") -> None:
+        super().__init__(found)
+        self.state = state
+        """known, or unknown: then nothing in the list means that it is not known, not that it is not so."""
+        self.reason = reason
+        """Why it is unknown, or what was left out; empty where there is nothing to say."""
 
 
 def relations(
     store: Store,
-    subject: int | None = None,
+    subject: int | str | None = None,
     predicate: str | None = None,
-    object: int | None = None,
+    object: int | str | None = None,
     min_confidence: float = 0.0,
-) -> list[Relation]:
-    """Relations that match what is given, the surest first; ids may be aliases.
+    *,
+    viewpoint: Place | None = None,
+    other: int | str | None = None,
+) -> Relations:
+    """Relations that match what is given, the surest first. Subject and object are ids, aliases, or words.
 
-    An empty answer to a vertical predicate means nothing where gravity is unknown: see `SceneMemory.gravity`. Raises
-    `OptionError` for a predicate that does not exist, `UnknownIdError` for an id that was never given.
+    With a `viewpoint` the four of `viewpoint.VIEWPOINT` are told as well (or alone, where one is the predicate); where
+    neither subject nor object is given, of things that the memory calls near each other. `between` needs `object` and
+    `other`. In the answer `state` is unknown where the question cannot be answered: a vertical predicate, or the view
+    from a point or a thing, without gravity. Raises `OptionError` for a predicate that does not exist or arguments that
+    do not fit, `UnknownIdError` for an id that was never given.
     """
-    if predicate is not None and predicate not in PREDICATES:
-        raise OptionError(f"predicate {predicate!r} is not known; choose one of: {', '.join(PREDICATES)}")
+    if predicate is not None and predicate not in ALL_PREDICATES:
+        raise OptionError(f"predicate {predicate!r} is not known; choose one of: {', '.join(ALL_PREDICATES)}")
     if not 0.0 <= min_confidence <= 1.0:
         raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
-    found = [r for r in store.relations(subject, predicate, object) if r.confidence >= min_confidence]
-    return sorted(found, key=lambda r: (-r.confidence, r.subject, r.predicate, r.object))
+    if predicate in VIEWPOINT and viewpoint is None:
+        raise OptionError(
+            f"{predicate} depends on who looks: say from where (--from ID, camera, camera:FRAME or x,y,z)"
+        )
+    if viewpoint is not None and predicate is not None and predicate not in VIEWPOINT:
+        raise OptionError(f"{predicate} does not depend on who looks; leave out the viewpoint")
+    if (predicate == "between") != (other is not None):
+        raise OptionError("between takes two things, object and other (--object A --and B), and nothing else takes two")
+    subjects, objects = _ids(store, subject), _ids(store, object)
+    if predicate == "between":
+        found = _between(store, subjects, objects, _ids(store, other))
+    elif viewpoint is None:
+        found = _stored(store, subjects, predicate, objects)
+    else:
+        found = _viewed(store, subjects, predicate, objects, viewpoint)
+        if predicate is None:
+            found += _stored(store, subjects, None, objects)
+    kept = sorted(
+        (r for r in found if r.confidence >= min_confidence),
+        key=lambda r: (-r.confidence, r.subject, r.predicate, r.object),
+    )
+    return Relations(kept, found.state, found.reason)
+
+
+def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
+    """Who looks from a place, see `Place`; None where up is not known. Raises `OptionError` and `UnknownIdError`."""
+    upright = store.get_value("gravity", "unknown") in ("known", "estimated")
+    up = np.array([0.0, 0.0, 1.0])
+    where = _parse_place(store, viewpoint) if isinstance(viewpoint, str) else viewpoint
+    if isinstance(where, Camera):
+        name = "the camera" if where.frame is None else f"frame {where.frame.frame_index}"
+        return Viewer(where.place, up if upright else where.up, name, None, where.component)
+    if isinstance(where, int | np.integer):
+        i = checked_instance(store, int(where))
+        return Viewer(i.center, up, f"#{i.id}", i.id, i.component) if upright else None
+    place = checked_point(where, "viewpoint")
+    return Viewer(place, up, "the point " + ", ".join(f"{x:g}" for x in place)) if upright else None
+
+
+def _parse_place(store: Store, text: str) -> int | Camera | list[float]:
+    if text == "camera":
+        return last_camera(store)
+    if match := re.fullmatch(r"camera:([0-9]{1,18})", text):
+        return camera_of_frame(store, int(match[1]))
+    if re.fullmatch(r"#?[0-9]{1,30}", text):
+        return int(text.removeprefix("#"))
+    try:
+        return [float(x) for x in text.split(",")]
+    except ValueError:
+        raise OptionError(f"viewpoint {text!r}: an id, camera, camera:FRAME, or a point such as 0,0,1.5") from None
+
+
+def _ids(store: Store, what: int | str | None) -> list[int] | None:
+    """The ids that a number or words stand for; None for whatever."""
+    if what is None:
+        return None
+    if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):
+        wanted = set(wanted_words(what))
+        return [i.id for i in store.instances() if wanted <= words_of(i)]
+    return [checked_instance(store, int(what.removeprefix("#")) if isinstance(what, str) else what).id]
+
+
+def _stored(store: Store, subjects: list[int] | None, predicate: str | None, objects: list[int] | None) -> Relations:
+    if subjects is not None and len(subjects) == 1:
+        found = [r for s in subjects for r in store.relations(s, predicate, None)]
+    elif objects is not None:
+        found = [r for o in objects for r in store.relations(None, predicate, o)]
+    else:
+        found = store.relations(None, predicate, None)
+    allowed = None if subjects is None else set(subjects), None if objects is None else set(objects)
+    found = [
+        r
+        for r in found
+        if (allowed[0] is None or r.subject in allowed[0]) and (allowed[1] is None or r.object in allowed[1])
+    ]
+    if store.get_value("gravity", "unknown") not in ("known", "estimated"):
+        why = "which way is up is not known in this memory, so neither is what is on, in, above or under what"
+        if predicate in VERTICAL and not found:
+            return Relations([], "unknown", why)
+        if predicate is None:
+            return Relations(found, "known", why)
+    return Relations(found)
+
+
+def _viewed(
+    store: Store, subjects: list[int] | None, predicate: str | None, objects: list[int] | None, viewpoint: Place
+) -> Relations:
+    viewer = viewer_from(store, viewpoint)
+    if viewer is None:
+        return Relations(
+            [], "unknown", "which way is up is not known in this memory, so neither is left or right; try a camera"
+        )
+    things = {i.id: i for i in store.instances()}
+    if subjects is None and objects is None:
+        pairs = sorted({(r.subject, r.object) for p in ("near", "next_to") for r in store.relations(None, p, None)})
+    else:
+        everything = [i.id for i in things.values() if i.structure is None]
+        pairs = (
+            [(s, o) for s in subjects or everything for o in objects or everything]
+            if [] not in (subjects, objects)
+            else []
+        )
+    out, untold = [], 0
+    noise = noise_of(store)
+    for s, o in pairs:
+        if s == o or viewer.instance_id in (s, o) or s not in things or o not in things:
+            continue
+        found = viewed(viewer, things[s], things[o], noise)
+        untold += found is None
+        out += [r for r in found or [] if predicate in (None, r.predicate)]
+    reason = f"as seen from {viewer.name}"
+    if untold:
+        reason += f"; of {untold} pairs it cannot be told from there"
+    return Relations(out, "unknown" if untold and not out else "known", reason)
+
+
+def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, others: list[int] | None) -> Relations:
+    if ones is None or others is None:
+        raise OptionError("between takes two things: say both, object and other (--object A --and B)")
+    noise = noise_of(store)
+    things = {i.id: i for i in store.instances()}
+    asked = [i for i in things.values() if (i.structure is None if subjects is None else i.id in set(subjects))]
+    found = [
+        r
+        for a in ones
+        for b in others
+        if a != b
+        for i in _near_line(store, things[a], things[b], asked)
+        if (r := between(i, things[a], things[b], noise)) is not None
+    ]
+    apart = [(a, b) for a in ones for b in others if things[a].component != things[b].component]
+    if apart and not found:
+        return Relations([], "unknown", "the two live in parts of the memory that are not joined")
+    unique: dict[tuple[int, frozenset[int]], BetweenRelation] = {}
+    for r in found:
+        unique.setdefault((r.subject, frozenset((r.object, r.other))), r)
+    return Relations(unique.values())
+
+
+def _near_line(store: Store, a: Instance, b: Instance, asked: list[Instance]) -> list[Instance]:
+    near = set(store.ids_in_box(np.minimum(a.center, b.center), np.maximum(a.center, b.center))) - {a.id, b.id}
+    return [i for i in asked if i.id in near]
+
+
+def noise_of(store: Store) -> float:
+    """Standard deviation of a position: the one of the stored relations, in world units."""
+    return RelationSettings().noise_m * unit_of(store)
+
+
+def unit_of(store: Store) -> float:
+    """What a metre is about in world units: 1 where the memory is metric, else told by the distances of things from
+    the cameras, which stand about two metres from what they look at indoors.
+    """
+    if store.get_value("scale_kind", "metric") != "relative":
+        return 1.0
+    poses = store.camera_poses()
+    centers = np.array([i.center for i in store.instances()]).reshape(-1, 3)
+    if not poses or not len(centers):
+        return 1.0
+    cameras = np.array([S.translation for _, S in poses[:: -(-len(poses) // 50)]])
+    away = np.linalg.norm(cameras[:, None] - centers[None, :: -(-len(centers) // 1000)], axis=2)
+    return max(float(np.median(away)) / 2.0, 1e-9)

@@ -1,14 +1,18 @@
-"""What lies in a region."""
+"""What lies in a region: a box, a sphere, or what a camera sees."""
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError
 from list3r.memory.store import Store
-from list3r.queries.match import Filters, Match, checked_length, checked_point
-from list3r.queries.surfaces import distance_to_point, surface_tree
+from list3r.queries.camera import Camera
+from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point
+from list3r.queries.seen import visible
+from list3r.queries.surfaces import distance_to_point, surface_of
 
 
 def within(
@@ -18,37 +22,36 @@ def within(
     upper: ArrayLike | None = None,
     center: ArrayLike | None = None,
     radius: float | None = None,
-    min_confidence: float = 0.0,
-    structure: bool = False,
-    state: str | None = None,
+    camera: Camera | None = None,
+    max_depth: float | None = None,
+    occlusion: bool = True,
+    **options: Unpack[FilterOptions],
 ) -> list[Match]:
-    """The things of which some surface lies in a box (`lower`, `upper`) or a sphere (`center`, `radius`); world.
+    """The things of which some surface lies in a box (`lower`, `upper`), in a sphere (`center`, `radius`), both in the
+    world, or in the frustum of a `camera`.
 
-    The score is the share of the thing's surface that lies inside; the most inside come first. Distances are from the
-    middle of the region. Raises `OptionError` for a region that makes no sense.
+    In a box or sphere the score is the share of the thing's surface that lies inside, and distances are from the middle
+    of the region; for a camera see `seen.visible`: with `occlusion` it leaves out what other things hide. The most
+    inside come first. For the filters see `Filters`. Raises `OptionError` for a region that makes no sense.
     """
-    filters = Filters(structure, min_confidence, state)
+    filters = Filters(**options)
     box, sphere = lower is not None or upper is not None, center is not None or radius is not None
-    if box == sphere:
-        raise OptionError("give one region: a box (lower and upper corner) or a sphere (center and radius)")
-    if box:
-        if lower is None or upper is None:
-            raise OptionError("a box needs both its lower and its upper corner")
-        low, high = checked_point(lower, "lower corner"), checked_point(upper, "upper corner")
-        if (low > high).any():
-            raise OptionError(f"the lower corner {low.tolist()} must not lie beyond the upper corner {high.tolist()}")
-        middle, reach = (low + high) / 2, None
-    else:
-        if center is None or radius is None:
-            raise OptionError("a sphere needs both its center and its radius")
-        middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
-        low, high = middle - reach, middle + reach
-    near = set(store.ids_in_box(low, high))
+    if box + sphere + (camera is not None) != 1:
+        raise OptionError(
+            "give one region: a box (lower and upper corner), a sphere (center and radius), or the view of a camera"
+        )
+    if camera is not None:
+        least = 0.1 if occlusion else 0.0
+        return visible(store, camera, min_visible=least, max_depth=max_depth, occlusion=occlusion, **options)
+    if max_depth is not None:
+        raise OptionError("a largest depth needs the view of a camera")
+    low, high, middle, reach = _box(lower, upper) if box else _sphere(center, radius)
+    ids, _ = store.boxes_in_box(
+        low, high, structure=filters.structure, min_confidence=filters.min_confidence, state=filters.state
+    )
     found = []
-    for i in filters.select(store.instances()):
-        if i.id not in near:
-            continue
-        points = np.asarray(surface_tree(store, i).data)
+    for i in filters.select(store.instances_of(sorted(ids.tolist()))):
+        points = surface_of(store, i).points
         if reach is None:
             inside = np.all((points >= low) & (points <= high), axis=1)
         else:
@@ -59,3 +62,23 @@ def within(
             reason = f"{share:.0%} of its surface is inside"
             found.append(Match(i, round(share, 4), distance_to_point(store, i, middle), away, reason))
     return sorted(found, key=lambda m: (-m.score, m.center_distance_m or 0.0, m.instance.id))
+
+
+_Region = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float | None]
+"""Lower and upper corner, middle, and the radius of a sphere."""
+
+
+def _box(lower: ArrayLike | None, upper: ArrayLike | None) -> _Region:
+    if lower is None or upper is None:
+        raise OptionError("a box needs both its lower and its upper corner")
+    low, high = checked_point(lower, "lower corner"), checked_point(upper, "upper corner")
+    if (low > high).any():
+        raise OptionError(f"the lower corner {low.tolist()} must not lie beyond the upper corner {high.tolist()}")
+    return low, high, low / 2 + high / 2, None
+
+
+def _sphere(center: ArrayLike | None, radius: float | None) -> _Region:
+    if center is None or radius is None:
+        raise OptionError("a sphere needs both its center and its radius")
+    middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
+    return middle - reach, middle + reach, middle, reach

@@ -33,10 +33,26 @@ _SYNONYMS = {
 
 def wanted_words(text: str) -> list[str]:
     """The words that matter, in order. Raises `OptionError` when none is left."""
-    found = [w for w in _split(text) if w not in _IGNORED]
+    found = [w for w in split_words(text) if w not in _IGNORED]
     if not found:
         raise OptionError(f"{text!r} has no word to look for; name a thing, a colour or a shape")
     return list(dict.fromkeys(found))
+
+
+def is_named(instance: Instance, text: str) -> bool:
+    """Whether label, kind of structure and description together bear all the words."""
+    return set(wanted_words(text)) <= words_of(instance)
+
+
+def is_colored(instance: Instance, text: str) -> bool:
+    """Whether the main colour bears all the words: "red" is said of what is dark red, not the other way round."""
+    return set(wanted_words(text)) <= set(split_words(instance.color_name))
+
+
+def words_of(instance: Instance) -> set[str]:
+    """All words that may name an instance: of its label, its kind of structure, its description and its colour."""
+    texts = (instance.label, instance.structure, instance.description.split(",")[0], instance.color_name)
+    return {word for text in texts for word in split_words(text or "")}
 
 
 def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]:
@@ -48,7 +64,7 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
     for word in wanted:
         best = 0.0
         for weight, text in fields:
-            have = _split(text or "")
+            have = split_words(text or "")
             if word in have:
                 best = max(best, weight)
             elif len(word) >= 3 and any(h.startswith(word) for h in have):
@@ -59,7 +75,8 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
     return total / len(wanted), hit
 
 
-def _split(text: str) -> list[str]:
+def split_words(text: str) -> list[str]:
+    """The words of a text in lower case, plurals as singulars, synonyms as one word."""
     return [_singular(w) for w in re.findall(r"[^\W_]+", text.lower())]
 
 

@@ -1,0 +1,60 @@
+"""How two things hang together: the shortest way through the relation graph."""
+
+from __future__ import annotations
+
+import itertools
+
+from list3r.memory.records import Relation
+from list3r.memory.relations import INVERSE, PREDICATES
+from list3r.memory.store import Store
+from list3r.queries.match import checked_instance
+from list3r.queries.relations import Relations
+
+_TELLING = ("in", "contains", "on", "supports", "attached_to", "under", "above", "below", "between", "next_to", "near")
+"""Of two relations of the same two things the one named first here tells more."""
+
+
+def path(store: Store, start: int, end: int, *, structure: bool = True) -> Relations:
+    """The fewest relations that lead from one instance to another, in order; of ways equally short the surest.
+
+    Where a step is stored only the other way round and has an inverse, the inverse is given; where it has none
+    (`under`, `attached_to`), the relation as it is stored, whose object then comes first on the way. Empty with a
+    `reason` where nothing leads there. Without `structure` the way does not lead over floor and walls, which nearly
+    everything stands on. Raises `UnknownIdError`.
+    """
+    import networkx
+
+    a, b = checked_instance(store, start), checked_instance(store, end)
+    if a.id == b.id:
+        return Relations([], "known", f"both are #{a.id}")
+    graph = networkx.Graph()
+    usable = {i.id for i in store.instances() if structure or i.structure is None} | {a.id, b.id}
+    best: dict[frozenset[int], Relation] = {}
+    for r in store.relations():
+        if r.subject not in usable or r.object not in usable or r.subject == r.object:
+            continue
+        key = frozenset((r.subject, r.object))
+        if key not in best or _rank(r) < _rank(best[key]):
+            best[key] = r
+            # One more hop costs more than any doubt saved: confidences decide only among ways equally long.
+            graph.add_edge(r.subject, r.object, weight=1.0 + 1e-6 * (1.0 - r.confidence))
+    try:
+        way = networkx.shortest_path(graph, a.id, b.id, weight="weight")
+    except (networkx.NetworkXNoPath, networkx.NodeNotFound):
+        apart = a.component != b.component
+        why = "they live in parts of the memory that are not joined" if apart else "no relation leads there"
+        return Relations([], "known", f"no way from #{a.id} to #{b.id}: {why}")
+    steps = [_forward(best[frozenset((s, o))], s) for s, o in itertools.pairwise(way)]
+    return Relations(steps, "known", f"{len(steps)} step{'s' if len(steps) > 1 else ''}")
+
+
+def _rank(r: Relation) -> tuple[int, float, int]:
+    known = _TELLING.index(r.predicate) if r.predicate in _TELLING else len(_TELLING) + (r.predicate in PREDICATES)
+    return known, -r.confidence, r.subject
+
+
+def _forward(r: Relation, subject: int) -> Relation:
+    """The relation with this subject where it has an inverse."""
+    if r.subject == subject or r.predicate not in INVERSE:
+        return r
+    return Relation(r.object, INVERSE[r.predicate], r.subject, r.confidence, r.margin)

@@ -1,0 +1,143 @@
+"""What a camera would see: supports projected into its picture, each hidden by what lies before it.
+
+The picture is a depth buffer at a fraction of the image's size. Every surface point covers a square as wide as its
+thing's points lie apart, so that surfaces are closed as far as they are known; a thing shows where it is the nearest,
+up to the noise of depth. Structure hides things too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from list3r.memory.records import Instance
+from list3r.memory.store import Store
+from list3r.queries.camera import Camera
+
+_WIDTH = 160
+"""Cells across the depth buffer."""
+_NEAR = 0.02
+"""Nothing nearer than this share of the median depth is drawn: the camera stands inside of it."""
+_MAX_REACH = 6
+"""Cells that one point reaches to each side at most."""
+_FEW = 9
+"""With fewer points than this the box stands for the surface, so many points along each edge."""
+_NOISE = 0.02
+"""Depth noise between views over depth."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How one thing shows in a picture."""
+
+    instance: Instance
+    inside: float
+    """Share of its surface points that lie in the picture, in [0, 1]."""
+    visible: float
+    """Share of its outline within the picture that nothing hides, in [0, 1]."""
+    picture: float
+    """Share of the picture that it fills, in [0, 1]."""
+    distance: float
+    """From the camera to its nearest point that shows, world units."""
+    box_xyxy: tuple[float, float, float, float]
+    """Round what shows of it, px of the image."""
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    instance: Instance
+    inside: float
+    cells: NDArray[np.int64]
+    depth: NDArray[np.float64]
+
+
+def look(
+    store: Store,
+    camera: Camera,
+    instances: Sequence[Instance],
+    *,
+    max_depth: float | None = None,
+    occlusion: bool = True,
+) -> list[Seen]:
+    """The instances of which something shows, by id; those of other components than the camera's cannot be seen.
+
+    `instances` are all that may hide or show. `max_depth` is the far end of the frustum, world units along z. Without
+    `occlusion` nothing hides anything.
+    """
+    step = max(1.0, camera.image_size[1] / _WIDTH)
+    height, width = (max(1, int(np.ceil(n / step))) for n in camera.image_size)
+    drawn = [
+        d
+        for i in instances
+        if i.component == camera.component
+        if (d := _draw(store, camera, i, step, (height, width), max_depth))
+    ]
+    nearest = np.full(height * width, np.inf)
+    for d in drawn:
+        np.minimum.at(nearest, d.cells, d.depth)
+    out = []
+    for d in drawn:
+        shows = d.depth <= nearest[d.cells] * (1.0 + _NOISE) if occlusion else np.ones(len(d.cells), dtype=bool)
+        if not shows.any():
+            continue
+        rows, columns = np.divmod(d.cells[shows], width)
+        x0, y0, x1, y1 = columns.min() * step, rows.min() * step, (columns.max() + 1) * step, (rows.max() + 1) * step
+        box = (float(x0), float(y0), float(min(x1, camera.image_size[1])), float(min(y1, camera.image_size[0])))
+        share, part = float(shows.mean()), float(shows.sum()) / (height * width)
+        out.append(Seen(d.instance, d.inside, share, part, float(d.depth[shows].min()), box))
+    return out
+
+
+def _draw(
+    store: Store, camera: Camera, instance: Instance, step: float, size: tuple[int, int], max_depth: float | None
+) -> _Drawn | None:
+    """The cells that an instance covers when nothing else is there, and its depth in each; None for none."""
+    R, t = camera.T_world_cam[:3, :3], camera.T_world_cam[:3, 3]
+    corners = (instance.box.corners() - t) @ R
+    if corners[:, 2].max() <= 0.0 or (max_depth is not None and corners[:, 2].min() > max_depth * 1.05):
+        return None
+    world, spacing = _surface(store, instance)
+    points = (world - t) @ R
+    fx, fy, cx, cy = camera.intrinsics
+    ahead = points[:, 2] > max(1e-9, _NEAR * float(np.median(np.abs(points[:, 2]))))
+    if max_depth is not None:
+        ahead &= points[:, 2] <= max_depth
+    x, y, z = points[ahead].T
+    u, v = (fx * x / z + cx + 0.5) / step, (fy * y / z + cy + 0.5) / step
+    within = (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0])
+    if not within.any():
+        return None
+    column, row, depth = u[within].astype(np.int64), v[within].astype(np.int64), z[within]
+    reach = np.clip(np.round(0.5 * spacing * fx / (step * depth)), 0, _MAX_REACH).astype(np.int64)
+    buffer = np.full(size[0] * size[1], np.inf)
+    for r in np.unique(reach).tolist():
+        at = reach == r
+        for dy in range(-r, r + 1):
+            for dx in range(-r, r + 1):
+                c, w = column[at] + dx, row[at] + dy
+                fits = (c >= 0) & (w >= 0) & (c < size[1]) & (w < size[0])
+                np.minimum.at(buffer, w[fits] * size[1] + c[fits], depth[at][fits])
+    cells = np.flatnonzero(np.isfinite(buffer))
+    return _Drawn(instance, float(within.sum()) / len(points), cells, buffer[cells])
+
+
+def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
+    """Surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie apart: of
+    most of them the second neighbour is nearer, so that squares of that width close the surface.
+    """
+    points = store.support(instance.id).points.astype(np.float64)
+    slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
+    points = points[np.all((points >= instance.aabb[0] - slack) & (points <= instance.aabb[1] + slack), axis=1)]
+    if len(points) < _FEW:
+        side = np.linspace(-0.5, 0.5, _FEW)
+        grid = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
+        grid = grid[np.abs(grid).max(axis=1) > 0.499]
+        return instance.box.center + (grid * instance.box.size) @ instance.box.rotation.T, float(
+            np.max(instance.box.size) / (_FEW - 1)
+        )
+    sample = points[:: -(-len(points) // 200)]
+    return points, float(np.quantile(np.asarray(cKDTree(points).query(sample, k=3)[0])[:, -1], 0.9))
