@@ -339,6 +339,26 @@ class Relation:
 
 
 @dataclass(frozen=True)
+class ChangeEvent:
+    """What a session showed of a thing that was known before, or of a new one where nothing stood before."""
+
+    session_id: int
+    instance_id: int
+    kind: str
+    """seen_again, moved, removed, added."""
+    from_box: OrientedBox | None
+    """Where it was before the session, world; None for what was added."""
+    to_box: OrientedBox | None
+    """Where the session saw it, world; None for what was removed."""
+    frames: tuple[tuple[int, int], ...]
+    """(session id, Frame.index) of the evidence, the most telling first."""
+    confidence: float
+    """In [0, 1]."""
+    reason: str
+    """Why, one sentence."""
+
+
+@dataclass(frozen=True)
 class MergeDecision:
     """One entry of the log: why two things became one, or did not."""
 

@@ -77,10 +77,17 @@ MIGRATIONS: tuple[str, ...] = (
     ALTER TABLE local_instances ADD COLUMN dynamic INTEGER NOT NULL DEFAULT 0;
     ALTER TABLE local_instances ADD COLUMN motion BLOB;
     """,
-    # 3: checksums of all rows
+    # 3: checksums of all rows; what operators edited; what changed between sessions
     """
     CREATE TABLE sums (
         name TEXT NOT NULL, part INTEGER NOT NULL, crcs BLOB NOT NULL, PRIMARY KEY (name, part)) WITHOUT ROWID;
+    CREATE TABLE edits (
+        entry INTEGER PRIMARY KEY, created_at TEXT NOT NULL, author TEXT NOT NULL, kind TEXT NOT NULL,
+        arguments TEXT NOT NULL);
+    CREATE TABLE events (
+        session_id INTEGER NOT NULL REFERENCES sessions, instance INTEGER NOT NULL REFERENCES instances,
+        kind TEXT NOT NULL, from_box BLOB, to_box BLOB, frames TEXT NOT NULL, confidence REAL NOT NULL,
+        reason TEXT NOT NULL, PRIMARY KEY (session_id, instance)) WITHOUT ROWID;
     """,
 )
 
