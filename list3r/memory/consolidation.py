@@ -11,6 +11,7 @@ import numpy as np
 
 from list3r.memory.bodies import Body, aabb_gap
 from list3r.memory.colors import Reference, color_words, main_color
+from list3r.memory.constraints import Constraints
 from list3r.memory.derive import DeriveSettings, Member, Thing, derive_mover, derive_thing, with_agreement
 from list3r.memory.describe import describe
 from list3r.memory.evidence import Evidence, EvidenceSettings, contested, weigh
@@ -78,19 +79,22 @@ def consolidate(
     pairs = without_moving(
         _known_pairs(store, settled, summaries), {k: v.shapes for k, v in summaries.items()}, motions
     )
-    groups, decisions = _partition(chunks, summaries, pairs, s.merging)
-    groups, movers, joined = _with_movers(store, groups, chunks, summaries, motions, s)
+    word = store.constraints()
+    groups, decisions = _partition(chunks, summaries, pairs, s.merging, word)
+    groups, movers, joined = _with_movers(store, groups, chunks, summaries, motions, word, s)
+    groups, movers = word.joined(groups, {c.chunk_id: c.component for c in chunks}, movers)
     decisions += joined
-    before = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
     evidence = weigh(groups, {k: v.shapes for k, v in summaries.items()}, pairs, s.evidence)
     weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
     posed = store.posed_count()
-    shown = [e.shown(s.evidence, posed) for e in evidence]
+    shown = word.shown(groups, [e.shown(s.evidence, posed) for e in evidence])
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
     things = _things(store, groups, ids, evidence, chunks, summaries, s, movers)
     things = _with_structure(store, things, chunks, summaries, s)
-    _write(store, things, groups, ids, summaries, settled)
+    labels = {ids.of_group[n]: text for n, text in word.labels_of(groups, weights).items()}
+    _write(store, things, groups, ids, summaries, settled, labels)
     store.replace_relations(None, _relations(store, things, chunks, summaries, s))
     _log(store, chunk_id if chunk_id is not None else chunks[-1].chunk_id, decisions, before, ids)
     return ConsolidationReport(
@@ -115,6 +119,7 @@ def _partition(
     summaries: Mapping[int, ChunkSummary],
     pairs: Mapping[tuple[int, int], PairScores],
     settings: MergeSettings,
+    word: Constraints,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     """Groups and decisions of all components, each merged on its own."""
     groups: list[list[Key]] = []
@@ -125,7 +130,7 @@ def _partition(
         links = [
             ((c.chunk_id, int(a)), (c.chunk_id, int(b))) for c in inside for a, b in summaries[c.chunk_id].cannot_link
         ]
-        found = merge_nodes([summaries[c.chunk_id].shapes for c in inside], placed, links, settings, pairs)
+        found = merge_nodes([summaries[c.chunk_id].shapes for c in inside], placed, links, settings, pairs, word)
         groups += found[0]
         decisions += found[1]
     return sorted(groups), decisions
@@ -137,6 +142,7 @@ def _with_movers(
     chunks: Sequence[ChunkRow],
     summaries: Mapping[int, ChunkSummary],
     motions: Mapping[Key, MotionTrack | None],
+    word: Constraints,
     s: ConsolidationSettings,
 ) -> tuple[list[list[Key]], dict[Key, Mover], list[MergeDecision]]:
     """The groups with those that move joined over time, and what is known of them by their first member."""
@@ -148,7 +154,8 @@ def _with_movers(
         {k: v.shapes for k, v in summaries.items()},
         {c.chunk_id: c.S_world_chunk for c in chunks},
         {c.chunk_id: c.component for c in chunks},
-        [((k, int(a)), (k, int(b))) for k, v in summaries.items() for a, b in v.cannot_link],
+        [((k, int(a)), (k, int(b))) for k, v in summaries.items() for a, b in v.cannot_link]
+        + word.pairs_apart(motions),
         Tracks(motions, times),
         s.moving,
     )
@@ -301,6 +308,7 @@ def _write(
     ids: Identities,
     summaries: Mapping[int, ChunkSummary],
     settled: Settled,
+    edited: Mapping[int | None, str | None],
 ) -> None:
     times = {(f.session_id, f.frame_index): f.time_s for f in store.frames()}
     metric = store.get_value("scale_kind", "metric") != "relative"
@@ -308,7 +316,8 @@ def _write(
     kept = {t.body.id for t in things}
     for old in [i.id for i in store.instances() if i.id not in kept]:
         store.drop_instance(old, dict(ids.aliases).get(old))
-    labels = {i.id: i.label for i in store.instances()}
+    labels: dict[int | None, str | None] = {i.id: i.label for i in store.instances()}
+    labels.update(edited)
     light = light_of(summaries)
     rows = {c.chunk_id: c for c in store.chunks()}
     seen_in = {n: [rows[k] for k in sorted({k for k, _ in g})] for g, n in zip(groups, ids.of_group, strict=True)}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.constraints import Constraints, Growing
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import MergeDecision
 from list3r.memory.shapes import ChunkShapes, Ints, coverage
@@ -99,14 +100,17 @@ def merge_nodes(
     cannot_link: Sequence[tuple[Key, Key]],
     settings: MergeSettings | None = None,
     pairs: Mapping[tuple[int, int], PairScores] | None = None,
+    word: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     """Group local instances into things.
 
     All chunks given must share one frame of reference. `pairs` are scores already known, by chunk ids (u <= v). The
     partition is the same in whatever order chunks and pairs are given: edges are taken best first, ties by key. Two
-    groups are joined unless a cannot-link pair would come together or too many pairs across speak against it
-    (complete link). Returns the groups, each sorted, ordered by their first member, and the decisions: one `merge`
-    for each union, one `refuse` for each strong edge that was not taken.
+    groups are joined unless a cannot-link pair would come together, or too many pairs across speak against it
+    (complete link), or the operator's `word` parts them. What that word holds together is joined afterwards, by
+    `Constraints.joined`, so that each half of it goes on attracting what looks like it. Returns the groups, each
+    sorted, ordered by their first member, and the decisions: one `merge` for each union, one `refuse` for each strong
+    edge that was not taken.
     """
     s = settings or MergeSettings()
     chunks = sorted(chunks, key=lambda c: c.chunk_id)
@@ -119,7 +123,7 @@ def merge_nodes(
             edges += _edges(table, table.start[u], table.start[v], scores, overlap, s)
     edges.sort(key=lambda e: (-e.score, e.a, e.b))
     enemies = _enemies(table, cannot_link)
-    return _join(table, edges, overlap, enemies, s)
+    return _join(table, edges, overlap, enemies, s, None if word is None or not word else word.growing())
 
 
 def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> dict[tuple[int, int], PairScores]:
@@ -270,7 +274,12 @@ def _enemies(t: _Table, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]
 
 
 def _join(
-    t: _Table, edges: Sequence[_Edge], overlap: dict[tuple[int, int], float], enemies: list[set[int]], s: MergeSettings
+    t: _Table,
+    edges: Sequence[_Edge],
+    overlap: dict[tuple[int, int], float],
+    enemies: list[set[int]],
+    s: MergeSettings,
+    word: Growing | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     group = list(range(len(t.keys)))
     members = {n: [n] for n in group}
@@ -281,13 +290,16 @@ def _join(
         a, b = sorted((group[e.a], group[e.b]))
         if a == b or (a, b) in refused:
             continue
-        against = _objection(t, members[a], members[b], foes[a], overlap, s)
+        against = word.objection(t.keys[a], t.keys[b]) if word is not None else ""
+        against = against or _objection(t, members[a], members[b], foes[a], overlap, s)
         name_a, name_b = _name(t.keys[e.a]), _name(t.keys[e.b])
         if against:
             refused.add((a, b))
             decisions.append(MergeDecision("refuse", name_a, name_b, e.scores, against))
             continue
         decisions.append(MergeDecision("merge", name_a, name_b, e.scores, _REASONS[e.kind]))
+        if word is not None:
+            word.join(t.keys[a], t.keys[b])
         members[a] = sorted(members[a] + members.pop(b))
         foes[a] |= foes.pop(b)
         for n in members[a]:

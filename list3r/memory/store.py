@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from list3r.memory.codec import checksum
-from list3r.memory.instance_verbs import InstanceVerbs
+from list3r.memory.edit_verbs import EditVerbs
 
 _CHECKED = {
     "chunks": ("chunk_id", "cannot_link, overlap"),
@@ -24,7 +24,7 @@ _REFERENCES = (
 )
 
 
-class Store(InstanceVerbs):
+class Store(EditVerbs):
     """Verbs of the memory file. `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew."""
 
     def verify(self) -> list[str]:
