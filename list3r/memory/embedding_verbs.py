@@ -24,6 +24,8 @@ class EmbeddingVerbs(ChunkVerbs):
         super().__init__(path, database, lock)
         self.vectors_touched: list[int] = []
         """Instances whose vectors this store has written or dropped since it was opened, in order; may repeat."""
+        self.spaces_touched: set[str] = set()
+        """Spaces that this store has written to."""
 
     def state_stamp(self) -> tuple[int, int, bool]:
         """Changes whenever the content may have: by other processes, by this store, by a rollback."""
@@ -33,6 +35,7 @@ class EmbeddingVerbs(ChunkVerbs):
     def put_embeddings(self, space: str, ids: Sequence[int], vectors: NDArray[np.float32]) -> None:
         """Set the vectors of instances in a named space. `vectors` has shape (N, D)."""
         self.vectors_touched += [int(i) for i in ids]
+        self.spaces_touched.add(space)
         self._database.executemany(
             "INSERT OR REPLACE INTO embeddings VALUES (?, ?, ?)",
             [(int(i), space, v.astype("<f4").tobytes()) for i, v in zip(ids, vectors, strict=True)],
@@ -63,6 +66,19 @@ class EmbeddingVerbs(ChunkVerbs):
         while rows := self._rows(query, (last, space, size)):
             last = rows[-1][0]
             yield _vectors(rows, space)
+
+    def embedding_count(self, space: str) -> int:
+        """How many vectors a named space holds."""
+        return int(self._rows("SELECT count(*) FROM embeddings WHERE space = ?", (space,))[0][0])
+
+    def embedding_sample(self, space: str, size: int) -> NDArray[np.float32]:
+        """About `size` of the vectors of a named space, spread evenly over it; all where there are fewer. (n, D)."""
+        stride = max(1, self.embedding_count(space) // size)
+        query = (
+            "SELECT instance, vector FROM embeddings"
+            " WHERE space = ? AND ((instance % 1000003) * 2654435761 >> 7) % ? = 0 ORDER BY instance"
+        )
+        return _vectors(self._rows(query, (space, stride)), space)[1]
 
     def embedding_spaces(self) -> list[str]:
         """The named spaces that hold vectors."""

@@ -21,7 +21,7 @@ from list3r.queries.match import (
     checked_length,
     checked_point,
 )
-from list3r.queries.surfaces import distance_between, distance_to_point, surface_of
+from list3r.queries.surfaces import STRAY, distance_between, distance_to_point, surface_of
 from list3r.queries.words import STRUCTURE, wanted_words, word_score
 
 
@@ -122,6 +122,7 @@ def _by_distance(
     if not candidates:
         return []
     gaps = box_gaps(np.array([i.aabb for i in candidates]), aabb)
+    gaps -= STRAY * np.array([np.max(i.box.size) for i in candidates])
     found: list[tuple[float, int, Instance]] = []
     for n in np.argsort(gaps, kind="stable"):
         if len(found) >= k and gaps[n] > found[k - 1][0] + 1e-9:

@@ -1,7 +1,10 @@
-"""Surface points of instances as KD-trees, kept while the store stays as it is."""
+"""Surfaces of instances, kept while the instances stay as they are."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,51 +16,110 @@ from list3r.memory.store import Store
 
 _MAX_POINTS = 4000
 """More points of one instance are thinned out: that is finer than the surfaces are known."""
-
-_trees: WeakKeyDictionary[Store, dict[int, tuple[bytes, cKDTree, float]]] = WeakKeyDictionary()
-
-
-def surface_tree(store: Store, instance: Instance) -> cKDTree:
-    """KD-tree of an instance's support in the world; its box's corners where it has no support."""
-    return _surface(store, instance)[0]
+STRAY = 2e-5
+"""Points may lie this far outside their thing's box, by its size: the steps in which they are stored."""
+_KEPT_POINTS = 4_000_000
+"""Points of surfaces that are kept for the next question, over all instances of a store."""
 
 
-def _surface(store: Store, instance: Instance) -> tuple[cKDTree, float]:
-    """The tree, and how far its points lie from each other: what is nearer than that touches, as far as is known."""
-    known = _trees.setdefault(store, {})
-    stamp = np.concatenate([instance.aabb.ravel(), instance.center, [instance.observations]]).tobytes()
-    if instance.id not in known or known[instance.id][0] != stamp:
-        tree = cKDTree(_points(store, instance))
-        known[instance.id] = (stamp, tree, _spacing(tree))
-    return known[instance.id][1], known[instance.id][2]
+@dataclass(frozen=True)
+class Surface:
+    """What is known of the surface of one instance, world coordinates."""
+
+    points: NDArray[np.float64]
+    """Thinned out. None outside the axis-aligned box, but for `STRAY`. Shape (N, 3)."""
+    instance: Instance
+    measured: bool
+    """False where nothing was measured and the points are those of the oriented box."""
+
+    # Cached properties write to __dict__, which frozen dataclasses without slots allow.
+    @cached_property
+    def tree(self) -> cKDTree:
+        """KD-tree of the points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """How far the points lie from each other: what is nearer than that touches, as far as is known."""
+        if not self.measured or len(self.points) < 9:
+            return 0.0
+        sample = self.points[:: -(-len(self.points) // 200)]
+        return float(np.median(np.asarray(self.tree.query(sample, k=2)[0])[:, 1]))
 
 
-def _spacing(tree: cKDTree) -> float:
-    if tree.n < 9:
-        return 0.0
-    sample = np.asarray(tree.data)[:: -(-tree.n // 200)]
-    return float(np.median(np.asarray(tree.query(sample, k=2)[0])[:, 1]))
+_kept: WeakKeyDictionary[Store, OrderedDict[int, tuple[bytes, Surface]]] = WeakKeyDictionary()
+_kept_points: WeakKeyDictionary[Store, int] = WeakKeyDictionary()
 
 
-def _points(store: Store, instance: Instance) -> NDArray[np.float64]:
-    """Support points inside the box, which leaves strays out, as deriving the box did."""
-    points = store.support(instance.id).points.astype(np.float64)
-    slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
-    inside = np.all((points >= instance.aabb[0] - slack) & (points <= instance.aabb[1] + slack), axis=1)
-    points = points[inside] if inside.any() else instance.box.corners()
-    return points[:: -(-len(points) // _MAX_POINTS)]
+def surface_of(store: Store, instance: Instance) -> Surface:
+    """The surface of an instance: its support, or its box where it has none."""
+    known = _kept.setdefault(store, OrderedDict())
+    stamp = instance.aabb.tobytes() + instance.center.tobytes() + instance.observations.to_bytes(8, "little")
+    if instance.id in known:
+        if known[instance.id][0] == stamp:
+            known.move_to_end(instance.id)
+            return known[instance.id][1]
+        _kept_points[store] -= len(known.pop(instance.id)[1].points)
+    surface = _surface(store, instance)
+    known[instance.id] = (stamp, surface)
+    _kept_points[store] = _kept_points.get(store, 0) + len(surface.points)
+    while _kept_points[store] > _KEPT_POINTS and len(known) > 1:
+        _kept_points[store] -= len(known.popitem(last=False)[1][1].points)
+    return surface
+
+
+def surface_points(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
+    """Surface points of an instance in the world, thinned out (N, 3), and how far they lie from each other."""
+    surface = surface_of(store, instance)
+    return surface.points, surface.spacing
+
+
+def _surface(store: Store, instance: Instance) -> Surface:
+    """Support points inside the box, as deriving the box left strays out; those just outside are moved to its side, so
+    that a thing is never nearer than its box.
+    """
+    points = store.surface_points(instance.id).astype(np.float64)
+    if len(points):
+        low, high = instance.aabb
+        slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
+        points = points[np.all((points >= low - slack) & (points <= high + slack), axis=1)]
+    if len(points) == 0:
+        return Surface(_box_points(instance), instance, measured=False)
+    stray = STRAY * float(np.max(instance.box.size))
+    points = np.clip(points[:: -(-len(points) // _MAX_POINTS)], low - stray, high + stray)
+    return Surface(points, instance, measured=True)
+
+
+_FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.float64) * 0.5 - 0.5
+
+
+def _box_points(instance: Instance) -> NDArray[np.float64]:
+    """Corners and middles of edges and faces of the oriented box. Shape (26, 3)."""
+    box = instance.box
+    points = box.center + (_FACES * box.size) @ box.rotation.T
+    return np.asarray(np.clip(points, instance.aabb[0], instance.aabb[1]))
 
 
 def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float64]) -> float:
     """From a point to the nearest surface point of an instance."""
-    return float(np.min(surface_tree(store, instance).query(point)[0]))
+    surface = surface_of(store, instance)
+    if surface.measured:
+        offset = surface.points - point
+        return float(np.sqrt(np.min(np.einsum("ij,ij->i", offset, offset))))
+    half = instance.box.size / 2.0
+    outside = np.abs((point - instance.box.center) @ instance.box.rotation) - half
+    if (outside <= 0.0).all():
+        return float(-np.max(outside))
+    gap = max(0.0, float(np.linalg.norm(np.maximum(outside, 0.0))))
+    apart = np.maximum(0.0, np.maximum(instance.aabb[0] - point, point - instance.aabb[1]))
+    return max(gap, float(np.linalg.norm(apart)))
 
 
 def distance_between(store: Store, a: Instance, b: Instance) -> float:
     """Between the nearest surface points of two instances; 0 where they touch, which is where the points of one lie as
     near to the other as to each other.
     """
-    (one, spacing_one), (two, spacing_two) = _surface(store, a), _surface(store, b)
-    small, large = sorted((one, two), key=lambda t: t.n)
-    gap = float(np.min(large.query(np.asarray(small.data))[0]))
-    return 0.0 if gap <= max(spacing_one, spacing_two) else gap
+    one, two = surface_of(store, a), surface_of(store, b)
+    small, large = sorted((one, two), key=lambda s: len(s.points))
+    gap = float(np.min(large.tree.query(small.points)[0]))
+    return 0.0 if gap <= max(one.spacing, two.spacing) else gap

@@ -1,0 +1,270 @@
+"""How a memory answers as it grows: 1,000 to 1,000,000 instances, beside a NumPy scan and an embedded vector database.
+
+python benchmarks/scale.py --instances 1000,1000000 --json benchmarks/results/scale.json
+
+The instances are made up and written through the store's own verbs: rooms of 5 x 5 x 3 m side by side, 30 things in
+each, relations to the neighbours, features of 256 numbers in families that lie apart by design (`features`). They have
+no measured surfaces, so distances are to their boxes. Each size runs in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, write_json
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import OrientedBox
+from list3r.memory.records import Instance, Relation
+from list3r.memory.store import Store
+from list3r.queries.nearest import nearest
+from list3r.queries.similar import similar
+from list3r.queries.within import within
+
+SPACE = "synthetic@1/256"
+DIMENSION = 256
+ROOM_M = np.array([5.0, 5.0, 3.0])
+THINGS = 30
+BATCH = 20_000
+Floats = NDArray[np.float64]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--instances", default="1000,10000,100000,1000000")
+    parser.add_argument("--questions", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder in which the memories are kept and taken up again")
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    words = parser.parse_args()
+    if words.one is not None:
+        print(json.dumps(measure(words.one, words.questions, words.seed, words.keep)))
+        return
+    print(machine())
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for count in (int(word) for word in words.instances.split(",")):
+            folder = words.keep or Path(scratch)
+            command = [sys.executable, __file__, "--one", str(count), "--keep", str(folder)]
+            command += ["--questions", str(words.questions), "--seed", str(words.seed)]
+            out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+            rows.append(json.loads(out.splitlines()[-1]))
+            print("\n".join(f"{count:>9,}  {k:34} {v}" for k, v in rows[-1].items()), flush=True)
+    write_json(words.json, {"sizes": rows})
+
+
+def measure(count: int, questions: int, seed: int, folder: Path) -> dict[str, Any]:
+    """All figures of one size."""
+    path = folder / f"scale-{count}-{seed}.l3r"
+    written = write_memory(path, count, seed) if not path.exists() else None
+    started = time.perf_counter()
+    store = Store.open(path, writable=True)
+    row: dict[str, Any] = {"instances": count, "write_s": written, "file_mb": round(path.stat().st_size / 1e6, 1)}
+    row["open_s"] = round(time.perf_counter() - started, 4)
+    rng = np.random.default_rng([seed, 2])
+    world = rooms(count)
+    points = rng.uniform(0.0, 1.0, (questions, 3)) * world
+    row |= timed("nearest", [lambda p=p: nearest(store, point=p, k=5) for p in points])
+    row |= timed("within_1m", [lambda p=p: within(store, center=p, radius=1.0) for p in points])
+    ids = rng.integers(1, count + 1, questions)
+    row |= timed("near_instance", [lambda n=n: nearest(store, instance_id=int(n), k=5) for n in ids])
+    _, stored = store.embeddings_of(SPACE, sorted({int(n) for n in ids}))
+    asked = views(stored, rng)
+    started = time.perf_counter()
+    similar(store, vector=asked[0], space=SPACE, k=10)
+    row["similar_first_s"] = round(time.perf_counter() - started, 2)
+    found: dict[int, list[int]] = {}
+
+    def ask(n: int) -> None:
+        found[n] = [m.instance.id for m in similar(store, vector=asked[n], space=SPACE, k=10)]
+
+    row |= timed("similar", [lambda n=n: ask(n) for n in range(len(asked))])
+    row["resident_mb"] = resident_mb()
+    row |= beside(store, points, asked, found)
+    row |= timed("one_more_chunk", [lambda n=n: one_more_chunk(store, int(n), count) for n in range(20)], warm=1)
+    row |= timed("similar_after_chunk", [lambda v=v: similar(store, vector=v, space=SPACE, k=10) for v in asked[:20]])
+    store.close()
+    row["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, 1)
+    return row
+
+
+# ---------------------------------------------------------------------------------------------- what is written
+
+
+def rooms(count: int) -> Floats:
+    """Extent of the world: rooms in a square, one floor. Shape (3,)."""
+    side = int(np.ceil(np.sqrt(np.ceil(count / THINGS))))
+    return np.array([side, side, 1.0]) * ROOM_M
+
+
+def write_memory(path: Path, count: int, seed: int) -> float:
+    """A memory of made-up instances; CPU and disk seconds it took."""
+    started = time.perf_counter()
+    side = int(rooms(count)[0] / ROOM_M[0] + 0.5)
+    with Store.create(path) as store:
+        with store.transaction():
+            store.set_value("scale_kind", "metric")
+            store.set_value("gravity", "estimated")
+        for first in range(1, count + 1, BATCH):
+            ids = np.arange(first, min(first + BATCH, count + 1))
+            rng = np.random.default_rng([seed, first])
+            with store.transaction():
+                store.put_instances(things(ids, side, rng))
+                store.put_embeddings(SPACE, ids.tolist(), features(len(ids), seed, rng))
+                store.replace_relations(
+                    [], [Relation(int(n), "near", int(n) - 1, 0.9, 0.1) for n in ids if n % THINGS != 1]
+                )
+    return round(time.perf_counter() - started, 1)
+
+
+def things(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Iterator[Instance]:
+    """Boxes of 5 cm to 2 m, small ones the most, anywhere in their room and turned about the vertical."""
+    room = (ids - 1) // THINGS
+    corner = np.stack([room % side, room // side, np.zeros_like(room)], axis=1) * ROOM_M
+    size = 0.05 * 40.0 ** (rng.uniform(size=(len(ids), 3)) ** 2)
+    center = corner + rng.uniform(0.0, 1.0, size.shape) * (ROOM_M - np.minimum(size, ROOM_M)) + size / 2
+    angle = rng.uniform(0.0, np.pi, len(ids))
+    for n, instance_id in enumerate(ids.tolist()):
+        c, s = np.cos(angle[n]), np.sin(angle[n])
+        box = OrientedBox(center[n], size[n], np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+        corners = box.corners()
+        yield Instance(
+            id=instance_id,
+            label=None,
+            description=f"white box, {100 * size[n].max():.0f} cm",
+            center=center[n],
+            aabb=np.stack([corners.min(axis=0), corners.max(axis=0)]),
+            box=box,
+            confidence=0.9,
+            observations=30,
+            first_seen_s=float(room[n]),
+            last_seen_s=float(room[n]) + 10.0,
+            state="present",
+            structure=None,
+            color_rgb=(240, 240, 240),
+            color_name="white",
+            component=1,
+            best_view=None,
+        )
+
+
+def features(count: int, seed: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Unit vectors: 2,000 kinds of things, within a kind 32 ways to differ, and noise in all directions.
+
+    Two things of one kind have a cosine of about 0.6, two of different kinds of about 0. Shape (count, 256).
+    """
+    fixed = np.random.default_rng([seed, 1])
+    kinds = fixed.normal(size=(2000, DIMENSION)) / np.sqrt(DIMENSION)
+    ways = fixed.normal(size=(32, DIMENSION)) / np.sqrt(DIMENSION)
+    own = rng.normal(size=(count, 32)) @ ways / np.sqrt(32)
+    noise = rng.normal(size=(count, DIMENSION)) / np.sqrt(DIMENSION)
+    made = kinds[rng.integers(0, len(kinds), count)] + 0.75 * own + 0.3 * noise
+    return np.asarray(made / np.linalg.norm(made, axis=1, keepdims=True), np.float32)
+
+
+def views(stored: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Other views of stored things: cosine about 0.9 to what is stored."""
+    made = stored + 0.45 * rng.normal(size=stored.shape) / np.sqrt(stored.shape[1])
+    return np.asarray(made / np.linalg.norm(made, axis=1, keepdims=True), np.float32)
+
+
+def one_more_chunk(store: Store, n: int, count: int) -> None:
+    """What the store writes when a chunk has changed 30 things of one room and found 5 new ones."""
+    first = 1 + THINGS * (n % max(1, count // THINGS))
+    changed = list(range(first, min(first + THINGS, count)))
+    new = [store.next_id() + k for k in range(5)]
+    rng = np.random.default_rng(n)
+    side = int(rooms(count)[0] / ROOM_M[0] + 0.5)
+    with store.transaction():
+        store.put_instances(things(np.array(changed + new), side, rng))
+        store.put_embeddings(SPACE, changed + new, features(len(changed) + 5, 1, rng))
+        store.replace_relations(changed, [Relation(a, "near", a - 1, 0.9, 0.1) for a in changed[1:]])
+
+
+# ---------------------------------------------------------------------------------------------- beside it
+
+
+def beside(store: Store, points: Floats, asked: NDArray[np.float32], found: dict[int, list[int]]) -> dict[str, Any]:
+    """A plain NumPy scan over the same data, which is also the truth for the recall, and a vector database."""
+    out: dict[str, Any] = {}
+    ids, vectors = store.embeddings(SPACE)
+    asked = asked[: min(len(asked), 100)]
+    truth: dict[int, list[int]] = {}
+
+    def scan(n: int) -> None:
+        cosine = vectors @ asked[n]
+        truth[n] = ids[np.argpartition(-cosine, min(10, len(cosine) - 1))[:10]].tolist()
+
+    out |= timed("numpy_similar", [lambda n=n: scan(n) for n in range(len(asked))])
+    out["similar_recall_at_10"] = recall(found, truth)
+    bounds = store.world_bounds()
+    assert bounds is not None
+    _, boxes = store.boxes_in_box(bounds[0], bounds[1])
+
+    def scan_boxes(p: Floats) -> None:
+        apart = np.maximum(0.0, np.maximum(boxes[:, 0] - p, p - boxes[:, 1]))
+        np.argpartition(np.einsum("ij,ij->i", apart, apart), min(5, len(boxes) - 1))
+
+    out |= timed("numpy_nearest", [lambda p=p: scan_boxes(p) for p in points[:50]], warm=1)
+    return out | vector_database(ids, vectors, asked, truth)
+
+
+def vector_database(
+    ids: NDArray[np.int64], vectors: NDArray[np.float32], asked: NDArray[np.float32], truth: dict[int, list[int]]
+) -> dict[str, Any]:
+    """usearch, an embedded HNSW index with its default settings; left out where it is not installed."""
+    try:
+        from usearch.index import Index
+    except ImportError:
+        print("usearch is not installed (pip install usearch); left out", file=sys.stderr)
+        return {}
+    index = Index(ndim=vectors.shape[1], metric="cos", dtype="f16")
+    started = time.perf_counter()
+    index.add(ids.astype(np.uint64), vectors)
+    out: dict[str, Any] = {"usearch_build_s": round(time.perf_counter() - started, 2)}
+    found: dict[int, list[int]] = {}
+
+    def ask(n: int) -> None:
+        found[n] = index.search(asked[n], 10).keys.tolist()
+
+    out |= timed("usearch_similar", [lambda n=n: ask(n) for n in range(len(asked))])
+    out["usearch_recall_at_10"] = recall(found, truth)
+    return out
+
+
+def recall(found: dict[int, list[int]], truth: dict[int, list[int]]) -> float:
+    """Mean share of the true ten that were found, over the questions of `truth`."""
+    return round(float(np.mean([len(set(found[n]) & set(t)) / len(t) for n, t in truth.items()])), 4)
+
+
+def timed(name: str, questions: list[Callable[[], Any]], warm: int = 3) -> dict[str, float]:
+    """p50 and p99 of single questions, milliseconds, after a few to warm up that are asked once more."""
+    spent = []
+    for n, ask in enumerate([*questions[:warm], *questions]):
+        started = time.perf_counter()
+        ask()
+        if n >= warm:
+            spent.append(1e3 * (time.perf_counter() - started))
+    p50, p99 = np.quantile(spent, [0.5, 0.99])
+    return {f"{name}_p50_ms": round(float(p50), 3), f"{name}_p99_ms": round(float(p99), 3)}
+
+
+def resident_mb() -> float:
+    """Resident set of this process now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return round(pages * resource.getpagesize() / 1e6, 1)
+
+
+if __name__ == "__main__":
+    main()
