@@ -21,9 +21,10 @@ import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
 
+from list3r.association.graph_growth import extend
 from list3r.association.graph_solver import GraphProblem, stack, take
 from list3r.association.marginals import marginals
-from list3r.association.pose_graph import GraphResult, GraphSettings, extend, optimize
+from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.records import Edge
 

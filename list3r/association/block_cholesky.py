@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_SMALL_FRONT = 10
+_SMALL_FRONT = 20
 """Fronts of up to so many blocks are joined to their parent whatever zeros that adds: calls cost more than sums."""
 _ZEROS = 0.2
 """Share of zeros that joining two larger fronts may add."""
@@ -82,7 +82,26 @@ def _structure(count: int, rows: Rows, columns: Rows) -> tuple[Rows, list[Rows]]
     lower.sort_indices()
     starts, indices = lower.indptr, lower.indices.astype(np.int64)
     structure = [indices[starts[k] + 1 : starts[k + 1]] for k in range(count)]
-    return np.asarray(factor.perm_c, np.int64), structure
+    after = _postorder(structure)
+    before = np.argsort(after)
+    return after[factor.perm_c], [after[structure[k]] for k in before.tolist()]
+
+
+def _postorder(structure: list[Rows]) -> Rows:
+    """New places that fill in no more, at which every block comes right after those that lead up to it (the postorder
+    of the elimination tree), so that blocks of like structure lie side by side. Shape (n,)."""
+    count = len(structure)
+    children: list[list[int]] = [[] for _ in range(count + 1)]
+    for k in sorted(range(count), key=lambda k: len(structure[k]), reverse=True):
+        children[int(structure[k][0]) if len(structure[k]) else count].append(k)
+    waiting, order = list(children[count]), []
+    while waiting:
+        k = waiting.pop()
+        order.append(k)
+        waiting.extend(reversed(children[k]))
+    out = np.empty(count, np.int64)
+    out[order[::-1]] = np.arange(count)
+    return out
 
 
 def _groups(structure: list[Rows]) -> list[tuple[int, int]]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.graph_solver import adjoint
+from list3r.association.graph_solver import adjoint, stack
 from list3r.memory.geometry import skew
 from list3r.memory.records import Edge
 
@@ -79,15 +79,16 @@ def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settin
 
     Shape (K, 7, 7), 0 for chunks without an edge that states a covariance.
     """
+    stated = [e for e in edges if e.covariance is not None]
     out, seen = np.zeros((count, 7, 7)), np.zeros(count)
-    stated = [(e, e.covariance) for e in edges if e.covariance is not None]
     if stated:
-        shapes = _bent(np.array([C for _, C in stated]), settings) - np.array([C for _, C in stated])
-        for (edge, _), shape in zip(stated, shapes, strict=True):
-            moved = adjoint(edge.S_v_u)
-            for chunk, here in ((edge.u, shape), (edge.v, moved @ shape @ moved.T)):
-                out[row[chunk]] += here
-                seen[row[chunk]] += 1
+        covariance = np.array([e.covariance for e in stated])
+        shape = _bent(covariance, settings) - covariance
+        moved = adjoint(stack([e.S_v_u for e in stated]))
+        rows = np.array([[row[e.u], row[e.v]] for e in stated])
+        np.add.at(out, rows[:, 0], shape)
+        np.add.at(out, rows[:, 1], moved @ shape @ np.swapaxes(moved, 1, 2))
+        np.add.at(seen, rows, 1)
     return np.asarray(out * (settings.own_bend / settings.bend) ** 2 / np.maximum(seen, 1)[:, None, None])
 
 

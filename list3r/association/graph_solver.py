@@ -69,8 +69,9 @@ class GraphProblem:
         e = self.residuals(poses)
         return np.asarray(np.einsum("ei,eij,ej->e", e, self.information, e, optimize=True))
 
-    def solve(self, poses: Sim3, trust: Array, iterations: int) -> Sim3:
-        """Poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`. Shape of trust (E,)."""
+    def solve(self, poses: Sim3, trust: Array, iterations: int, settled: float = _CONVERGED) -> Sim3:
+        """Poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`, until a step gains less
+        than a share `settled` of the cost. Shape of trust (E,)."""
         if len(self.u) == 0 or not (~self.fixed).any():
             return poses
         damping = 0.0
@@ -89,7 +90,7 @@ class GraphProblem:
                 continue
             gain, poses, cost, e, system = cost - new_cost, tried, new_cost, new, None
             damping = 0.0 if damping <= 1e-6 else damping / 10.0
-            if gain <= _CONVERGED * cost + 1e-18:
+            if gain <= settled * cost + 1e-18:
                 break
         return poses
 

@@ -29,6 +29,9 @@ _NONE = 1e-9
 _SETTLED = 0.05
 """Change of the logarithm of a variance factor that no longer matters."""
 
+_ROUGHLY, _CLOSELY = 1e-3, 1e-9
+"""Relative gain of a step at which a stage of the annealing, and at which the solution, has settled."""
+
 
 @dataclass(frozen=True)
 class TrustSettings:
@@ -92,9 +95,10 @@ def judge(
     limit = chi2.ppf(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
     poses, trust, factors = _as_stated_or_drifted(problem, start, tree, loop, limit, robust, settings)
     freedom = np.full(2, settings.prior_freedom)
-    for _ in range(settings.rounds if loop.any() else 0):
+    for judged_anew in range(settings.rounds if loop.any() else 0):
         scaled = problem.scaled(factors[kinds])
-        poses, trust = _harden(scaled, poses, limit, robust, settings)
+        if judged_anew:
+            poses, trust = _harden(scaled, poses, limit, robust, settings)
         known, squares = marginals(scaled, poses, np.maximum(trust, _NONE)), scaled.squares(poses)
         before = factors
         factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, before, settings.prior_freedom)
@@ -162,7 +166,7 @@ def _anneal(
     steps = settings.iterations // 4
     trust = (mu / (problem.squares(poses) / limit + mu)) ** 2 if gated else np.ones(len(limit))
     while True:
-        poses = problem.solve(poses, np.maximum(trust, _NONE), steps)
+        poses = problem.solve(poses, np.maximum(trust, _NONE), steps, _ROUGHLY)
         share = problem.squares(poses) / limit
         trust = (mu / (share + mu)) ** 2
         if mu == 1.0:
@@ -177,7 +181,7 @@ def _harden(
     inside = problem.squares(poses) <= limit if robust else np.ones(len(limit), bool)
     seen: set[bytes] = set()
     while True:
-        poses = problem.solve(poses, np.where(inside, 1.0, _NONE), settings.iterations)
+        poses = problem.solve(poses, np.where(inside, 1.0, _NONE), settings.iterations, _CLOSELY)
         seen.add(inside.tobytes())
         after = problem.squares(poses) <= limit if robust else inside
         if after.tobytes() in seen or len(seen) == 6:
