@@ -198,7 +198,7 @@ def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, o
 
 
 def _near_line(store: Store, a: Instance, b: Instance, asked: list[Instance]) -> list[Instance]:
-    near = set(store.ids_in_box(np.minimum(a.center, b.center), np.maximum(a.center, b.center))) - {a.id, b.id}
+    near = set(store.ids_in_box(np.minimum(a.aabb[0], b.aabb[0]), np.maximum(a.aabb[1], b.aabb[1]))) - {a.id, b.id}
     return [i for i in asked if i.id in near]
 
 

@@ -75,8 +75,9 @@ def viewed(viewer: Viewer, subject: Instance, object: Instance, noise: float) ->
 
 
 def between(subject: Instance, a: Instance, b: Instance, noise: float) -> BetweenRelation | None:
-    """Whether a thing lies between two others: the line of their centres meets it, or passes it nearer than its own
-    half width, in the part that is inside neither of the two. The margin is how much nearer; None when it does not.
+    """Whether a thing lies between two others: in the gap between their boxes it meets the tube that the thinner of
+    the two sweeps along the line of the centres, and is not so long as to be under or behind both. The margin is how
+    deep; None when it does not.
     """
     line = b.center - a.center
     length = float(np.linalg.norm(line))
@@ -85,12 +86,13 @@ def between(subject: Instance, a: Instance, b: Instance, noise: float) -> Betwee
     along = line / length
     foot = float((subject.center - a.center) @ along)
     start, end = 0.5 * _extent(a, along), length - 0.5 * _extent(b, along)
-    if not min(start, end) < foot < max(start, end):
+    if not start < foot < end or _extent(subject, along) >= length:
         return None
     off = subject.center - a.center - foot * along
     away = float(np.linalg.norm(off))
-    half = 0.5 * _extent(subject, off / away) if away > 1e-9 else 0.5 * float(np.min(subject.box.size))
-    margin = min(half - away, foot - min(start, end), max(start, end) - foot)
+    aside = off / away if away > 1e-9 else np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
+    half = 0.5 * (_extent(subject, aside) + min(_extent(a, aside), _extent(b, aside)))
+    margin = min(half - away, foot - start, end - foot)
     if margin <= 0.0:
         return None
     confidence = round(certainty(margin, noise), 4)

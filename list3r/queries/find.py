@@ -1,0 +1,344 @@
+"""Things by what is said of them: attributes, a noun, and how they stand to others; see `grammar`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance
+from list3r.memory.store import Store
+from list3r.queries.camera import camera_of_frame
+from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
+from list3r.queries.match import Match, checked_count, checked_instance
+from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
+from list3r.queries.surfaces import distance_between
+from list3r.queries.viewpoint import VIEWPOINT, between
+from list3r.queries.words import STRUCTURE, split_words
+
+_BY_STRUCTURE_M = 0.4
+"""What is nearer than this to a wall is near it: the memory stores that of things only."""
+_MOST_OBJECTS = 40
+"""So many things that others are left of, or between, are looked at."""
+_ALIKE = 0.1
+"""Sizes that differ by less than this share are equally the biggest."""
+
+
+class TextEncoder(Protocol):
+    """A model whose vectors of text and of pictures can be compared, such as CLIP or SigLIP."""
+
+    space: str
+    """The embedding space of the memory that it belongs to, `model@revision/dim`."""
+    min_cosine: float
+    """From here a thing is said to be what a text says."""
+
+    def encode(self, text: str) -> NDArray[np.float32]:
+        """The vector of a text. Shape (D,)."""
+        ...
+
+
+class Found(list[Match]):
+    """Ranked answers with what can be said of the question as a whole."""
+
+    def __init__(
+        self, matches: Iterable[Match] = (), notes: Sequence[str] = (), unknown_words: Sequence[str] = ()
+    ) -> None:
+        super().__init__(matches)
+        self.notes = tuple(dict.fromkeys(notes))
+        """What a reader should know: words that nothing bears, relations that are not known, several equal answers."""
+        self.unknown_words = tuple(dict.fromkeys(unknown_words))
+        """Words that nothing in the memory bears."""
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the second answer is as good as the first."""
+        return len(self) > 1 and self[0].score - self[1].score < 0.02
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    instance: Instance
+    score: float
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass
+class _Search:
+    """One question while it is worked on."""
+
+    store: Store
+    things: dict[int, Instance]
+    vocabulary: dict[int, dict[str, float]]
+    encoder: TextEncoder | None
+    viewpoint: Place | None
+    notes: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+
+
+def find(
+    store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: TextEncoder | None = None
+) -> Found:
+    """The things that a text describes, the best first: "white mug on table", "chair next to 12".
+
+    Every word must be borne by label, kind of structure, description or colour; small and large are relative to what
+    else there is of the kind; every relation must hold. Nothing that fits is an empty answer, never a guess: its
+    `notes` name the words that nothing bears and the relations that the memory cannot know. Left, right, front and
+    behind are told from `viewpoint` (see `relations.Place`), else as the picture shows it in which the other thing is
+    seen best. With an `encoder` of a space that the memory holds, phrases with words that nothing bears are compared
+    by their vectors. The score is how well the words fit times how sure the relations are. Raises `OptionError` for a
+    text without sense and `UnknownIdError` for a number that was never an id.
+    """
+    k = checked_count(k)
+    phrase = parse(text)
+    things = {i.id: i for i in store.instances()}
+    search = _Search(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint)
+    found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
+    matches = [Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "a thing") for c in found[:k]]
+    out = Found(matches, search.notes, search.unknown)
+    if out.ambiguous and len(found) > 1:
+        equal = sum(c.score > found[0].score - 0.02 for c in found)
+        out.notes = (*out.notes, f"{equal} things answer equally well; say more to tell them apart")
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- phrases
+
+
+def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
+    """What a phrase may mean: words, then relations, then size among what is left."""
+    if phrase.instance_id is not None:
+        i = checked_instance(search.store, phrase.instance_id)
+        found = [_Candidate(i, 1.0, (f"#{i.id}",))]
+        if not _bears(search, i.id, phrase.words):
+            search.notes.append(f"#{i.id} is not named {' '.join(phrase.words)}")
+            found = []
+    else:
+        found = _named(search, phrase)
+    if phrase.size is not None:
+        found = _sized(search, found, phrase.size)
+    for clause in phrase.where:
+        if not found:
+            # The rest is looked at all the same, so that all words that nothing bears are told.
+            _meaning(search, clause.object)
+            if clause.other:
+                _meaning(search, clause.other)
+            continue
+        found = _related(search, found, clause, phrase.text)
+    if phrase.superlative is not None and found:
+        found = _extreme(found, phrase.superlative)
+    return found
+
+
+def _vocabulary(i: Instance) -> dict[str, float]:
+    """Words that an instance bears, with how well each names it."""
+    out: dict[str, float] = {}
+    color = split_words(i.color_name)
+    fields = ((1.0, i.label), (0.9, i.structure), (0.8, i.description.split(",")[0]))
+    for score, text in fields:
+        for word in split_words(text or ""):
+            out[word] = max(out.get(word, 0.0), score)
+    for word in color:
+        out[word] = 1.0 if len(color) == 1 else 0.9
+    if i.label is None:
+        for word in split_words(i.description.split(",")[0])[-1:]:
+            out[word] = max(out[word], 0.9)
+    return out
+
+
+def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
+    unknown = [w for w in phrase.words if not any(w in v for v in search.vocabulary.values())]
+    if unknown:
+        by_vector = _by_vector(search, phrase)
+        if by_vector is not None:
+            return by_vector
+        search.unknown += unknown
+        bear = ", ".join(repr(w) for w in unknown)
+        search.notes.append(f"nothing in this memory bears the word{'s' if len(unknown) > 1 else ''} {bear}")
+        return []
+    structure = not STRUCTURE.isdisjoint(phrase.words) or bool(
+        phrase.words
+        and not any(_bears(search, n, phrase.words) for n, i in search.things.items() if i.structure is None)
+    )
+    out = []
+    for n, i in search.things.items():
+        if (i.structure is None or structure) and _bears(search, n, phrase.words):
+            score = float(np.mean([search.vocabulary[n][w] for w in phrase.words])) if phrase.words else 1.0
+            reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
+            out.append(_Candidate(i, score, reasons))
+    return out
+
+
+def _bears(search: _Search, n: int, words: Sequence[str]) -> bool:
+    return all(w in search.vocabulary[n] for w in words)
+
+
+def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
+    """Things by the likeness of their vectors to the phrase; None where no vectors of the encoder's space are there."""
+    encoder = search.encoder
+    if encoder is None or encoder.space not in search.store.embedding_spaces():
+        return None
+    ids, vectors = search.store.embeddings(encoder.space)
+    query = np.asarray(encoder.encode(" ".join(phrase.words)), dtype=np.float64)
+    lengths = np.linalg.norm(vectors, axis=1) * np.linalg.norm(query)
+    cosine = vectors @ query / np.maximum(lengths, 1e-12)
+    return [
+        _Candidate(search.things[n], float(c), (f"like {' '.join(phrase.words)!r}: cosine {c:.2f} in {encoder.space}",))
+        for n, c in zip(ids.tolist(), cosine.tolist(), strict=True)
+        if c >= encoder.min_cosine and n in search.things and search.things[n].structure is None
+    ]
+
+
+# ---------------------------------------------------------------------------------------------- sizes
+
+
+def _sized(search: _Search, found: list[_Candidate], size: str) -> list[_Candidate]:
+    """Those of a size, relative to the others that fit the words, or to all things where those are fewer than four."""
+    among = [c.instance for c in found]
+    if len(among) < 4:
+        among = [i for i in search.things.values() if i.structure is None] or among
+    edges = np.sort([_edge(i) for i in among])
+    low, high = SIZES[size]
+    out = []
+    for c in found:
+        rank = float(np.mean(edges < _edge(c.instance)) + 0.5 * np.mean(edges == _edge(c.instance)))
+        said = search.vocabulary[c.instance.id].get(size, 0.0)
+        fit = 1.0 - rank if high <= 0.5 else rank if low >= 0.5 else 1.0 - 2.0 * abs(rank - 0.5)
+        if said > 0.0 or low <= rank <= high:
+            score = max(said, 0.5 + 0.5 * fit)
+            why = f"{size}: longest edge {_edge(c.instance):.2f}, {1.0 - rank:.0%} of what is there is larger"
+            out.append(_Candidate(c.instance, c.score * score, (*c.reasons, why)))
+    return out
+
+
+def _extreme(found: list[_Candidate], superlative: str) -> list[_Candidate]:
+    """The largest or smallest, and what is practically as large."""
+    kind = SUPERLATIVES[superlative]
+    sizes = [_edge(c.instance) if abs(kind) == 1 else float(np.ptp(c.instance.aabb[:, 2])) for c in found]
+    best = max(sizes) if kind > 0 else min(sizes)
+    out = []
+    for c, size in zip(found, sizes, strict=True):
+        share = min(size, best) / max(size, best, 1e-12)
+        if share >= 1.0 - _ALIKE:
+            what = "longest edge" if abs(kind) == 1 else "height"
+            out.append(_Candidate(c.instance, c.score * share, (*c.reasons, f"{superlative}: {what} {size:.2f}")))
+    return out
+
+
+def _edge(i: Instance) -> float:
+    return float(np.max(i.box.size))
+
+
+# ---------------------------------------------------------------------------------------------- relations
+
+
+def _related(search: _Search, found: list[_Candidate], clause: Clause, text: str) -> list[_Candidate]:
+    """Those that stand in the relation to something that the clause's phrase means."""
+    objects = _few(search, _meaning(search, clause.object), clause)
+    others = _few(search, _meaning(search, clause.other), clause) if clause.other else []
+    if clause.other:
+        out = _between(search, found, objects, others)
+    else:
+        out = _standing(search, found, objects, clause.predicates)
+    if not out and objects and (others or not clause.other):
+        ends = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
+        search.notes.append(f"of {len(found)} that fit {text!r} none is known to be {clause.said} {ends!r}")
+    return out
+
+
+def _few(search: _Search, objects: list[_Candidate], clause: Clause) -> list[_Candidate]:
+    """Not more than can be looked at from each of them, the best first."""
+    stored = not ({"between", *VIEWPOINT} & set(clause.predicates))
+    if stored or len(objects) <= _MOST_OBJECTS:
+        return objects
+    search.notes.append(
+        f"{len(objects)} things may be meant after {clause.said!r}; the best {_MOST_OBJECTS} were taken"
+    )
+    return sorted(objects, key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))[:_MOST_OBJECTS]
+
+
+def _standing(
+    search: _Search, found: list[_Candidate], objects: list[_Candidate], predicates: Sequence[str]
+) -> list[_Candidate]:
+    subjects = {c.instance.id: c for c in found}
+    best: dict[int, _Candidate] = {}
+    for object in objects:
+        for subject, predicate, confidence, whence in _pairs(search, subjects, object, predicates):
+            c = subjects[subject]
+            score = c.score * confidence * (0.5 + 0.5 * object.score)
+            if subject not in best or score > best[subject].score:
+                o = object.instance
+                why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{whence})"
+                inner = tuple(r for r in object.reasons if not r.startswith(("named", "#")))
+                best[subject] = _Candidate(c.instance, score, (*c.reasons, why, *inner))
+    return [best[n] for n in sorted(best)]
+
+
+def _pairs(
+    search: _Search, subjects: dict[int, _Candidate], object: _Candidate, predicates: Sequence[str]
+) -> list[tuple[int, str, float, str]]:
+    """(subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
+    o = object.instance
+    out: list[tuple[int, str, float, str]] = []
+    for predicate in predicates:
+        place = _viewpoint(search, o) if predicate in VIEWPOINT else None
+        if predicate in VIEWPOINT and place is None:
+            search.notes.append(f"{predicate.replace('_', ' ')} depends on who looks; say from where")
+            continue
+        held = relations(search.store, None, predicate, o.id, viewpoint=place)
+        if held.state == "unknown" and (predicate in VIEWPOINT or predicate in VERTICAL):
+            search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
+        whence = f", {held.reason.split(';')[0]}" if place is not None else ""
+        out += [(r.subject, r.predicate, r.confidence, whence) for r in held if r.subject in subjects]
+    if "near" in predicates and (o.structure is not None):
+        out += _near_structure(search, subjects, o)
+    return [p for p in out if p[0] != o.id]
+
+
+def _near_structure(search: _Search, subjects: dict[int, _Candidate], o: Instance) -> list[tuple[int, str, float, str]]:
+    """Things near a wall, by the distance of surfaces: the memory keeps `near` of things only."""
+    limit = _BY_STRUCTURE_M * unit_of(search.store)
+    near = set(search.store.ids_in_box(o.aabb[0] - limit, o.aabb[1] + limit))
+    out = []
+    for n, c in subjects.items():
+        if n in near and n != o.id and c.instance.component == o.component:
+            gap = distance_between(search.store, c.instance, o)
+            if gap <= limit:
+                out.append((n, "near", 1.0 - 0.5 * gap / limit, f", {gap:.2f} away"))
+    return out
+
+
+def _viewpoint(search: _Search, o: Instance) -> Place | None:
+    """From where left and right are told: as asked, else the picture in which the other thing is seen best."""
+    if search.viewpoint is not None:
+        return search.viewpoint
+    if o.best_view is None:
+        return None
+    try:
+        return camera_of_frame(search.store, o.best_view.frame_index, o.best_view.session_id)
+    except OptionError:
+        return None
+
+
+def _between(
+    search: _Search, found: list[_Candidate], ones: list[_Candidate], others: list[_Candidate]
+) -> list[_Candidate]:
+    noise = noise_of(search.store)
+    best: dict[int, _Candidate] = {}
+    for a in ones:
+        for b in others:
+            ends = a.instance.id, b.instance.id
+            box = np.stack([a.instance.aabb, b.instance.aabb])
+            near = set(search.store.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0)))
+            for c in found:
+                if c.instance.id not in near or c.instance.id in ends or ends[0] == ends[1]:
+                    continue
+                r = between(c.instance, a.instance, b.instance, noise)
+                score = 0.0 if r is None else c.score * r.confidence * (0.5 + 0.25 * (a.score + b.score))
+                if r is not None and (c.instance.id not in best or score > best[c.instance.id].score):
+                    why = f"between #{ends[0]} and #{ends[1]} ({r.confidence:.2f})"
+                    best[c.instance.id] = _Candidate(c.instance, score, (*c.reasons, why))
+    return [best[n] for n in sorted(best)]
