@@ -1,0 +1,282 @@
+"""What an operator does to the library: merge, split, label, delete, undo. Each is one transaction and one log entry.
+
+An edit is written down in terms of local instances (chunk:local), which never change; then the library is derived anew
+under all edits that stand (`memory.constraints`), and so it is whenever a chunk arrives later.
+"""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+
+from list3r.memory.consolidation import consolidate
+from list3r.memory.constraints import Edit, Key, standing
+from list3r.memory.edit_verbs import LogEntry
+from list3r.memory.errors import OptionError, UnknownIdError
+from list3r.memory.parting import part_best
+from list3r.memory.records import MergeDecision, Observation
+from list3r.memory.store import Store
+
+Before = tuple[tuple[int, str | None, tuple[Key, ...]], ...]
+_LONGEST_LABEL = 200
+
+
+@dataclass(frozen=True)
+class EditReport:
+    """What an edit did."""
+
+    entry: int
+    """Its number in the merge log, for `undo`."""
+    kind: str
+    """merge, split, label, delete, undo."""
+    ids: tuple[int, ...]
+    """The instances that are there now of what it touched, the one that was spoken of first."""
+    new: tuple[int, ...]
+    """Ids given for the first time."""
+    aliases: tuple[tuple[int, int], ...]
+    """(id that retired, id that stands for it now)."""
+    restored: tuple[int, ...]
+    """Ids that had retired and name an instance again."""
+    text: str
+    """One sentence."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return asdict(self)
+
+
+def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport:
+    """Two instances are one thing, whatever their overlap says; the older id stays, the other becomes its alias.
+
+    Raises `UnknownIdError`, and `OptionError` for two that are one already or lie in parts that were never joined.
+    """
+    with store.transaction():
+        first, second = sorted((_known(store, a), _known(store, b)))
+        if first == second:
+            raise OptionError(f"{a} and {b} are one instance already, #{first}")
+        if store.instance(first).component != store.instance(second).component:
+            raise OptionError(
+                f"#{first} and #{second} lie in parts of the memory that were never joined, each with its own frame of "
+                "reference; add a session that connects them first"
+            )
+        before = _as_they_are(store, [first, second])
+        edit = _edit("merge", (before[0][2], before[1][2]), before, author)
+        return _carry_out(store, edit, (f"#{first}", f"#{second}"), f"{edit.author} merged #{second} into #{first}")
+
+
+def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, author: str | None = None) -> EditReport:
+    """An instance is two things: `out`, local instances (chunk id, local id) of it, and the rest.
+
+    Without `out` it is parted where the evidence parts it best. The larger part keeps the id, the other gets a new one.
+    Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.
+    """
+    with store.transaction():
+        known = _known(store, instance_id)
+        before = _as_they_are(store, [known])
+        keys = before[0][2]
+        if len(keys) < 2:
+            raise OptionError(f"#{known} was seen as one piece in one chunk only; there is nothing to split")
+        leaving = _checked_part(known, keys, out) if out is not None else part_best(store, keys)
+        staying = tuple(k for k in keys if k not in set(leaving))
+        edit = _edit("split", (staying, tuple(sorted(leaving))), before, author)
+        told = ", ".join(map(_name, edit.parts[1]))
+        return _carry_out(store, edit, (f"#{known}", told), f"{edit.author} split #{known}: {told} left it")
+
+
+def label(store: Store, instance_id: int, text: str | None, author: str | None = None) -> EditReport:
+    """Give an instance a name; nothing, or an empty text, takes it away. Raises `UnknownIdError` and `OptionError`."""
+    cleaned = " ".join((text or "").split()) or None
+    if cleaned is not None and (len(cleaned) > _LONGEST_LABEL or not cleaned.isprintable()):
+        raise OptionError(f"a label is one line of at most {_LONGEST_LABEL} printable characters")
+    with store.transaction():
+        known = _known(store, instance_id)
+        before = _as_they_are(store, [known])
+        edit = replace(_edit("label", (before[0][2],), before, author), text=cleaned)
+        reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} took the label of #{known}"
+        edit = _write_down(store, edit, (f"#{known}", cleaned or ""), reason)
+        store.set_labels({known: cleaned})
+        return EditReport(edit.entry, "label", (known,), (), (), (), reason)
+
+
+def delete(store: Store, instance_id: int, author: str | None = None) -> EditReport:
+    """Take an instance out of the library, with all that is seen of it later. Raises `UnknownIdError`."""
+    with store.transaction():
+        known = _known(store, instance_id)
+        before = _as_they_are(store, [known])
+        edit = _edit("delete", (before[0][2],), before, author)
+        return _carry_out(store, edit, (f"#{known}", ""), f"{edit.author} deleted #{known}")
+
+
+def undo(store: Store, entry: int | None = None, author: str | None = None) -> EditReport:
+    """Take back an edit, or a decision of the merge log, by its entry; the last edit that stands without one.
+
+    Undoing an undo brings the edit back. Ids that had retired come back. Raises `OptionError` for an entry that there
+    is not, that is undone already, or that decided nothing.
+    """
+    with store.transaction():
+        edits = store.edits()
+        holding = standing(edits)
+        if entry is None:
+            last = [e.entry for e in holding if e.kind != "undo"]
+            if not last:
+                raise OptionError(f"{store.path} has no edit to undo; give the ENTRY of a decision of the merge log")
+            entry = last[-1]
+        chosen = next((e for e in edits if e.entry == entry), None)
+        if chosen is None:
+            return _undo_decision(store, entry, author)
+        if chosen not in holding:
+            raise OptionError(f"entry {entry} is undone already; undo the undo to bring it back")
+        touched = sorted({k for _, _, keys in chosen.before for k in keys})
+        edit = replace(_edit("undo", (), _owners(store, touched), author), target=entry)
+        what = f"the undo of entry {chosen.target}" if chosen.kind == "undo" else f"the {chosen.kind}"
+        reason = f"{edit.author} took back {what} of entry {entry}"
+        if chosen.kind == "undo":
+            reason = f"{edit.author} took back the undo of entry {chosen.target}"
+        return _carry_out(store, edit, (f"entry {entry}", ""), reason, bring_back=chosen.before)
+
+
+# ---------------------------------------------------------------------------------------------- one decision
+
+
+def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
+    """What merging decided is decided otherwise, by an edit of the two local instances that it spoke of."""
+    found = next((e for e in store.log_entries() if e.entry == entry), None)
+    if found is None:
+        raise OptionError(f"the log has no entry {entry}; `list3r merges {store.path}` shows all")
+    d = found.decision
+    if d.kind not in ("merge", "refuse"):
+        raise OptionError(f"entry {entry} ({d.kind}) only tells what became of ids; undo the merge that led to it")
+    a, b = _key(d.a, found), _key(d.b, found)
+    before = _owners(store, [a, b])
+    one = len(before) == 1 and len(before[0][2]) > 0 and {a, b} <= set(before[0][2])
+    if one != (d.kind == "merge"):
+        raise OptionError(f"entry {entry} does not hold any more: {d.a} and {d.b} are {'one' if one else 'two'} now")
+    edit = replace(_edit("split" if one else "merge", ((a,), (b,)), before, author), target=entry)
+    reason = f"{edit.author} took back the {d.kind} of entry {entry}"
+    return _carry_out(store, edit, (d.a, d.b), reason)
+
+
+def _key(name: str, entry: LogEntry) -> Key:
+    try:
+        chunk, local = name.split(":")
+        return int(chunk), int(local)
+    except ValueError:
+        raise OptionError(f"entry {entry.entry} names no local instances, so it cannot be undone") from None
+
+
+# ---------------------------------------------------------------------------------------------- carrying out
+
+
+def _edit(kind: str, parts: tuple[tuple[Key, ...], ...], before: Before, author: str | None) -> Edit:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return Edit(0, now, author or _user(), kind, parts, 0, before)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):
+        return "somebody"
+
+
+def _known(store: Store, instance_id: int) -> int:
+    """The id that stands for an id today. Raises `UnknownIdError`, which says so of one that was deleted."""
+    try:
+        return store.resolve(instance_id)
+    except UnknownIdError:
+        for e in standing(store.edits()):
+            if e.kind == "delete" and any(n == instance_id for n, _, _ in e.before):
+                raise UnknownIdError(
+                    f"#{instance_id} was deleted; `list3r undo {store.path} {e.entry}` brings it back"
+                ) from None
+        raise
+
+
+def _as_they_are(store: Store, ids: Sequence[int]) -> Before:
+    """What an undo brings back: ids, labels and local instances of instances."""
+    return tuple(
+        (n, store.instance(n).label, tuple((o.chunk_id, o.local_id) for o in store.observations(n))) for n in ids
+    )
+
+
+def _owners(store: Store, keys: Sequence[Key]) -> Before:
+    """The same of all instances that any of these local instances belong to."""
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    return _as_they_are(store, sorted({home[k] for k in keys if k in home}))
+
+
+def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -> Edit:
+    """Append the edit to the log and to the edits; the edit with its number."""
+    through = max(c.chunk_id for c in store.chunks())
+    entry = store.add_log_entry(through, MergeDecision(f"edit {edit.kind}", *names, {}, reason))
+    edit = replace(edit, entry=entry, through=through)
+    store.add_edit(edit)
+    return edit
+
+
+def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, bring_back: Before = ()) -> EditReport:
+    """Write the edit down, derive the library anew, and see to it that every id still resolves."""
+    edit = _write_down(store, edit, names, reason)
+    there = {i.id for i in store.instances()}
+    aliases = store.aliases()
+    _give_back(store, bring_back, there, aliases)
+    report = consolidate(store)
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    now = {i.id: i.label for i in store.instances()}
+    named = {n for keys, _ in store.constraints().labels for n in {home.get(k) for k in keys}}
+    store.set_labels({n: text for n, text, _ in bring_back if n in now and n not in named})
+    retired = _retired(store, edit.before + bring_back, home, now, dict(report.merged))
+    store.add_aliases(retired)
+    store.drop_revived_aliases()
+    touched = sorted({home[k] for _, _, keys in edit.before + bring_back for k in keys if k in home})
+    first = [n for n, _, _ in bring_back + edit.before if n in touched]
+    return EditReport(
+        entry=edit.entry,
+        kind=edit.kind,
+        ids=tuple(dict.fromkeys([*first, *touched])),
+        new=tuple(n for n in report.new if n in touched),
+        aliases=tuple((old, new) for old, new in sorted(store.aliases().items()) if aliases.get(old) != new),
+        restored=tuple(n for n in touched if n not in there and n not in report.new),
+        text=reason,
+    )
+
+
+def _give_back(store: Store, before: Before, there: Collection[int], aliases: Mapping[int, int]) -> None:
+    """Ids that retired own again what they owned and what has not gone to a third one since."""
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    for instance_id, _, keys in before:
+        if instance_id not in there:
+            heir = store.resolve(instance_id) if instance_id in aliases else None
+            own = [k for k in keys if home.get(k) in (None, heir)]
+            store.set_observations(Observation(instance_id, *key) for key in own)
+
+
+def _retired(
+    store: Store, before: Before, home: Mapping[Key, int], now: Mapping[int, str | None], merged: Mapping[int, int]
+) -> dict[int, int]:
+    """Ids that were touched, name no instance now and have no alias yet: what most of them has become."""
+    out = {}
+    known = store.aliases()
+    for instance_id, _, keys in before:
+        heirs = [home[k] for k in keys if k in home]
+        if instance_id in now or not heirs or known.get(instance_id) in now:
+            continue
+        out[instance_id] = merged.get(instance_id, max(sorted(set(heirs)), key=heirs.count))
+    return out
+
+
+def _checked_part(instance_id: int, keys: Sequence[Key], out: Sequence[Key]) -> tuple[Key, ...]:
+    wrong = [k for k in out if k not in keys]
+    if wrong:
+        raise OptionError(
+            f"{_name(wrong[0])} is not a part of #{instance_id}; `list3r show MEMORY {instance_id} --json` lists them"
+        )
+    if not out or set(out) == set(keys):
+        raise OptionError(f"a part of #{instance_id} must leave and a part must stay; it has {len(keys)} in all")
+    return tuple(sorted(set(out)))
+
+
+def _name(key: Key) -> str:
+    return f"{key[0]}:{key[1]}"
