@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,13 +27,21 @@ _KEPT_POINTS = 4_000_000
 class Surface:
     """What is known of the surface of one instance, world coordinates."""
 
-    points: NDArray[np.float64]
-    """Thinned out. None outside the axis-aligned box, but for `STRAY`. Shape (N, 3)."""
+    support: NDArray[np.float64] | None
+    """Thinned out, inside the axis-aligned box but for `STRAY`; None where nothing was measured. Shape (N, 3)."""
     instance: Instance
-    measured: bool
-    """False where nothing was measured and the points are those of the oriented box."""
+
+    @property
+    def weight(self) -> int:
+        """What it counts for among those that are kept."""
+        return 50 if self.support is None else 50 + len(self.support)
 
     # Cached properties write to __dict__, which frozen dataclasses without slots allow.
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Points of the surface, of the oriented box where nothing was measured. Shape (N, 3)."""
+        return _box_points(self.instance) if self.support is None else self.support
+
     @cached_property
     def tree(self) -> cKDTree:
         """KD-tree of the points."""
@@ -41,7 +50,7 @@ class Surface:
     @cached_property
     def spacing(self) -> float:
         """How far the points lie from each other: what is nearer than that touches, as far as is known."""
-        if not self.measured or len(self.points) < 9:
+        if self.support is None or len(self.support) < 9:
             return 0.0
         sample = self.points[:: -(-len(self.points) // 200)]
         return float(np.median(np.asarray(self.tree.query(sample, k=2)[0])[:, 1]))
@@ -59,12 +68,12 @@ def surface_of(store: Store, instance: Instance) -> Surface:
         if known[instance.id][0] == stamp:
             known.move_to_end(instance.id)
             return known[instance.id][1]
-        _kept_points[store] -= len(known.pop(instance.id)[1].points)
+        _kept_points[store] -= known.pop(instance.id)[1].weight
     surface = _surface(store, instance)
     known[instance.id] = (stamp, surface)
-    _kept_points[store] = _kept_points.get(store, 0) + len(surface.points)
+    _kept_points[store] = _kept_points.get(store, 0) + surface.weight
     while _kept_points[store] > _KEPT_POINTS and len(known) > 1:
-        _kept_points[store] -= len(known.popitem(last=False)[1][1].points)
+        _kept_points[store] -= known.popitem(last=False)[1][1].weight
     return surface
 
 
@@ -84,10 +93,10 @@ def _surface(store: Store, instance: Instance) -> Surface:
         slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
         points = points[np.all((points >= low - slack) & (points <= high + slack), axis=1)]
     if len(points) == 0:
-        return Surface(_box_points(instance), instance, measured=False)
+        return Surface(None, instance)
     stray = STRAY * float(np.max(instance.box.size))
     points = np.clip(points[:: -(-len(points) // _MAX_POINTS)], low - stray, high + stray)
-    return Surface(points, instance, measured=True)
+    return Surface(points, instance)
 
 
 _FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.float64) * 0.5 - 0.5
@@ -103,16 +112,15 @@ def _box_points(instance: Instance) -> NDArray[np.float64]:
 def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float64]) -> float:
     """From a point to the nearest surface point of an instance."""
     surface = surface_of(store, instance)
-    if surface.measured:
-        offset = surface.points - point
+    if surface.support is not None:
+        offset = surface.support - point
         return float(np.sqrt(np.min(np.einsum("ij,ij->i", offset, offset))))
-    half = instance.box.size / 2.0
-    outside = np.abs((point - instance.box.center) @ instance.box.rotation) - half
-    if (outside <= 0.0).all():
-        return float(-np.max(outside))
-    gap = max(0.0, float(np.linalg.norm(np.maximum(outside, 0.0))))
-    apart = np.maximum(0.0, np.maximum(instance.aabb[0] - point, point - instance.aabb[1]))
-    return max(gap, float(np.linalg.norm(apart)))
+    box = instance.box
+    outside = (np.abs((point - box.center) @ box.rotation) - box.size / 2.0).tolist()
+    apart = np.maximum(instance.aabb[0] - point, point - instance.aabb[1]).tolist()
+    if max(outside) <= 0.0:
+        return float(-max(outside))
+    return math.sqrt(max(sum(max(x, 0.0) ** 2 for x in side) for side in (outside, apart)))
 
 
 def distance_between(store: Store, a: Instance, b: Instance) -> float:
