@@ -25,7 +25,7 @@ def build_ended(walk: Path, memory: Path, end: str, *more: str) -> subprocess.Co
 import os, signal, sys
 import list3r.pipeline
 from list3r.cli import main
-def add_chunk(*_):
+def add_chunk(*_, **__):
     {end}
 list3r.pipeline.add_chunk = add_chunk
 sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given", "--workers", "1", *{more!r}]

@@ -160,7 +160,7 @@ def test_a_newer_schema_is_refused_with_its_version(make_memory: Make) -> None:
 def test_a_second_writer_is_refused_and_a_reader_sees_whole_transactions(make_memory: Make) -> None:
     path = make_memory()
     with Store.open(path, writable=True) as writer:
-        with pytest.raises(MemoryFileError, match="another process"):
+        with pytest.raises(MemoryFileError, match="by this process already"):
             Store.open(path, writable=True)
         with Store.open(path) as reader:
             with writer.transaction():

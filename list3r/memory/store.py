@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from list3r.memory.codec import checksum
-from list3r.memory.edit_verbs import EditVerbs
+import sqlite3
+from collections.abc import Iterator
+from typing import Any
 
-_CHECKED = {
-    "chunks": ("chunk_id", "cannot_link, overlap"),
-    "keyframes": ("chunk_id || ':' || frame_index", "descriptor, features, jpeg"),
-    "local_instances": ("chunk_id || ':' || local_id", "feature, track"),
-    "supports": ("chunk_id || ':' || local_id", "grid, points, confidence, rgb"),
-}
+import numpy as np
+
+from list3r.memory.edit_verbs import EditVerbs
+from list3r.memory.event_verbs import EventVerbs
+from list3r.memory.sums import OWN_CRC, bad_rows_of, own_crc_wrong, summed_tables
 
 _REFERENCES = (
     ("observations", "instance", "instances", "id"),
@@ -22,19 +22,71 @@ _REFERENCES = (
     ("instances", "id", "instance_boxes", "id"),
     ("instance_boxes", "id", "instances", "id"),
 )
+_GEOMETRY_BYTES = 24 * 8
 
 
-class Store(EditVerbs):
+class Store(EditVerbs, EventVerbs):
     """Verbs of the memory file. `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew."""
 
     def verify(self) -> list[str]:
-        """Every damage found: pages, checksums of blobs, rows that point nowhere. Empty when the file is sound."""
-        found = [f"SQLite: {text}" for (text,) in self._rows("PRAGMA integrity_check") if text != "ok"]
-        for table, (key, blobs) in _CHECKED.items():
-            for name, crc, *parts in self._rows(f"SELECT {key}, crc, {blobs} FROM {table}"):
-                if checksum(*parts) != crc:
-                    found.append(f"{table} {name}: the checksum does not match; the row is damaged")
-        for table, column, other, target in _REFERENCES:
-            query = f"SELECT DISTINCT {column} FROM {table} WHERE {column} NOT IN (SELECT {target} FROM {other})"
-            found += [f"{table}: {column} {value} is not in {other}" for (value,) in self._rows(query)]
-        return found
+        """Every damage found: pages, checksums of rows and blobs, rows that point nowhere, boxes that lie.
+
+        Empty when the file is sound. One pass over the file; about 0.1 s for 25 MB.
+        """
+        with self._guard:
+            before = self._database.text_factory
+            self._database.text_factory = _any_text
+            try:
+                with self.snapshot():
+                    return list(self._verify())
+            finally:
+                self._database.text_factory = before
+
+    def _damage(self) -> list[str]:
+        return self.verify()
+
+    def _verify(self) -> Iterator[str]:
+        for text in self._asked("PRAGMA integrity_check"):
+            yield from (f"SQLite: {t}" for t in text if t != "ok")
+        for text in self._asked("SELECT rtreecheck('instance_boxes')"):
+            yield from (f"instance_boxes: {t}" for t in text if t != "ok")
+        for name, table in summed_tables().items():
+            try:
+                if name in OWN_CRC:
+                    yield from map(str, own_crc_wrong(self._database, name, table.key))
+                yield from map(str, bad_rows_of(self._database, table))
+            except sqlite3.Error as error:
+                yield f"{name}: {error}"
+        for source, column, other, target in _REFERENCES:
+            query = f"SELECT DISTINCT {column} FROM {source} WHERE {column} NOT IN (SELECT {target} FROM {other})"
+            yield from (f"{source}: {column} {row[0]} is not in {other}" for row in self._asked(query))
+        query = (
+            "SELECT i.id, i.geometry, b.min_x, b.min_y, b.min_z, b.max_x, b.max_y, b.max_z FROM instances i"
+            " JOIN instance_boxes b USING (id)"
+        )
+        for row in self._asked(query):
+            if len(row) == 1 or not _holds(row[1], row[2:]):
+                yield f"instance_boxes {row[0]}: the box is not that of the instance"
+
+    def _asked(self, query: str) -> Iterator[tuple[Any, ...]]:
+        """Rows of a query; what SQLite says where it fails, as one row."""
+        try:
+            yield from self._database.execute(query)
+        except sqlite3.Error as error:
+            yield (str(error),)
+
+
+def _any_text(text: bytes) -> str:
+    return text.decode("utf-8", "surrogateescape")
+
+
+def _holds(geometry: object, box: tuple[float, ...]) -> bool:
+    """Whether a box of the R*Tree (lower, upper corner) is that of an instance, rounded outwards to 32 bits."""
+    if not isinstance(geometry, bytes) or len(geometry) != _GEOMETRY_BYTES:
+        return False
+    lower, upper = np.frombuffer(geometry, "<f8")[3:9].reshape(2, 3)
+    low, high = np.array(box[:3]), np.array(box[3:])
+    if not np.isfinite([lower, upper, low, high]).all():
+        return True
+    slack = 2.4e-7 * np.maximum(np.abs([lower, upper]), 1e-30)
+    return bool(((low <= lower) & (lower - low <= slack[0]) & (high >= upper) & (high - upper <= slack[1])).all())
