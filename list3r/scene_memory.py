@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from list3r.exporters.registry import export as export_memory
 from list3r.memory.records import Instance, Relation, Support
 from list3r.memory.store import Store
+from list3r.memory_edits import MemoryEdits
 from list3r.queries.match import Match
 from list3r.queries.nearest import nearest
 from list3r.queries.relations import relations
@@ -26,9 +27,12 @@ if TYPE_CHECKING:
     from list3r.frames.options import SourceOptions
 
 
-def open(path: str | Path) -> SceneMemory:
-    """Open a memory for reading. Raises `MemoryFileError` for anything that is not one."""
-    return SceneMemory(Store.open(path))
+def open(path: str | Path, *, writable: bool = False) -> SceneMemory:
+    """Open a memory, for reading or for editing too. Raises `MemoryFileError` for anything that is not one.
+
+    Many may read while one writes; a second writer is refused.
+    """
+    return SceneMemory(Store.open(path, writable=writable))
 
 
 def build(
@@ -53,8 +57,8 @@ def build(
     return open(memory)
 
 
-class SceneMemory:
-    """A memory that is open for reading; use it as a context manager or call `close`."""
+class SceneMemory(MemoryEdits):
+    """A memory that is open; use it as a context manager or call `close`."""
 
     def __init__(self, store: Store) -> None:
         self.store = store

@@ -13,7 +13,14 @@ from types import FrameType
 
 import typer
 
-from list3r.cli import build_commands, evaluation_commands, file_commands, memory_commands, query_commands
+from list3r.cli import (
+    build_commands,
+    edit_commands,
+    evaluation_commands,
+    file_commands,
+    memory_commands,
+    query_commands,
+)
 from list3r.memory.errors import List3rError
 
 app = typer.Typer(
@@ -25,7 +32,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (build_commands, memory_commands, query_commands, file_commands, evaluation_commands):
+for module in (
+    build_commands,
+    memory_commands,
+    query_commands,
+    edit_commands,
+    file_commands,
+    evaluation_commands,
+):
     module.register(app)
 
 _INTERRUPTED = 130

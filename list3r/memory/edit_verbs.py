@@ -30,6 +30,11 @@ class LogEntry:
 class EditVerbs(InstanceVerbs):
     """Reading and writing what operators said. Writing verbs are called inside `transaction()`."""
 
+    @property
+    def writable(self) -> bool:
+        """Whether the file was opened for writing."""
+        return self._lock is not None
+
     def log_entries(self) -> list[LogEntry]:
         """The merge log with its numbers, oldest first."""
         query = "SELECT entry, chunk_id, kind, a, b, scores, reason FROM merges ORDER BY entry"
@@ -100,7 +105,7 @@ def _edit(store: EditVerbs, row: tuple[Any, ...]) -> Edit:
             text=told["text"],
             target=told["target"],
         )
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise MemoryFileError(f"{store.path}: edit {entry} is damaged; run `list3r verify {store.path}`") from error
 
 

@@ -183,6 +183,8 @@ def _user() -> str:
 
 def _known(store: Store, instance_id: int) -> int:
     """The id that stands for an id today. Raises `UnknownIdError`, which says so of one that was deleted."""
+    if not 0 < instance_id < 2**63:
+        raise UnknownIdError(f"{store.path} has no instance {instance_id}; `list3r list {store.path}` shows the ids")
     try:
         return store.resolve(instance_id)
     except UnknownIdError:
