@@ -113,7 +113,9 @@ class Connection:
             if version < SCHEMA_VERSION:
                 _migrate(database, version)
             _use_write_ahead_log(database)
-            return cls(path, database, lock)
+            opened = cls(path, database, lock)
+            opened._rows("SELECT 1 FROM memory LIMIT 1")  # the first read of a new log ends what holds off checkpoints
+            return opened
         except BaseException as error:
             if database is not None:
                 database.close()
@@ -129,9 +131,9 @@ class Connection:
                 if self._sums is not None and self._sums.pending:
                     with self.transaction():
                         pass
-            with contextlib.suppress(sqlite3.Error):
-                self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-                self._database.execute("PRAGMA journal_mode=DELETE")
+            for statement in ("wal_checkpoint(TRUNCATE)", "journal_mode=DELETE"):
+                with contextlib.suppress(sqlite3.Error):
+                    self._database.execute(f"PRAGMA {statement}").fetchall()
         self._database.close()
         if self._lock is not None:
             self._lock.release()
@@ -307,7 +309,7 @@ def _use_write_ahead_log(database: sqlite3.Connection) -> None:
     end = time.monotonic() + _WAIT_S
     while True:
         try:
-            database.execute("PRAGMA journal_mode=WAL")
+            database.execute("PRAGMA journal_mode=WAL").fetchall()
             break
         except sqlite3.OperationalError as error:
             if "locked" not in str(error) or time.monotonic() > end:
