@@ -52,15 +52,24 @@ def add_chunk(
     chosen = settings or AssociationSettings()
     with store.transaction():
         chunk_id = store.add_chunk(session_id, result)
-        if store.get_value("poses") == "given":
+        given = _poses_given(store, session_id)
+        if given:
             store.add_edges(_edge_of_given_poses(store, session_id))
         else:
             store.add_edges(_adjacent_edge(store, session_id, chosen.edges, debug_dir))
+        if not given or len(store.sessions()) > 1:
             store.add_edges(find_loops(store, chunk_id, joint, chosen.revisits))
         place_chunks(store, chosen.graph)
         if library:
             consolidate(store, chunk_id)
     return chunk_id
+
+
+def _poses_given(store: Store, session_id: int) -> bool:
+    """Whether the source of a session said where its camera was; each session has a world of its own for that."""
+    chosen = {s.session_id: s.settings.get("poses") for s in store.sessions()}
+    first = min(chosen, default=session_id)
+    return (chosen.get(session_id) if session_id != first else store.get_value("poses")) == "given"
 
 
 def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_dir: Path | None) -> list[Edge]:

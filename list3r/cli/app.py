@@ -20,6 +20,7 @@ from list3r.cli import (
     file_commands,
     memory_commands,
     query_commands,
+    update_commands,
 )
 from list3r.memory.errors import List3rError
 
@@ -34,6 +35,7 @@ app = typer.Typer(
 )
 for module in (
     build_commands,
+    update_commands,
     memory_commands,
     query_commands,
     edit_commands,

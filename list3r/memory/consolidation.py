@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from list3r.memory.bodies import Body, aabb_gap
+from list3r.memory.changes import ChangeSettings, across_sessions, as_events, find_changes
 from list3r.memory.colors import Reference, color_words, main_color
 from list3r.memory.constraints import Constraints
 from list3r.memory.derive import DeriveSettings, Member, Thing, derive_mover, derive_thing, with_agreement
@@ -42,6 +43,7 @@ class ConsolidationSettings:
     relations: RelationSettings = field(default_factory=RelationSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     settling: SettlingSettings = field(default_factory=SettlingSettings)
+    changes: ChangeSettings = field(default_factory=ChangeSettings)
 
 
 @dataclass(frozen=True)
@@ -76,26 +78,32 @@ def consolidate(
     settled = settle(store, summaries, s.settling)
     chunks = settled.chunks
     motions = {(k, n): track for k, v in summaries.items() for n, track in v.motions.items()}
-    pairs = without_moving(
-        _known_pairs(store, settled, summaries), {k: v.shapes for k, v in summaries.items()}, motions
-    )
+    shapes = {k: v.shapes for k, v in summaries.items()}
+    pairs = without_moving(_known_pairs(store, settled, summaries), shapes, motions)
+    pairs = across_sessions(pairs, shapes, s.changes)
     word = store.constraints()
     groups, decisions = _partition(chunks, summaries, pairs, s.merging, word)
     groups, movers, joined = _with_movers(store, groups, chunks, summaries, motions, word, s)
     groups, movers = word.joined(groups, {c.chunk_id: c.component for c in chunks}, movers)
-    decisions += joined
-    before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
-    evidence = weigh(groups, {k: v.shapes for k, v in summaries.items()}, pairs, s.evidence)
-    weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
     posed = store.posed_count()
+    shown = word.shown(groups, [e.shown(s.evidence, posed) for e in weigh(groups, shapes, pairs, s.evidence)])
+    changes = find_changes(store, groups, shown, frozenset(movers), chunks, summaries, s.changes)
+    groups = changes.groups
+    decisions += joined + changes.decisions
+    before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
+    evidence = weigh(groups, shapes, pairs, s.evidence)
+    weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
     shown = word.shown(groups, [e.shown(s.evidence, posed) for e in evidence])
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
-    things = _things(store, groups, ids, evidence, chunks, summaries, s, movers)
+    things = _things(store, groups, ids, evidence, chunks, summaries, s, movers, changes.current)
     things = _with_structure(store, things, chunks, summaries, s)
+    states = {n: changes.states[g[0]] for g, n in zip(groups, ids.of_group, strict=True) if g[0] in changes.states}
     labels = {ids.of_group[n]: text for n, text in word.labels_of(groups, weights).items()}
-    _write(store, things, groups, ids, summaries, settled, labels)
-    store.replace_relations(None, _relations(store, things, chunks, summaries, s))
+    _write(store, things, groups, ids, summaries, settled, labels, states)
+    store.replace_events(as_events(changes, {g[0]: n for g, n in zip(groups, ids.of_group, strict=True)}))
+    here = [t for t in things if states.get(t.body.id) != "removed"]
+    store.replace_relations(None, _relations(store, here, chunks, summaries, s))
     _log(store, chunk_id if chunk_id is not None else chunks[-1].chunk_id, decisions, before, ids)
     return ConsolidationReport(
         instances=sum(t.body.structure is None for t in things),
@@ -214,6 +222,7 @@ def _things(
     summaries: Mapping[int, ChunkSummary],
     s: ConsolidationSettings,
     movers: Mapping[Key, Mover],
+    current: Mapping[Key, Sequence[Key]],
 ) -> list[Thing]:
     rows = {c.chunk_id: c for c in chunks}
     placed = {c.chunk_id: c.S_world_chunk for c in chunks}
@@ -230,11 +239,12 @@ def _things(
             continue
         component = rows[group[0][0]].component
         up = upright and component == first
-        members = [Member(shapes[k], _at(summaries, (k, n)), placed[k], dropped[k]) for k, n in group]
+        shown_by = current.get(group[0], group)
+        members = [Member(shapes[k], _at(summaries, (k, n)), placed[k], dropped[k]) for k, n in shown_by]
         poses = tuple((checks[k], placed[k].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
         cuts = b"".join(np.packbits(m.dropped[slice(*m.span)]).tobytes() for m in members)
         mover = movers.get(group[0])
-        key: tuple[object, ...] = (instance_id, component, up, tuple(group), poses, cuts, mover)
+        key: tuple[object, ...] = (instance_id, component, up, tuple(group), tuple(shown_by), poses, cuts, mover)
         if key not in before:
             if mover is None:
                 thing = derive_thing(instance_id, members, component, upright=up, settings=s.derive)
@@ -309,6 +319,7 @@ def _write(
     summaries: Mapping[int, ChunkSummary],
     settled: Settled,
     edited: Mapping[int | None, str | None],
+    states: Mapping[int | None, str],
 ) -> None:
     times = {(f.session_id, f.frame_index): f.time_s for f in store.frames()}
     metric = store.get_value("scale_kind", "metric") != "relative"
@@ -322,7 +333,12 @@ def _write(
     rows = {c.chunk_id: c for c in store.chunks()}
     seen_in = {n: [rows[k] for k in sorted({k for k, _ in g})] for g, n in zip(groups, ids.of_group, strict=True)}
     records = [
-        _moved(_record(t, labels.get(t.body.id), times, unit, light, metric=metric), settled.S_exact_settled[t.anchor])
+        replace(
+            _moved(
+                _record(t, labels.get(t.body.id), times, unit, light, metric=metric), settled.S_exact_settled[t.anchor]
+            ),
+            state=states.get(t.body.id, "present"),
+        )
         for t in things
     ]
     store.put_instances(replace(r, position_sigma_m=position_sigma(r.center, seen_in[r.id])) for r in records)

@@ -184,7 +184,7 @@ class InstanceVerbs(EmbeddingVerbs):
             np.concatenate([s.confidence for _, s in parts]) if parts else np.zeros(0, np.float32),
             np.concatenate([s.rgb for _, s in parts]) if parts else np.zeros((0, 3), np.uint8),
         )
-        if not instance.dynamic:
+        if not instance.dynamic and instance.state != "moved":
             return found
         slack = 0.05 * float(np.linalg.norm(np.ptp(instance.aabb, axis=0)))
         here = np.all((found.points >= instance.aabb[0] - slack) & (found.points <= instance.aabb[1] + slack), axis=1)

@@ -1,0 +1,200 @@
+"""A simulated home filmed twice, with things moved, removed and added in between; and redkitchen cut in two.
+
+python benchmarks/sessions.py --seeds 1,2,3,4,5 --json benchmarks/results/sessions.json
+
+The second walk goes the other way round and starts elsewhere. Placement: the rigid motion that is left between the
+second session's camera path and the truth when the world is laid on the truth by the first session alone. Ids: of the
+unchanged things that both memories found. Events: moved, removed and added against what was done to the world, over
+the changes of which the camera saw enough (150 px in some frame of each walk that should show it); `found` counts only
+those whose things the memory held before (for moved and removed) at all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, run_list3r, write_json
+from numpy.typing import NDArray
+
+from list3r.evaluation.scene import evaluate_scene, read_scene
+from list3r.evaluation.trajectory import Trajectory, align, associate, read_tum
+from list3r.memory.geometry import Sim3
+from list3r.memory.store import Store
+from list3r.simulation.changes import random_changes
+from list3r.simulation.dataset import WalkSettings, write_walk
+from list3r.simulation.walk import camera_path
+
+MIN_PX = 150
+KINDS = ("moved", "removed", "added")
+
+
+class ReturnWalk(WalkSettings):
+    """The same rooms the other way round."""
+
+    def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        tour = tuple(reversed(self.world().tour))
+        time_s, poses = camera_path(tour, None, self.path, self.walk_seed or 0)
+        return time_s[self.start :], poses[self.start :]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="1,2,3,4,5")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
+    parser.add_argument("--workers", default="1")
+    parser.add_argument("--redkitchen", type=Path, help="the sequence's folder; its two halves become two sessions")
+    words = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        root = words.keep or Path(scratch)
+        for seed in (int(word) for word in words.seeds.split(",") if word):
+            rows.append({"seed": seed, **one_home(root / str(seed), seed, words.workers)})
+            print(json.dumps(rows[-1]), flush=True)
+        halves = redkitchen(root, words.redkitchen, words.workers) if words.redkitchen else None
+    result: dict[str, Any] = {"seeds": rows, "total": total(rows)} | ({"redkitchen": halves} if halves else {})
+    print(machine())
+    print(json.dumps({k: v for k, v in result.items() if k != "seeds"}, indent=1))
+    write_json(words.json, result)
+
+
+def one_home(root: Path, seed: int, workers: str) -> dict[str, Any]:
+    """Film twice, build, update, measure."""
+    first = WalkSettings(seed=seed)
+    changes = random_changes(first.world(), seed, moved=3, removed=2, added=2)
+    if not (root / "first" / "truth.json").exists():
+        write_walk(root / "first", first)
+    if not (root / "second" / "truth.json").exists():
+        write_walk(root / "second", ReturnWalk(seed=seed, walk_seed=seed + 1000, start=40, changes=changes))
+    one, two = root / "one.l3r", root / "two.l3r"
+    if not one.exists():
+        run_list3r("build", str(root / "first"), "-m", str(one), "--poses", "estimate", "--workers", workers)
+    two.unlink(missing_ok=True)
+    shutil.copy(one, two)
+    report, usage = run_list3r("update", str(two), str(root / "second"), "--poses", "estimate", "--workers", workers)
+    with Store.open(one) as before, Store.open(two) as after:
+        figures = measure(before, after, root)
+    return {"placed": report["placed"], "chunks": report["chunks"], "ties": report["ties"], **usage, **figures}
+
+
+def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
+    """Placement, ids and events of an updated memory against the truth."""
+    truth = [read_tum(root / name / "groundtruth.txt") for name in ("first", "second")]
+    scenes = [read_scene(root / name / "truth.json") for name in ("first", "second")]
+    S_truth_one = _alignment(truth[0], _path(before, 1))
+    S_truth_two = _alignment(truth[0], _path(after, 1))
+    moved_m, turned_deg = _placement(truth[1], _path(after, 2), S_truth_two)
+    was = {e: t for t, e, _ in evaluate_scene(_scene(before), scenes[0], S_truth_one)["matched_ids"]}
+    now = {e: t for t, e, _ in evaluate_scene(_scene(after), scenes[1], S_truth_two)["matched_ids"]}
+    done = _changes(scenes)
+    unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
+    kept = sum(now.get(after.resolve(i)) == t for i, t in unchanged)
+    told = set()
+    for e in after.events(2):
+        if e.kind in KINDS:
+            thing = was.get(e.instance_id) if e.kind in ("moved", "removed") else now.get(e.instance_id)
+            told.add((e.kind, thing if thing is not None else -e.instance_id))
+    wrong = sorted((k, t) for k, t in told - done)
+    known = {t for t in was.values()} | {t for k, t in done if k == "added"}
+    return {
+        "placed_m": round(moved_m, 4),
+        "placed_deg": round(turned_deg, 3),
+        "unchanged": len(unchanged),
+        "ids_kept": kept,
+        "events": {k: _counts(told, done, k) for k in KINDS},
+        "missed": sorted((k, t, t in known) for k, t in done - told),
+        "false": wrong,
+        "false_removed_unseen": sum(k == "removed" and _unseen(scenes[1], t) for k, t in wrong),
+    }
+
+
+def _changes(scenes: Sequence[dict[str, Any]]) -> set[tuple[str, int]]:
+    """What was done to things of which the camera saw enough."""
+    a, b = ({e["id"]: e for e in s["instances"] if not e["structure"]} for s in scenes)
+    seen_a, seen_b = ({k for k, e in s.items() if e["largest_px"] >= MIN_PX} for s in (a, b))
+    out = {("removed", k) for k in seen_a - set(b)} | {("added", k) for k in seen_b - set(a)}
+    for k in seen_a & seen_b:
+        if np.linalg.norm(np.array(a[k]["box"]["center"]) - b[k]["box"]["center"]) > 0.05:
+            out.add(("moved", k))
+    return out
+
+
+def _unseen(scene: dict[str, Any], thing: int) -> bool:
+    return any(e["id"] == thing and e["largest_px"] == 0 for e in scene["instances"])
+
+
+def _counts(told: set[tuple[str, int]], done: set[tuple[str, int]], kind: str) -> dict[str, int]:
+    said, true = ({t for k, t in s if k == kind} for s in (told, done))
+    return {"hit": len(said & true), "false": len(said - true), "missed": len(true - said)}
+
+
+def _scene(store: Store) -> dict[str, Any]:
+    from list3r.exporters.scene_json import scene_dict
+
+    return scene_dict(store)
+
+
+def _path(store: Store, session: int) -> Trajectory:
+    poses = store.camera_poses(session)
+    T = np.array([Sim3(1.0, S.rotation, S.translation).as_matrix() for _, S in poses])
+    return Trajectory(np.array([f.time_s for f, _ in poses]), T)
+
+
+def _alignment(truth: Trajectory, estimate: Trajectory) -> Sim3:
+    rows, at = associate(truth.time_s, estimate.time_s, 0.01)
+    return align(truth.at(rows), estimate.at(at), with_scale=False)
+
+
+def _placement(truth: Trajectory, estimate: Trajectory, S_truth_world: Sim3) -> tuple[float, float]:
+    """Metres at the middle of the path, and degrees, by which the session as a whole lies off."""
+    rest = _alignment(truth, estimate) @ S_truth_world.inverse()
+    middle = S_truth_world.apply(np.median(estimate.T_world_cam[:, :3, 3], axis=0)[None])
+    turn = np.degrees(np.arccos(np.clip((np.trace(rest.rotation) - 1) / 2, -1, 1)))
+    return float(np.linalg.norm(rest.apply(middle) - middle)), float(turn)
+
+
+def total(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """All seeds together."""
+    if not rows:
+        return {}
+    out: dict[str, Any] = {
+        "placed_m_worst": max(r["placed_m"] for r in rows),
+        "placed_deg_worst": max(r["placed_deg"] for r in rows),
+        "ids_kept": round(sum(r["ids_kept"] for r in rows) / max(sum(r["unchanged"] for r in rows), 1), 4),
+        "false_removed_unseen": sum(r["false_removed_unseen"] for r in rows),
+    }
+    sums = {k: {n: sum(r["events"][k][n] for r in rows) for n in ("hit", "false", "missed")} for k in KINDS}
+    sums["all"] = {n: sum(s[n] for s in sums.values()) for n in ("hit", "false", "missed")}
+    for kind, s in sums.items():
+        out[kind] = {**s, "f1": round(2 * s["hit"] / max(2 * s["hit"] + s["false"] + s["missed"], 1), 4)}
+    return out
+
+
+def redkitchen(root: Path, source: Path, workers: str, cut: int = 500) -> dict[str, Any]:
+    """The first frames as one session, the rest as another: nothing has changed, so nothing may be said to."""
+    memory = root / "redkitchen.l3r"
+    memory.unlink(missing_ok=True)
+    common = ("--poses", "estimate", "--workers", workers)
+    run_list3r("build", str(source), "-m", str(memory), "--frames", f"0:{cut}", *common)
+    with Store.open(memory) as store:
+        before = {i.id: i for i in store.instances(structure=False)}
+    report, usage = run_list3r("update", str(memory), str(source), "--frames", f"{cut}:100000", *common)
+    with Store.open(memory) as store:
+        events = {e.instance_id: e for e in store.events(2)}
+        small = [k for k, i in before.items() if np.linalg.norm(i.box.size) < 0.4]
+        again = [k for k in small if k in events and events[k].kind == "seen_again"]
+        gone = [k for k in small if store.resolve(k) != k]
+    changed = [(e.kind, k) for k, e in events.items() if e.kind in KINDS]
+    small_things = {"small": len(small), "small_seen_again": len(again), "small_aliased": len(gone)}
+    return {**report["events"], "placed": report["placed"], **usage, **small_things, "false": changed}
+
+
+if __name__ == "__main__":
+    main()

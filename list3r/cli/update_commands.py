@@ -1,0 +1,117 @@
+"""update: one more video for a memory."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli import source_options as src
+from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
+
+if TYPE_CHECKING:
+    from list3r.updating import UpdateReport
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("update")(update)
+
+
+def update(
+    memory: MemoryArgument,
+    source: src.SourceArgument,
+    reconstruction: Annotated[str, typer.Option("--reconstruction", help="rgbd or auto.")] = "auto",
+    poses: Annotated[
+        str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
+    ] = "auto",
+    kind: src.Kind = "auto",
+    every: src.Every = 1,
+    frames: src.Frames = None,
+    intrinsics: src.Intrinsics = None,
+    distortion: src.Distortion = None,
+    depth_intrinsics: src.DepthIntrinsics = None,
+    depth_to_color: src.DepthToColor = None,
+    registered: src.Registered = False,
+    depth_scale: src.DepthScale = None,
+    fps: src.Fps = None,
+    chunk: Annotated[int, typer.Option("--chunk", help="Frames in a chunk.")] = 100,
+    overlap: Annotated[int, typer.Option("--overlap", help="Frames that neighbouring chunks share.")] = 30,
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
+    workers: Annotated[
+        int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an update that was interrupted.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Add one more video to a memory: it is placed against what is stored, and what has changed is written down.
+
+    Example: list3r update house.l3r walk-2/
+    """
+    words = {name: value for name, value in locals().items() if name in _SOURCE_WORDS}
+    from list3r.chunk_stage import BuildSettings
+    from list3r.frames.chunks import ChunkSettings
+
+    settings = BuildSettings(
+        reconstruction=reconstruction,
+        poses=poses,
+        chunks=ChunkSettings(length=chunk, overlap=overlap),
+        keep_pictures=pictures,
+    )
+    options = src.source_options(**words)
+    report = _run(memory, source, quiet=json, options=options, settings=settings, workers=workers, resume=resume)
+    if json:
+        print_json({"memory": str(memory), **report.as_dict()})
+    else:
+        print("\n".join(report_lines(memory, report)))
+
+
+def report_lines(memory: Path, report: UpdateReport) -> list[str]:
+    """What an update did, for people."""
+    events = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in report.events.items())
+    lines = [
+        f"{memory}  session {report.session}",
+        f"frames     {report.posed} of {report.frames} posed, {report.lost} lost, {report.bad} unreadable",
+        f"placed     {report.placed} of {report.chunks} chunks, by {report.ties} relations to earlier sessions",
+        f"things     {events}; {report.instances} in all",
+        f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
+    ]
+    return lines + [f"note: {line}" for line in report.notes]
+
+
+_SOURCE_WORDS = (
+    "kind",
+    "every",
+    "frames",
+    "intrinsics",
+    "distortion",
+    "depth_intrinsics",
+    "depth_to_color",
+    "registered",
+    "depth_scale",
+    "fps",
+)
+
+
+def _run(memory: Path, source: str, *, quiet: bool, **arguments: Any) -> UpdateReport:
+    """Update with a progress bar; Ctrl-C says how to go on."""
+    from tqdm import tqdm
+
+    from list3r.updating import update as update_memory
+
+    tqdm.monitor_interval = 0
+    with tqdm(unit="frame", desc="updating", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+            bar.refresh()
+
+        try:
+            return update_memory(memory, source, progress=progress, **arguments)
+        except KeyboardInterrupt:
+            bar.close()
+            note(f"\ninterrupted; {memory} keeps what it knew and the finished chunks: go on with --resume")
+            raise typer.Exit(1) from None

@@ -1,0 +1,126 @@
+"""What the frames of a session saw at a place: a surface there, free space through it, or nothing at all.
+
+The keyframes' small depth images are asked. A pixel speaks only together with its neighbours, so that neither the edge
+of a thing nor a small error of alignment looks like free space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.records import ChunkRow, Keyframe
+
+
+@dataclass(frozen=True)
+class VisibilitySettings:
+    """When depth speaks for a surface, and when for free space."""
+
+    tolerance_m: float = 0.025
+    """How far a surface may lie from where it is stored: alignment of two sessions."""
+    noise_per_m2: float = 0.0045
+    """Three deviations of depth at one metre; grows with the square of depth (structured light, 3 x 1.5 mm)."""
+    nearest_m: float = 0.3
+    """Closer than this nothing is measured."""
+    most_depth_m: float = 4.5
+    """Beyond this depth is too coarse to tell."""
+    least_points: int = 8
+    """Points of a thing that a frame must tell about."""
+    least_share: float = 0.4
+    """Share of a thing's points that a frame must tell about."""
+    gone: float = 0.55
+    """Share of what is told that must be free space for a thing to be gone from there;"""
+    there: float = 0.2
+    """and up to which it is still there."""
+    least_frames: int = 2
+    """Frames that must agree."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One keyframe in the world."""
+
+    session_id: int
+    frame_index: int
+    S_cam_world: Sim3
+    """World to the camera, chunk units."""
+    unit: float
+    """What a metre is in chunk units."""
+    depth: NDArray[np.float32]
+    """Chunk units, 0 where unknown. Shape (h, w)."""
+    camera: tuple[float, float, float, float]
+    """fx, fy, cx, cy of `depth`, px."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What frames tell about a place."""
+
+    verdict: str
+    """there, gone, unclear, unseen."""
+    free: float
+    """Share of what was told that is free space."""
+    frames: tuple[tuple[int, int], ...]
+    """(session id, Frame.index) of the frames that told, the most telling first."""
+
+
+def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyframe]], unit: float) -> list[View]:
+    """The keyframes of chunks that have depth, as they are placed now; `unit` is a metre in world units."""
+    out = []
+    for c in chunks:
+        for k in keyframes[c.chunk_id]:
+            if k.depth_small.size:
+                S_world_cam = c.S_world_chunk @ Sim3.from_matrix(k.T_chunk_cam)
+                in_chunk = unit / float(c.S_world_chunk.scale)
+                out.append(
+                    View(c.session_id, k.frame_index, S_world_cam.inverse(), in_chunk, k.depth_small, k.camera_small)
+                )
+    return out
+
+
+def look(points: Array, views: Iterable[View], settings: VisibilitySettings | None = None) -> Look:
+    """Ask frames about surface points of one thing, world coordinates, shape (N, 3)."""
+    s = settings or VisibilitySettings()
+    told = []
+    for view in views:
+        there, free = _told(points, view, s)
+        if there + free >= max(s.least_points, s.least_share * len(points)):
+            told.append((there + free, free, (view.session_id, view.frame_index)))
+    if not told:
+        return Look("unseen", 0.0, ())
+    shares = np.array([f / n for n, f, _ in told])
+    share = float(np.median(shares))
+    gone = shares >= s.gone
+    if share >= s.gone and gone.sum() >= s.least_frames:
+        verdict, kept = "gone", gone
+    elif share <= s.there:
+        verdict, kept = "there", shares <= s.there
+    else:
+        verdict, kept = "unclear", np.ones(len(told), bool)
+    best = sorted((t for t, k in zip(told, kept, strict=True) if k), key=lambda t: (-t[0], t[2]))
+    return Look(verdict, share, tuple(t[2] for t in best))
+
+
+def _told(points: Array, view: View, s: VisibilitySettings) -> tuple[int, int]:
+    """How many points of a surface one frame sees where they should be, and through how many it sees further."""
+    p = view.S_cam_world.apply(points)
+    fx, fy, cx, cy = view.camera
+    height, width = view.depth.shape
+    z = p[:, 2] / view.unit
+    p = p[(z > s.nearest_m) & (z < s.most_depth_m)]
+    column, row = np.rint(p[:, 0] / p[:, 2] * fx + cx), np.rint(p[:, 1] / p[:, 2] * fy + cy)
+    inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
+    p, column, row = p[inside], column[inside].astype(np.int64), row[inside].astype(np.int64)
+    if len(p) == 0:
+        return 0, 0
+    around = np.stack([view.depth[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]) / view.unit
+    z = p[:, 2] / view.unit
+    slack = s.tolerance_m + s.noise_per_m2 * z**2
+    met = (np.abs(around - z) <= slack).any(axis=0)
+    known = (around > 0).sum(axis=0) >= 6
+    free = known & (np.where(around > 0, around, np.inf) > z + slack).all(axis=0)
+    return int(met.sum()), int(free.sum())
