@@ -158,6 +158,17 @@ class Constraints:
         """To ask while groups are formed."""
         return Growing(self)
 
+    def forbids(self, a: Collection[Key], b: Collection[Key]) -> str:
+        """Why two whole groups must not be made one thing, or nothing."""
+        if not self:
+            return ""
+        growing = self.growing()
+        for group in (a, b):
+            first, *rest = sorted(group)
+            for key in rest:
+                growing.join(first, key)
+        return growing.objection(min(a), min(b))
+
     def pairs_apart(self, among: Collection[Key]) -> list[tuple[Key, Key]]:
         """Pairs that must not come together, of which one is among these."""
         wanted = set(among)

@@ -226,6 +226,7 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
     _give_back(store, bring_back, there, aliases)
     report = consolidate(store)
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    _check_effect(edit, home)
     now = {i.id: i.label for i in store.instances()}
     named = {n for keys, _ in store.constraints().labels for n in {home.get(k) for k in keys}}
     store.set_labels({n: text for n, text, _ in bring_back if n in now and n not in named})
@@ -253,6 +254,14 @@ def _give_back(store: Store, before: Before, there: Collection[int], aliases: Ma
             heir = store.resolve(instance_id) if instance_id in aliases else None
             own = [k for k in keys if home.get(k) in (None, heir)]
             store.set_observations(Observation(instance_id, *key) for key in own)
+
+
+def _check_effect(edit: Edit, home: Mapping[Key, int]) -> None:
+    """Raise an error, so that nothing is written, where other evidence was stronger than the operator's word."""
+    if edit.kind in ("merge", "split"):
+        left, right = ({home[k] for k in part if k in home} for part in edit.parts)
+        if left and right and (left == right) != (edit.kind == "merge"):
+            raise OptionError(f"the {edit.kind} does not come about: what was seen moving says otherwise")
 
 
 def _retired(
