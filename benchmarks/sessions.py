@@ -99,7 +99,8 @@ def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
     told = set()
     for e in after.events(2):
         if e.kind in KINDS:
-            thing = was.get(e.instance_id) if e.kind in ("moved", "removed") else now.get(e.instance_id)
+            then = was.get(e.instance_id) if e.kind in ("moved", "removed") else None
+            thing = now.get(e.instance_id) if then is None else then
             told.add((e.kind, thing if thing is not None else -e.instance_id))
     wrong = sorted((k, t) for k, t in told - done)
     known = {t for t in was.values()} | {t for k, t in done if k == "added"}

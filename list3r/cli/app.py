@@ -35,12 +35,12 @@ app = typer.Typer(
 )
 for module in (
     build_commands,
-    update_commands,
     memory_commands,
     query_commands,
     edit_commands,
     file_commands,
     evaluation_commands,
+    update_commands,
 ):
     module.register(app)
 

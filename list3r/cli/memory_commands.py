@@ -91,6 +91,7 @@ def list_instances(
     memory: MemoryArgument,
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
     min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")] = 0.0,
+    at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
     json: JsonOption = False,
 ) -> None:
     """List the instances with their place and size.
@@ -99,6 +100,10 @@ def list_instances(
     """
     with open_memory(memory) as scene:
         found = scene.instances(structure=None if structure else False)
+        if at is not None:
+            from list3r.memory.history import world_at
+
+            found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.units
     kept = [i for i in found if i.confidence >= min_confidence]
     if json:
@@ -113,10 +118,11 @@ def list_instances(
             i.confidence,
             i.observations,
             i.structure or ("dynamic" if i.dynamic else ""),
+            "" if i.state == "present" else i.state,
         ]
         for i in kept
     ]
-    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind"])
+    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind", "state"])
 
 
 def _triple(values: Any) -> str:

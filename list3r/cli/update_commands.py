@@ -1,4 +1,4 @@
-"""update: one more video for a memory."""
+"""update, query changes: one more video for a memory, and what it changed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli import source_options as src
+from list3r.cli.change_commands import changes
 from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
 
 if TYPE_CHECKING:
@@ -16,8 +17,11 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
+    """Add the commands to the program, after those of `query`."""
     app.command("update")(update)
+    for group in app.registered_groups:
+        if group.name == "query" and group.typer_instance is not None:
+            group.typer_instance.command("changes")(changes)
 
 
 def update(

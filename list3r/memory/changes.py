@@ -39,12 +39,18 @@ class ChangeSettings:
     """Between median colours (CIE L*a*b*, lightness at half weight) of two whole things that are not one;"""
     other_size: float = 2.0
     """or the ratio of their diagonals."""
-    moved_color: float = 12.0
+    moved_color: float = 10.0
     """The same for a thing that was moved: it must look"""
     moved_size: float = 1.45
-    """and measure the same,"""
+    """and measure the same, in height and in footprint,"""
     moved_cosine: float = 0.8
-    """and its feature must agree."""
+    """and its feature must agree;"""
+    moved_difference: float = 0.7
+    """and all of that together, as a share of these limits, must not differ more."""
+    replaced: float = 0.4
+    """Share of a new thing's surface that must lie where a thing stood that is gone, to be new there;"""
+    replaced_slack_m: float = 0.02
+    """within this."""
     least_frames: int = 12
     """Frames in which a thing must have been seen for its absence or presence to be an event."""
     most_structure: float = 0.5
@@ -146,7 +152,8 @@ class _Looks:
     """What a group looks like, over the members of some sessions."""
 
     lab: Array
-    size: float
+    extent: Array
+    """Larger and smaller side of the footprint, height; world units, upright where gravity is known. Shape (3,)."""
     feature: NDArray[np.float32]
 
 
@@ -172,10 +179,8 @@ class _Story:
         self._views: dict[tuple[int, int], list[View]] = {}
         self._sessions = [sorted({self._rows[k].session_id for k, _ in g}) for g in groups]
         self._component = [self._rows[g[0][0]].component for g in groups]
-        self._counts = [
-            bool(show) and g[0] not in fixed and self._flagged(g) < settings.most_structure
-            for g, show in zip(groups, shown, strict=True)
-        ]
+        self._movable = [g[0] not in fixed and self._flagged(g) < settings.most_structure for g in groups]
+        self._counts = [bool(show) and free for show, free in zip(shown, self._movable, strict=True)]
         self._thing = {n: _Thing([n], n) for n in range(len(groups))}
         self._events: list[tuple[int, Change]] = []
         self._decisions: list[MergeDecision] = []
@@ -185,6 +190,23 @@ class _Story:
     def tell(self, session: int) -> None:
         """What one session has changed."""
         components = {c.component for c in self._rows.values() if c.session_id == session}
+        gone = self._missing(session, components)
+        fresh = [n for n, s in enumerate(self._sessions) if s[0] == session and self._component[n] in components]
+        fresh = [n for n in fresh if self._counts[n] and self._known_before(n, session)]
+        looks = {n: self._look(n, session, before=False) for n in fresh}
+        for thing, place in self._moved(gone, fresh, session):
+            fresh.remove(place)
+            self._move(thing, place, session, looks[place])
+        gone = [(t, found) for t, found in gone if t.state == "unseen" and self._counts[t.now]]
+        for thing, found in gone:
+            self._remove(thing, session, found)
+        for n in fresh:
+            replaces = any(self._replaces(n, thing.now, session) for thing, _ in gone)
+            if looks[n].verdict == "gone" or replaces:
+                self._add(n, session, looks[n])
+
+    def _missing(self, session: int, components: set[int]) -> list[tuple[_Thing, Look]]:
+        """The things that are gone from where they were; all others that were known are given their state."""
         gone: list[tuple[_Thing, Look]] = []
         for thing in self._things():
             if self._sessions[thing.now][0] >= session or self._component[thing.now] not in components:
@@ -194,24 +216,13 @@ class _Story:
                 self._seen(thing, seen, session)
             elif thing.state != "removed":
                 thing.state = "unseen"
-                if self._counts[thing.now]:
+                if self._movable[thing.now] and self._frames(thing.now, session) >= self._s.least_frames:
                     found = self._look(thing.now, session, before=True)
-                    if found.verdict == "gone" and self._frames(thing.now, session) >= self._s.least_frames:
+                    if found.verdict == "gone":
                         gone.append((thing, found))
-                    elif found.verdict == "there":
+                    elif found.verdict == "there" and self._counts[thing.now]:
                         self._still_there(thing, session, found)
-        fresh = [n for n, s in enumerate(self._sessions) if s[0] == session and self._component[n] in components]
-        fresh = [n for n in fresh if self._counts[n] and self._known_before(n, session)]
-        looks = {n: self._look(n, session, before=False) for n in fresh}
-        for thing, place in self._moved(gone, fresh, session):
-            fresh.remove(place)
-            self._move(thing, place, session, looks[place])
-        for thing, found in gone:
-            if thing.state == "unseen":
-                self._remove(thing, session, found)
-        for n in fresh:
-            if looks[n].verdict == "gone":
-                self._add(n, session, looks[n])
+        return gone
 
     def _things(self) -> list[_Thing]:
         known: list[_Thing] = []
@@ -219,6 +230,14 @@ class _Story:
             if self._thing[n].places[0] == n:
                 known.append(self._thing[n])
         return known
+
+    def _replaces(self, n: int, place: int, session: int) -> bool:
+        """Whether a new thing stands where one stood that is gone."""
+        box = self._box(place, session, before=True)
+        inside = np.abs((self._points(n, session, before=False) - box.center) @ box.rotation)
+        slack = self._s.replaced_slack_m * self._unit
+        share = float(np.mean(np.all(inside <= box.size / 2 + slack, axis=1)))
+        return self._component[n] == self._component[place] and share >= self._s.replaced
 
     def _seen(self, thing: _Thing, places: list[int], session: int) -> None:
         place = thing.now if thing.now in places else max(places, key=lambda n: (self._frames_in(n, session), -n))
@@ -247,7 +266,8 @@ class _Story:
         thing = self._thing[place]
         thing.state = "added"
         box = self._box(place, session, before=False)
-        reason = f"{len(found.frames)} frames of earlier sessions see through its place"
+        seen = f"{len(found.frames)} frames of earlier sessions see through its place"
+        reason = seen if found.verdict == "gone" else "it stands where something else stood that is gone"
         self._tell(thing, session, "added", None, box, self._evidence(place, session), self._sure(found), reason)
 
     def _move(self, thing: _Thing, place: int, session: int, before: Look) -> None:
@@ -303,10 +323,11 @@ class _Story:
         """0 for things alike, from 1 for two that are not one."""
         s = self._s
         color = float(np.linalg.norm((a.lab - b.lab) * _LIGHTNESS)) / s.moved_color
-        size = abs(float(np.log(max(a.size, 1e-9) / max(b.size, 1e-9)))) / float(np.log(s.moved_size))
+        ratios = np.abs(np.log(np.maximum(a.extent, 1e-3) / np.maximum(b.extent, 1e-3)))
+        size = float(ratios.mean()) / float(np.log(s.moved_size))
         feature = (1.0 - float(a.feature @ b.feature)) / (1.0 - s.moved_cosine)
-        worst = max(color, size, feature)
-        return 0.5 * worst + 0.5 * float(np.mean([color, size, feature])) if worst < 1.0 else _NEVER
+        difference = float(np.mean([color, size, feature]))
+        return difference if max(color, size, feature) < 1.0 and difference < s.moved_difference else _NEVER
 
     # ------------------------------------------------------------------ what is asked
 
@@ -359,17 +380,33 @@ class _Story:
 
     def _looks(self, n: int, session: int, *, before: bool) -> _Looks:
         keys = self._members(n, session, before=before)
-        shapes = [(self._shapes[k], self._at(k, i), float(self._rows[k].S_world_chunk.scale)) for k, i in keys]
-        weight = np.array([max(len(c.frames[at]), 1) for c, at, _ in shapes], float)
-        whole = np.array([c.truncated[at] < self._s.most_truncated for c, at, _ in shapes])
-        size = np.array([c.size[at] * scale for c, at, scale in shapes])
-        feature = np.average([c.feature[at] for c, at, _ in shapes], axis=0, weights=weight)
+        shapes = [(self._shapes[k], self._at(k, i)) for k, i in keys]
+        weight = np.array([max(len(c.frames[at]), 1) for c, at in shapes], float)
+        feature = np.average([c.feature[at] for c, at in shapes], axis=0, weights=weight)
         length = float(np.linalg.norm(feature))
         return _Looks(
-            np.average([c.lab[at] for c, at, _ in shapes], axis=0, weights=weight),
-            float(np.median(size[whole]) if whole.any() else size.max()),
+            np.average([c.lab[at] for c, at in shapes], axis=0, weights=weight),
+            self._extent(n, session, before=before),
             np.asarray(feature / max(length, 1e-12), np.float32),
         )
+
+    def _extent(self, n: int, session: int, *, before: bool) -> Array:
+        """Median over its whole views, so that what one view took from its surroundings does not count."""
+        keys = self._members(n, session, before=before)
+        shapes = [self._shapes[k] for k, _ in keys]
+        whole = [c.truncated[self._at(*k)] < self._s.most_truncated for c, k in zip(shapes, keys, strict=True)]
+        sizes = []
+        for c, key, is_whole in zip(shapes, keys, whole, strict=True):
+            start, stop = np.searchsorted(c.owner, [self._at(*key), self._at(*key) + 1])
+            if stop > start and (is_whole or not any(whole)):
+                points = self._rows[key[0]].S_world_chunk.apply(c.points[start:stop])
+                sizes.append(self._sides(fit_box(points, upright=self._upright, trim=_SPREAD)))
+        return np.median(sizes, axis=0) if sizes else np.ones(3)
+
+    def _sides(self, box: OrientedBox) -> Array:
+        if not self._upright:
+            return np.sort(box.size)[::-1]
+        return np.array([*np.sort(box.size[:2])[::-1], box.size[2]])
 
     def _flagged(self, group: Sequence[Key]) -> float:
         return float(np.mean([self._shapes[k].structure[self._at(k, i)] for k, i in group]))
@@ -418,6 +455,8 @@ class _Story:
 
 
 _NEVER = 1e3
+_SPREAD = 0.04
+"""Share of points outside the box at either end by which things are compared."""
 _FIELDS = ("session_id", "kind", "from_box", "to_box", "frames", "confidence", "reason")
 
 

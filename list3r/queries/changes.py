@@ -1,0 +1,65 @@
+"""What sessions have changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from list3r.memory.errors import OptionError
+from list3r.memory.records import ChangeEvent, Instance
+from list3r.memory.store import Store
+
+KINDS = ("moved", "removed", "added", "seen_again")
+
+
+@dataclass(frozen=True)
+class Changed:
+    """One thing that a session showed in a new light."""
+
+    instance: Instance
+    """As it is today."""
+    event: ChangeEvent
+    """What happened, where from and where to, and the frames that show it."""
+
+    @property
+    def distance_m(self) -> float | None:
+        """How far the middle of it went, world units; None for what was removed or added."""
+        if self.event.from_box is None or self.event.to_box is None:
+            return None
+        return float(np.linalg.norm(self.event.to_box.center - self.event.from_box.center))
+
+    @property
+    def score(self) -> float:
+        """How sure it is, in [0, 1]."""
+        return self.event.confidence
+
+    @property
+    def reason(self) -> str:
+        """Why, in words."""
+        return self.event.reason
+
+
+def changes(
+    store: Store, since: int | None = None, kinds: tuple[str, ...] = KINDS[:3], min_confidence: float = 0.0
+) -> list[Changed]:
+    """What was moved, removed and added in the sessions after `since` (all where it is None), the newest session first.
+
+    Within a session by kind, the surest first. A thing that no frame could look at has no event. Raises `OptionError`
+    for a session or a kind that there is not.
+    """
+    sessions = [s.session_id for s in store.sessions()]
+    if since is not None and since not in sessions:
+        raise OptionError(f"{store.path} has no session {since}; it has {', '.join(map(str, sessions))}")
+    if wrong := [k for k in kinds if k not in KINDS]:
+        raise OptionError(f"kind of change {wrong[0]!r} is not known; choose one of: {', '.join(KINDS)}")
+    if not 0.0 <= min_confidence <= 1.0:
+        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    wanted = [
+        e
+        for e in store.events()
+        if e.kind in kinds and e.confidence >= min_confidence and (since is None or e.session_id > since)
+    ]
+    things = {i.id: i for i in store.instances()}
+    found = [Changed(things[e.instance_id], e) for e in wanted if e.instance_id in things]
+    return sorted(found, key=lambda c: (-c.event.session_id, KINDS.index(c.event.kind), -c.score, c.event.instance_id))
