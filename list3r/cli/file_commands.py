@@ -1,4 +1,4 @@
-"""export, verify, doctor: the file and the machine."""
+"""export, verify, repair, doctor: the file and the machine."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     app.command("export")(export)
     app.command("verify")(verify)
+    app.command("repair")(repair)
     app.command("doctor")(doctor)
 
 
@@ -49,11 +50,43 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         print_json({"sound": not found, "damage": found, "sessions": state, "chunks": chunks})
     elif found:
         print("\n".join(found))
+        print(f"`list3r repair {memory}` saves what is sound")
     else:
         unfinished = "; the build is unfinished, go on with --resume" if "building" in state else ""
         print(f"{memory} is sound: {chunks} chunks{unfinished}")
     if found:
         raise typer.Exit(1)
+
+
+def repair(
+    memory: MemoryArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Write the sound file there; default: in its place.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Salvage a damaged memory: keep every sound row, derive the rest anew, say what is lost. The original is kept.
+
+    Example: list3r repair house.l3r
+    """
+    from list3r.memory.repair import repair as salvage
+
+    report = salvage(memory, out)
+    if json:
+        print_json(report.as_dict())
+        return
+    if not report.damage:
+        where = "nothing was changed" if out is None else f"{out} is a copy"
+        print(f"{memory} is sound; {where}")
+        return
+    print(f"{report.memory} is sound: {report.chunks} chunks, {report.instances} instances")
+    print(f"the damaged file is {report.original}")
+    for kind, names in report.lost.items():
+        print(f"lost {kind.replace('_', ' ')}: {', '.join(names)}")
+    if not report.lost:
+        print("nothing is lost")
+    elif report.rebuilt:
+        print("instances and relations were derived anew from what is left")
 
 
 def doctor(json: JsonOption = False) -> None:

@@ -192,7 +192,8 @@ class Connection:
                 yield
             finally:
                 if self._database.in_transaction:
-                    self._database.execute("COMMIT")
+                    with contextlib.suppress(sqlite3.DatabaseError):  # nothing was written; damage was met on the way
+                        self._database.execute("ROLLBACK")
 
     def get_value(self, key: str, default: Any = None) -> Any:
         """A value of the key-value table, decoded from JSON.

@@ -22,7 +22,7 @@ _REFERENCES = (
     ("instances", "id", "instance_boxes", "id"),
     ("instance_boxes", "id", "instances", "id"),
 )
-_GEOMETRY_BYTES = 24 * 8
+GEOMETRY_BYTES = 24 * 8
 
 
 class Store(EditVerbs, EventVerbs):
@@ -41,6 +41,13 @@ class Store(EditVerbs, EventVerbs):
                     return list(self._verify())
             finally:
                 self._database.text_factory = before
+
+    def index_boxes(self) -> None:
+        """Fill the R*Tree anew from the instances; call inside `transaction()`."""
+        rows = self._rows("SELECT id, geometry FROM instances ORDER BY id")
+        boxes = [(i, *np.frombuffer(g, "<f8")[3:9].reshape(2, 3).T.ravel().tolist()) for i, g in rows]
+        self._database.execute("DELETE FROM instance_boxes")
+        self._database.executemany("INSERT INTO instance_boxes VALUES (?, ?, ?, ?, ?, ?, ?)", boxes)
 
     def _damage(self) -> list[str]:
         return self.verify()
@@ -82,7 +89,7 @@ def _any_text(text: bytes) -> str:
 
 def _holds(geometry: object, box: tuple[float, ...]) -> bool:
     """Whether a box of the R*Tree (lower, upper corner) is that of an instance, rounded outwards to 32 bits."""
-    if not isinstance(geometry, bytes) or len(geometry) != _GEOMETRY_BYTES:
+    if not isinstance(geometry, bytes) or len(geometry) != GEOMETRY_BYTES:
         return False
     lower, upper = np.frombuffer(geometry, "<f8")[3:9].reshape(2, 3)
     low, high = np.array(box[:3]), np.array(box[3:])
