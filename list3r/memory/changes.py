@@ -176,6 +176,7 @@ class _Story:
         self._unit = world_unit(chunks, summaries)
         self._upright = store.get_value("gravity", "unknown") != "unknown"
         self._store = store
+        self._word = store.constraints()
         self._views: dict[tuple[int, int], list[View]] = {}
         self._sessions = [sorted({self._rows[k].session_id for k, _ in g}) for g in groups]
         self._component = [self._rows[g[0][0]].component for g in groups]
@@ -312,7 +313,12 @@ class _Story:
             old = self._looks(thing.now, session, before=True)
             taken = {s for n in thing.places for s in self._sessions[n]}
             for j, n in enumerate(fresh):
-                if not taken.intersection(self._sessions[n]) and self._component[n] == self._component[thing.now]:
+                apart = self._word.forbids([k for p in thing.places for k in self._groups[p]], self._groups[n])
+                if (
+                    not apart
+                    and not taken.intersection(self._sessions[n])
+                    and self._component[n] == self._component[thing.now]
+                ):
                     cost[i, j] = self._difference(old, self._looks(n, session, before=False))
         rows, columns = linear_sum_assignment(cost)
         return [
