@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.registry import export as export_memory
-from list3r.memory.records import Instance, Relation, Support
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance, Support
 from list3r.memory.store import Store
 from list3r.memory_edits import MemoryEdits
-from list3r.queries.match import Match
+from list3r.queries.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame
+from list3r.queries.find import Found, TextEncoder, find
+from list3r.queries.match import FilterOptions, Match
 from list3r.queries.nearest import nearest
-from list3r.queries.relations import relations
+from list3r.queries.path import path
+from list3r.queries.relations import Place, Relations, relations
+from list3r.queries.seen import Sightings, seen, visible
 from list3r.queries.similar import similar
+from list3r.queries.tables import Table, Value, records_of
 from list3r.queries.within import within
 
 if TYPE_CHECKING:
@@ -25,6 +33,21 @@ if TYPE_CHECKING:
 
     from list3r.chunk_stage import BuildSettings
     from list3r.frames.options import SourceOptions
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concatenate[SceneMemory, P], R]:
+    """One thread at a time: the file's connection and what is kept for the next question are shared by all of them."""
+
+    @functools.wraps(method)
+    def guarded(self: SceneMemory, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return guarded
 
 
 def open(path: str | Path, *, writable: bool = False) -> SceneMemory:
@@ -58,10 +81,15 @@ def build(
 
 
 class SceneMemory(MemoryEdits):
-    """A memory that is open; use it as a context manager or call `close`."""
+    """A memory that is open; use it as a context manager or call `close`.
+
+    No question writes to the file. Several threads may ask one `SceneMemory`: their questions take turns. For questions
+    side by side open the file once in each thread or process; a writer does not disturb them.
+    """
 
     def __init__(self, store: Store) -> None:
         self.store = store
+        self._lock = threading.RLock()
 
     @property
     def path(self) -> Path:
@@ -71,66 +99,213 @@ class SceneMemory(MemoryEdits):
     @property
     def units(self) -> str:
         """`m` when lengths are metres, `unit` when the memory has no known scale."""
-        return "unit" if self.store.get_value("scale_kind") == "relative" else "m"
+        with self._lock:
+            return "unit" if self.store.get_value("scale_kind") == "relative" else "m"
 
     @property
     def gravity(self) -> str:
         """known, estimated (z is up in both) or unknown."""
-        return str(self.store.get_value("gravity", "unknown"))
+        with self._lock:
+            return str(self.store.get_value("gravity", "unknown"))
 
+    @_alone
     def instances(self, *, structure: bool | None = False) -> list[Instance]:
         """All things by id; the structure of the room with `structure=True`, both with None."""
         return self.store.instances(structure=structure)
 
+    @_alone
     def instance(self, instance_id: int) -> Instance:
         """One instance, by its id or by any id it ever had. Raises `UnknownIdError`."""
         return self.store.instance(instance_id)
 
+    @_alone
     def support(self, instance_id: int) -> Support:
         """Surface points of an instance, world coordinates."""
         return self.store.support(instance_id)
 
+    @_alone
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a moving (`dynamic`) instance was: seconds (V,) and places in the world (V, 3); nothing for others."""
         return self.store.track(instance_id)
 
-    def nearest(self, target: str | int | Sequence[float] | NDArray[Any], k: int = 5, **filters: Any) -> list[Match]:
+    @_alone
+    def nearest(
+        self,
+        target: str | int | ArrayLike,
+        k: int = 5,
+        *,
+        max_distance: float | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
         """The k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
 
-        Filters: see `list3r.queries.nearest.nearest`.
+        Distances are between surfaces and between centres. For the filters (`structure`, `min_confidence`, `state`,
+        `label`, `color`, `min_size`, `max_size`, `component`, `dynamic`) see `list3r.queries.match.Filters`.
+
+            >>> memory.nearest((0.5, 1.2, 0.8), k=3, color="red", max_distance=1.0)
         """
         if isinstance(target, str):
-            return nearest(self.store, words=target, k=k, **filters)
+            return nearest(self.store, words=target, k=k, max_distance=max_distance, **filters)
         if isinstance(target, int | np.integer):
-            return nearest(self.store, instance_id=int(target), k=k, **filters)
-        return nearest(self.store, point=target, k=k, **filters)
+            return nearest(self.store, instance_id=int(target), k=k, max_distance=max_distance, **filters)
+        return nearest(self.store, point=target, k=k, max_distance=max_distance, **filters)
 
-    def within(self, **region: Any) -> list[Match]:
-        """Things in a box (`lower`, `upper`) or a sphere (`center`, `radius`); see `list3r.queries.within.within`."""
-        return within(self.store, **region)
+    @_alone
+    def within(
+        self,
+        *,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        center: ArrayLike | None = None,
+        radius: float | None = None,
+        camera: Camera | None = None,
+        max_depth: float | None = None,
+        occlusion: bool = True,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """Things in a box (`lower`, `upper`), a sphere (`center`, `radius`) or the frustum of a `camera`.
 
-    def similar(self, instance_id: int, k: int = 5) -> list[Match]:
-        """The things that look most like an instance."""
-        return similar(self.store, instance_id=instance_id, k=k)
+        A camera comes from `memory.camera(...)`; what other things hide from it is left out unless `occlusion` is off.
 
+            >>> memory.within(camera=memory.camera(frame=120), max_depth=3.0)
+        """
+        return within(
+            self.store,
+            lower=lower,
+            upper=upper,
+            center=center,
+            radius=radius,
+            camera=camera,
+            max_depth=max_depth,
+            occlusion=occlusion,
+            **filters,
+        )
+
+    @_alone
+    def similar(
+        self,
+        target: int | ArrayLike,
+        k: int = 5,
+        *,
+        space: str | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """The things that look most like an instance (its id), or like a vector of a named embedding space."""
+        if isinstance(target, int | np.integer):
+            return similar(self.store, instance_id=int(target), space=space, k=k, **filters)
+        return similar(self.store, vector=target, space=space, k=k, **filters)
+
+    @_alone
+    def find(
+        self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: TextEncoder | None = None
+    ) -> Found:
+        """The things that a text describes, the best first; nothing where nothing fits, with `notes` that say why.
+
+        Words are matched with labels, descriptions, colours and sizes; an id may stand for a thing. Left, right, front
+        and behind are told from `viewpoint`, else as in the picture that shows the other thing best. An `encoder` of
+        an embedding space that the memory holds stands in where no thing bears a word.
+
+            >>> memory.find("white mug on table")
+            >>> memory.find("the biggest red thing near the door", k=1)
+        """
+        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder)
+
+    @_alone
+    def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
+        """When and in which frames an instance was seen; stretches with breaks of at most `gap_s` count as one."""
+        return seen(self.store, instance_id, gap_s=gap_s)
+
+    @_alone
+    def visible(
+        self,
+        camera: Camera,
+        *,
+        min_visible: float = 0.1,
+        max_depth: float | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """What a camera sees: all of which at least a share of `min_visible` is not hidden by other things.
+
+        >>> memory.visible(memory.camera(time_s=12.5))
+        """
+        return visible(self.store, camera, min_visible=min_visible, max_depth=max_depth, **filters)
+
+    @_alone
+    def camera(
+        self,
+        *,
+        frame: int | None = None,
+        time_s: float | None = None,
+        position: ArrayLike | None = None,
+        quat_wxyz: ArrayLike | None = None,
+        session: int | None = None,
+    ) -> Camera:
+        """The camera of a posed `frame`, of the posed frame nearest to `time_s`, or one put at a pose.
+
+        A pose is a `position` in the world and the rotation R_world_cam (OpenCV axes) as a quaternion w, x, y, z.
+        Raises `OptionError` unless one of the three is given.
+        """
+        posed = position is not None and quat_wxyz is not None
+        if (frame is not None) + (time_s is not None) + posed != 1 or (position is None) != (quat_wxyz is None):
+            raise OptionError(
+                "name a camera by its frame, by a time, or by a position with a quaternion: one of the three"
+            )
+        if frame is not None:
+            return camera_of_frame(self.store, frame, session)
+        if time_s is not None:
+            return camera_at_time(self.store, time_s, session)
+        assert position is not None and quat_wxyz is not None
+        return camera_at_pose(self.store, position, quat_wxyz, session)
+
+    @_alone
     def relations(
-        self, subject: int | None = None, predicate: str | None = None, object: int | None = None
-    ) -> list[Relation]:
-        """Relations that match what is given. Raises `OptionError` for a predicate that there is not."""
-        return relations(self.store, subject=subject, predicate=predicate, object=object)
+        self,
+        subject: int | str | None = None,
+        predicate: str | None = None,
+        object: int | str | None = None,
+        min_confidence: float = 0.0,
+        *,
+        viewpoint: Place | None = None,
+        other: int | str | None = None,
+    ) -> Relations:
+        """Relations that match what is given (ids or words); `state` is unknown where the memory cannot tell.
 
+        With `viewpoint` (an id, "camera", "camera:FRAME" or a point) also left_of, right_of, in_front_of and behind;
+        `between` with `object` and `other`. Raises `OptionError` for a predicate that there is not.
+
+            >>> memory.relations(predicate="left_of", object=4, viewpoint=(0.0, 0.0, 1.5))
+            >>> memory.relations(predicate="between", object=4, other=7)
+        """
+        return relations(self.store, subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
+
+    @_alone
+    def path_between(self, start: int, end: int, *, structure: bool = True) -> Relations:
+        """The fewest relations that lead from one instance to another; not over floor and walls without `structure`."""
+        return path(self.store, start, end, structure=structure)
+
+    @_alone
+    def to_records(self, table: Table = "instances") -> list[dict[str, Value]]:
+        """The instances, relations or frames as flat dicts: what `pandas.DataFrame` and its like take as they are.
+
+        >>> pandas.DataFrame(memory.to_records()).set_index("id")
+        """
+        return records_of(self.store, table)
+
+    @_alone
     def relation_graph(self) -> networkx.MultiDiGraph:
         """Instances and relations as a graph."""
         from list3r.memory.graphs import relation_graph
 
         return relation_graph(self.store)
 
+    @_alone
     def merge_graph(self) -> networkx.Graph:
         """Local instances, and the decisions that joined them, as a graph."""
         from list3r.memory.graphs import merge_graph
 
         return merge_graph(self.store)
 
+    @_alone
     def export(self, format: str, path: str | Path) -> tuple[Path, ...]:
         """Write the memory in a format: json, usd, ply, glb, tum, plan. Raises `OptionError` and `ExportError`.
 
@@ -139,6 +314,7 @@ class SceneMemory(MemoryEdits):
         with self.store.snapshot():
             return export_memory(self.store, format, path)
 
+    @_alone
     def close(self) -> None:
         """Close the file."""
         self.store.close()
@@ -149,4 +325,4 @@ class SceneMemory(MemoryEdits):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        self.store.__exit__(kind, error, trace)

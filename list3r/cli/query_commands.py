@@ -1,30 +1,42 @@
-"""query nearest, within, relations, similar."""
+"""query nearest, within, relations, similar, find, seen, path."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, parse_point, print_json, print_table
-from list3r.cli.memory_commands import instance_dict
+from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, parse_point, print_json, print_table
+from list3r.cli.query_output import (
+    Color,
+    Component,
+    Count,
+    Label,
+    MaxDepth,
+    MaxSize,
+    MinConfidence,
+    MinSize,
+    Pose,
+    SessionOption,
+    State,
+    Structure,
+    Time,
+    View,
+    camera_from,
+    match_dict,
+    print_matches,
+    print_relations,
+)
 
-if TYPE_CHECKING:
-    from list3r.queries.match import Match
-
-Count = Annotated[int, typer.Option("-k", help="How many at most.")]
-MinConfidence = Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")]
-Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
+query_app = typer.Typer(help="Ask a memory.", no_args_is_help=True, rich_markup_mode=None)
+"""The group that the commands of questions belong to."""
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
-    query = typer.Typer(help="Ask a memory.", no_args_is_help=True, rich_markup_mode=None)
-    query.command("nearest")(nearest)
-    query.command("within")(within)
-    query.command("relations")(relations)
-    query.command("similar")(similar)
-    app.add_typer(query, name="query")
+    for command in (nearest, within, relations, similar, find, seen, path):
+        query_app.command(command.__name__)(command)
+    app.add_typer(query_app, name="query")
 
 
 def nearest(
@@ -34,7 +46,13 @@ def nearest(
     id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Distance from this instance.")] = None,
     k: Count = 5,
     max_distance: Annotated[float | None, typer.Option("--max-distance", help="Surfaces no further than this.")] = None,
+    label: Label = None,
+    color: Color = None,
+    min_size: MinSize = None,
+    max_size: MaxSize = None,
     min_confidence: MinConfidence = 0.0,
+    state: State = None,
+    component: Component = None,
     structure: Structure = False,
     json: JsonOption = False,
 ) -> None:
@@ -45,18 +63,24 @@ def nearest(
     filters: dict[str, Any] = {
         "k": k,
         "max_distance": max_distance,
+        "label": label,
+        "color": color,
+        "min_size": min_size,
+        "max_size": max_size,
         "min_confidence": min_confidence,
+        "state": state,
+        "component": component,
         "structure": structure,
     }
     with open_memory(memory) as scene:
         from list3r.memory.errors import OptionError
-        from list3r.queries.nearest import nearest as find
+        from list3r.queries.nearest import nearest as ask
 
         if words is None and point is None and id is None:
             raise OptionError("say what to be near to: --point x,y,z, --id ID, or words such as mug")
         origin = None if point is None else parse_point(point, "--point")
-        matches = find(scene.store, words=words, point=origin, instance_id=id, **filters)
-        _print_matches(matches, scene.units, json)
+        matches = ask(scene.store, words=words, point=origin, instance_id=id, **filters)
+        print_matches(matches, scene.units, json)
 
 
 def within(
@@ -66,103 +90,211 @@ def within(
     ] = None,
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Centre of a sphere.")] = None,
     radius: Annotated[float | None, typer.Option("--radius", help="Radius of the sphere.")] = None,
+    view: View = None,
+    pose: Pose = None,
+    session: SessionOption = None,
+    max_depth: MaxDepth = None,
+    occlusion: Annotated[bool, typer.Option(help="Whether a camera does not see what other things hide.")] = True,
+    label: Label = None,
+    color: Color = None,
+    min_size: MinSize = None,
+    max_size: MaxSize = None,
     min_confidence: MinConfidence = 0.0,
     structure: Structure = False,
     json: JsonOption = False,
 ) -> None:
-    """The things inside a box or a sphere.
+    """The things inside a box, a sphere, or what a camera sees.
 
     Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
     """
     from list3r.memory.errors import OptionError
 
-    region: dict[str, Any] = {"min_confidence": min_confidence, "structure": structure}
-    if box is not None and (point is not None or radius is not None):
-        raise OptionError("give either --box or --point with --radius, not both")
+    region: dict[str, Any] = {
+        "max_depth": max_depth,
+        "occlusion": occlusion,
+        "label": label,
+        "color": color,
+        "min_size": min_size,
+        "max_size": max_size,
+        "min_confidence": min_confidence,
+        "structure": structure,
+    }
+    sphere = point is not None or radius is not None
+    if (box is not None) + sphere + (view is not None) + (pose is not None) > 1:
+        raise OptionError("give one region: --box, --point with --radius, --view or --pose")
     if box is not None:
         parts = box.split(",")
         region["lower"] = parse_point(",".join(parts[:3]), "--box")
         region["upper"] = parse_point(",".join(parts[3:]), "--box")
     elif point is not None and radius is not None:
         region |= {"center": parse_point(point, "--point"), "radius": radius}
-    else:
-        raise OptionError("give a region: --box x,y,z,x,y,z or --point x,y,z with --radius")
+    elif view is None and pose is None:
+        raise OptionError("give a region: --box x,y,z,x,y,z, --point x,y,z with --radius, --view FRAME or --pose")
     with open_memory(memory) as scene:
-        _print_matches(scene.within(**region), scene.units, json)
+        region["camera"] = camera_from(scene, view, None, pose, session)
+        print_matches(scene.within(**region), scene.units, json)
 
 
 def relations(
     memory: MemoryArgument,
-    subject: Annotated[int | None, typer.Option("--subject", metavar="ID", help="Who stands in the relation.")] = None,
-    predicate: Annotated[
-        str | None, typer.Option("--predicate", help="on, in, next_to, near, above, below, ...")
+    subject: Annotated[
+        str | None, typer.Option("--subject", metavar="ID|WORDS", help="Who stands in the relation.")
     ] = None,
-    object: Annotated[int | None, typer.Option("--object", metavar="ID", help="To whom.")] = None,
+    predicate: Annotated[
+        str | None, typer.Option("--predicate", help="on, in, next_to, near, above, left_of, behind, between, ...")
+    ] = None,
+    object: Annotated[str | None, typer.Option("--object", metavar="ID|WORDS", help="To whom.")] = None,
+    other: Annotated[
+        str | None, typer.Option("--and", metavar="ID|WORDS", help="The second object of between.")
+    ] = None,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="ID|camera|X,Y,Z",
+            help="Who looks, for left_of, right_of, in_front_of and behind: from the centre of an instance, from "
+            "where the camera was last (camera) or in a frame (camera:FRAME), or from a point; towards the middle "
+            "of the two.",
+        ),
+    ] = None,
     min_confidence: MinConfidence = 0.0,
     json: JsonOption = False,
 ) -> None:
-    """Relations by any of subject, predicate and object.
+    """Relations by any of subject, predicate and object; unknown where the memory cannot tell.
 
-    Example: list3r query relations house.l3r --predicate on --object 4
+    Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
     """
     with open_memory(memory) as scene:
-        from list3r.queries.relations import relations as find
-
-        found = find(scene.store, subject=subject, predicate=predicate, object=object, min_confidence=min_confidence)
-        names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
-        gravity, units = scene.gravity, scene.units
-    if json:
-        print_json({"gravity": gravity, "units": units, "relations": [vars(r) for r in found]})
-        return
-    rows = [
-        [r.subject, names[r.subject], r.predicate, r.object, names[r.object], r.confidence, r.margin] for r in found
-    ]
-    print_table(rows, ["id", "subject", "predicate", "id", "object", "conf", f"margin ({units})"])
+        found = scene.relations(subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
+        print_relations(scene, found, json)
 
 
 def similar(
     memory: MemoryArgument,
     id: Annotated[int, typer.Option("--id", metavar="ID", help="Things like this one.")],
     k: Count = 5,
+    label: Label = None,
+    color: Color = None,
+    min_size: MinSize = None,
+    max_size: MaxSize = None,
+    min_confidence: MinConfidence = 0.0,
+    structure: Structure = False,
     json: JsonOption = False,
 ) -> None:
     """The things that look most like one.
 
     Example: list3r query similar house.l3r --id 12
     """
+    filters: dict[str, Any] = {
+        "label": label,
+        "color": color,
+        "min_size": min_size,
+        "max_size": max_size,
+        "min_confidence": min_confidence,
+        "structure": structure,
+    }
     with open_memory(memory) as scene:
-        _print_matches(scene.similar(id, k=k), scene.units, json)
+        print_matches(scene.similar(id, k=k, **filters), scene.units, json)
 
 
-def _print_matches(matches: list[Match], units: str, json: bool) -> None:
+def find(
+    memory: MemoryArgument,
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="What it is and how it stands.", show_default=False)],
+    k: Count = 5,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option("--from", metavar="ID|camera|X,Y,Z", help="Who looks, for left, right, in front of and behind."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """The things that a text describes: attributes, a noun, relations; ids may stand for things.
+
+    Example: list3r query find house.l3r "white mug on table"
+    """
+    with open_memory(memory) as scene:
+        found, units = scene.find(text, k, viewpoint=viewpoint), scene.units
     if json:
-        entries = [
+        print_json(
             {
-                "id": m.instance.id,
-                "score": m.score,
-                "distance": m.distance_m,
-                "center_distance": m.center_distance_m,
-                "units": units,
-                "reason": m.reason,
-                "instance": instance_dict(m.instance),
+                "matches": [match_dict(m, units) for m in found],
+                "ambiguous": found.ambiguous,
+                "unknown_words": list(found.unknown_words),
+                "notes": list(found.notes),
             }
-            for m in matches
-        ]
-        print_json(entries)
+        )
         return
-    rows = [
-        [
-            m.instance.id,
-            m.instance.label or m.instance.description,
-            m.score,
-            _length(m.distance_m),
-            _length(m.center_distance_m),
-            m.reason,
+    print_matches(found, units, json=False)
+    for line in found.notes:
+        note(f"note: {line}")
+
+
+def seen(
+    memory: MemoryArgument,
+    instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
+    time: Time = None,
+    view: View = None,
+    pose: Pose = None,
+    session: SessionOption = None,
+    max_depth: MaxDepth = None,
+    structure: Structure = False,
+    json: JsonOption = False,
+) -> None:
+    """When an instance was seen, or what was to be seen at a time, in a frame, or from a pose.
+
+    Example: list3r query seen house.l3r --time 12.5
+    """
+    from list3r.memory.errors import OptionError
+
+    with open_memory(memory) as scene:
+        camera = camera_from(scene, view, time, pose, session)
+        if (camera is None) == (instance_id is None):
+            raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
+        if camera is not None:
+            found = scene.visible(camera, max_depth=max_depth, structure=structure)
+            if camera.frame is not None and not json:
+                note(f"frame {camera.frame.frame_index} of session {camera.session_id}, {camera.frame.time_s:.2f} s")
+            print_matches(found, scene.units, json)
+            return
+        assert instance_id is not None
+        sightings = scene.seen(instance_id)
+        name = scene.instance(sightings.instance_id)
+    spans = [{"session": n, "from_s": start, "to_s": end} for n, start, end in sightings.spans_s]
+    if json:
+        frames = [
+            {
+                "session": f.session_id,
+                "frame": f.frame_index,
+                "time_s": f.time_s,
+                "box_xyxy": list(f.box_xyxy),
+                "visible": f.visible_fraction,
+            }
+            for f in sightings.frames
         ]
-        for m in matches
-    ]
-    print_table(rows, ["id", "what", "score", f"surface ({units})", f"centre ({units})", "why"])
+        print_json({"id": sightings.instance_id, "spans": spans, "frames": frames})
+        return
+    print(f"{name.id}  {name.label or name.description}: seen in {len(sightings.frames)} frames")
+    rows = []
+    for s in spans:
+        inside = [
+            f.frame_index
+            for f in sightings.frames
+            if f.session_id == s["session"] and s["from_s"] <= f.time_s <= s["to_s"]
+        ]
+        rows.append([s["session"], f"{s['from_s']:.2f}", f"{s['to_s']:.2f}", inside[0], inside[-1], len(inside)])
+    print_table(rows, ["session", "from (s)", "to (s)", "first frame", "last frame", "frames"])
 
 
-def _length(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+def path(
+    memory: MemoryArgument,
+    start: Annotated[int, typer.Argument(metavar="ID", help="From this instance.", show_default=False)],
+    end: Annotated[int, typer.Argument(metavar="ID", help="To this one.", show_default=False)],
+    structure: Annotated[bool, typer.Option(help="Whether the way may lead over floor and walls.")] = True,
+    json: JsonOption = False,
+) -> None:
+    """How two things hang together: the fewest relations that lead from one to the other.
+
+    Example: list3r query path house.l3r 12 4
+    """
+    with open_memory(memory) as scene:
+        found = scene.path_between(start, end, structure=structure)
+        print_relations(scene, found, json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -157,7 +158,9 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
             return by_vector
         search.unknown += unknown
         bear = ", ".join(repr(w) for w in unknown)
-        search.notes.append(f"nothing in this memory bears the word{'s' if len(unknown) > 1 else ''} {bear}")
+        names = ", ".join(_names(search.things.values()))
+        hint = f"; things here are called: {names}" if names else ""
+        search.notes.append(f"nothing in this memory bears the word{'s' if len(unknown) > 1 else ''} {bear}{hint}")
         return []
     structure = not STRUCTURE.isdisjoint(phrase.words) or bool(
         phrase.words
@@ -170,6 +173,13 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
             reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
             out.append(_Candidate(i, score, reasons))
     return out
+
+
+def _names(things: Iterable[Instance], most: int = 12) -> list[str]:
+    """What most things are called: the last words of labels and descriptions."""
+    said = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
+    count = Counter(word for words in said for word in words)
+    return [word for word, _ in sorted(count.items(), key=lambda c: (-c[1], c[0]))[:most]]
 
 
 def _bears(search: _Search, n: int, words: Sequence[str]) -> bool:

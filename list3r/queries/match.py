@@ -110,6 +110,8 @@ class Filters:
         )
 
 
+_MOST = 1_000_000_000
+"""Answers that anybody can want."""
 _LARGEST_ID = 2**63 - 1
 """Of what a file holds."""
 
@@ -125,7 +127,7 @@ def checked_count(k: int) -> int:
     """A count of answers, at least 1. Raises `OptionError`."""
     if k < 1:
         raise OptionError(f"k = {k}: ask for at least 1 answer")
-    return int(k)
+    return min(int(k), _MOST)
 
 
 def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
