@@ -48,7 +48,7 @@ def cameras(target: tuple[float, float, float], start: float, turn: float = 1.6)
     """Poses on an arc around a point of the room, looking down at it. Shape (FRAMES, 4, 4)."""
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     for pose, angle in zip(poses, start + np.linspace(0.0, turn, FRAMES), strict=True):
-        eye = np.array(target) + [1.3 * np.cos(angle), 1.3 * np.sin(angle), 1.0]
+        eye = np.array(target) + np.array([1.3 * np.cos(angle), 1.3 * np.sin(angle), 1.0])
         forward = (np.array(target) - eye) / np.linalg.norm(np.array(target) - eye)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
