@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from list3r.chunk_stage import BuildSettings
     from list3r.frames.options import SourceOptions
     from list3r.memory.errors import List3rError
-    from list3r.scene_memory import SceneMemory, build, open
+    from list3r.scene_memory import SceneMemory, build, open, update
 
 __version__ = "0.1.0"
-__all__ = ["BuildSettings", "List3rError", "SceneMemory", "SourceOptions", "__version__", "build", "open"]
+__all__ = ["BuildSettings", "List3rError", "SceneMemory", "SourceOptions", "__version__", "build", "open", "update"]
 
 _HOMES = {
     "BuildSettings": "list3r.chunk_stage",
@@ -30,6 +30,7 @@ _HOMES = {
     "SceneMemory": "list3r.scene_memory",
     "build": "list3r.scene_memory",
     "open": "list3r.scene_memory",
+    "update": "list3r.scene_memory",
 }
 
 

@@ -14,10 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.registry import export as export_memory
 from list3r.memory.errors import OptionError
+from list3r.memory.history import world_at
 from list3r.memory.records import Instance, Support
 from list3r.memory.store import Store
 from list3r.memory_edits import MemoryEdits
 from list3r.queries.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame
+from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, TextEncoder, find
 from list3r.queries.match import FilterOptions, Match
 from list3r.queries.nearest import nearest
@@ -80,6 +82,26 @@ def build(
     return open(memory)
 
 
+def update(
+    memory: str | Path,
+    source: str | Path,
+    *,
+    options: SourceOptions | None = None,
+    settings: BuildSettings | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+) -> SceneMemory:
+    """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
+
+    The arguments are those of `build`. A video in which no stored place is recognised is kept apart, in a component of
+    its own. Raises `SourceError`, `OptionError` or `MemoryFileError`, each with the way to mend it.
+    """
+    from list3r import updating
+
+    updating.update(memory, source, options=options, settings=settings, workers=workers, resume=resume)
+    return open(memory)
+
+
 class SceneMemory(MemoryEdits):
     """A memory that is open; use it as a context manager or call `close`.
 
@@ -112,6 +134,16 @@ class SceneMemory(MemoryEdits):
     def instances(self, *, structure: bool | None = False) -> list[Instance]:
         """All things by id; the structure of the room with `structure=True`, both with None."""
         return self.store.instances(structure=structure)
+
+    @_alone
+    def instances_at(self, session_id: int) -> list[Instance]:
+        """All things, structure too, as they were after a session. Raises `OptionError` for one that there is not."""
+        return world_at(self.store, session_id)
+
+    @_alone
+    def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> list[Changed]:
+        """What was moved, removed and added in the sessions after `since`, the newest session first."""
+        return changes(self.store, since, min_confidence=min_confidence)
 
     @_alone
     def instance(self, instance_id: int) -> Instance:
