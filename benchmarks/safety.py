@@ -1,0 +1,445 @@
+"""What a memory survives: kill -9 while it is built and edited, readers beside a writer, flipped bytes, truncation.
+
+    python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --json benchmarks/results/safety.json
+
+Every process is real and is killed by the kernel. After each kill the file must verify, and hold all that was committed
+before; a build goes on with --resume and in the end must give the scene of a build that was left alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from list3r.exporters.scene_json import scene_dict
+from list3r.memory.connection import remove_memory
+from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.records import MergeDecision, Observation, Relation
+from list3r.memory.repair import repair
+from list3r.memory.store import Store
+
+Result = dict[str, Any]
+BUILD = ("--poses", "given", "--chunk", "12", "--overlap", "4", "--workers", "1")
+
+
+# ------------------------------------------------------------------------------------------- kills
+
+
+def _build_command(walk: Path, memory: Path, *more: str) -> list[str]:
+    return [sys.executable, "-m", "list3r", "build", str(walk), "-m", str(memory), *BUILD, *more]
+
+
+def kill_builds(walk: Path, folder: Path, kills: int, seed: int = 0) -> Result:
+    """Kill builds at random moments; each goes on from what is there, and begins anew once it is done."""
+    rng = random.Random(seed)
+    whole = folder / "whole.l3r"
+    started = time.monotonic()
+    subprocess.run(_build_command(walk, whole), check=True, capture_output=True)
+    length = time.monotonic() - started
+    with Store.open(whole) as store:
+        wanted = scene_dict(store)
+    memory = folder / "killed.l3r"
+    counts: Counter[str] = Counter()
+    problems: list[str] = []
+    while counts["kills"] < kills:
+        committed = _chunks(memory)
+        process = subprocess.Popen(
+            _build_command(walk, memory, "--resume"), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            _, text = process.communicate(timeout=rng.uniform(0.2, 1.0) * length)
+        except subprocess.TimeoutExpired:
+            before = _chunks(memory)
+            process.kill()
+            process.communicate()
+            counts["kills"] += 1
+            counts["with chunks committed"] += before > 0
+            problems += _judge(memory, max(committed, before))
+            continue
+        counts["builds completed"] += 1
+        if process.returncode != 0:
+            problems.append(f"--resume failed: {text.strip()}")
+        else:
+            with Store.open(memory) as store:
+                if scene_dict(store) != wanted:
+                    problems.append("the resumed build differs from the one that was left alone")
+        remove_memory(memory)
+    final = subprocess.run(_build_command(walk, memory, "--resume"), check=False, capture_output=True, text=True)
+    counts["builds completed"] += 1
+    problems += _judge(memory, 0) + ([f"--resume failed: {final.stderr}"] if final.returncode else [])
+    with Store.open(memory) as store:
+        if scene_dict(store) != wanted:
+            problems.append("the last build differs from the one that was left alone")
+    return {**counts, "problems": problems}
+
+
+def _chunks(memory: Path) -> int:
+    """Chunks that a reader sees now."""
+    try:
+        with Store.open(memory) as store:
+            return len(store.chunks())
+    except MemoryFileError:
+        return 0
+
+
+def _judge(memory: Path, committed: int) -> list[str]:
+    """What is wrong with a memory after a kill."""
+    if not memory.exists():
+        return [f"{committed} committed chunks are gone with the file"] if committed else []
+    try:
+        with Store.open(memory) as store:
+            found = store.verify()
+            held = len(store.chunks())
+    except Exception as error:  # whatever it is, it is a problem to report
+        return [f"{type(error).__name__}: {error}"]
+    return [*found, *([f"{committed} chunks were committed, {held} are left"] if held < committed else [])]
+
+
+def edit_for_ever(path: str, first: int) -> None:
+    """Edit one transaction after another and say the number of each once it is committed."""
+    with Store.open(path, writable=True) as store:
+        ids = [i.id for i in store.instances()]
+        n = first
+        while True:
+            n += 1
+            with store.transaction():
+                write_edit(store, ids, n)
+            sys.stdout.write(f"{n}\n")
+            sys.stdout.flush()
+
+
+def write_edit(store: Store, ids: list[int], n: int) -> None:
+    """One edit in several tables, all of which say `n`."""
+    from dataclasses import replace
+
+    store.set_value("edit", n)
+    store.put_instances([replace(store.instance(k), label=f"edit {n}") for k in ids])
+    store.log_decisions(1, [MergeDecision("edit", f"#{n}", "#0", {"n": n}, "an edit")])
+    pair = [ids[n % len(ids)], ids[(n + 1) % len(ids)]]
+    store.replace_relations([pair[0]], [Relation(pair[0], "near", pair[1], 1.0, float(n))])
+
+
+def edits_in(store: Store) -> set[int]:
+    """Numbers of edits that the tables speak of; one number where none is torn."""
+    logged = [int(d.scores["n"]) for d in store.decisions() if d.kind == "edit"]
+    labels = {i.label for i in store.instances()}
+    if logged != list(range(1, len(logged) + 1)):
+        return {-1}
+    return {int(store.get_value("edit", 0)), len(logged), *(int((x or "edit 0").split()[1]) for x in labels)}
+
+
+def kill_edits(memory: Path, kills: int, seed: int = 0) -> Result:
+    """Kill a process that edits a memory, at random moments."""
+    rng = random.Random(seed)
+    problems: list[str] = []
+    done = 0
+    for _ in range(kills):
+        process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).resolve()), "--edit", str(memory), str(done)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(rng.uniform(0.0, 0.25))
+        process.kill()
+        said = [line for line in process.communicate()[0].splitlines(keepends=True) if line.endswith("\n")]
+        least = int(said[-1]) if said else done + 1
+        problems += _judge(memory, 0)
+        with Store.open(memory) as store:
+            found = edits_in(store)
+        if len(found) != 1 or not least <= max(found) <= least + 1:
+            problems.append(f"edit {least} was committed, the memory speaks of {sorted(found)}")
+        done = max(found)
+    return {"kills": kills, "edits": done, "problems": problems}
+
+
+# ------------------------------------------------------------------------------------------- readers
+
+
+def write_and_read(memory: Path, seconds: float, readers: int = 8) -> Result:
+    """One process that writes, opening and closing the memory now and then, and others that read all the while."""
+    context = multiprocessing.get_context("spawn")
+    queue: Any = context.Queue()
+    ready: Any = context.Barrier(readers + 1)
+    work: list[tuple[Callable[..., None], int]] = [(_write, 0), *((_read, k) for k in range(readers))]
+    processes = [context.Process(target=_worker, args=(f, str(memory), seconds, k, queue, ready)) for f, k in work]
+    for process in processes:
+        process.start()
+    reports = [queue.get(timeout=seconds + 300) for _ in processes]
+    for process in processes:
+        process.join()
+    total: Counter[str] = Counter()
+    for name, count, _ in reports:
+        total[name] += count
+    with Store.open(memory) as store:
+        problems = store.verify()
+    return {
+        "readers": readers,
+        "seconds": seconds,
+        **total,
+        "problems": problems + [p for *_, ps in reports for p in ps],
+    }
+
+
+def _worker(work: Callable[..., Any], memory: str, seconds: float, k: int, queue: Any, ready: Any) -> None:
+    """Run one process and report what it met; all begin together."""
+    problems: list[str] = []
+    count = 0
+    name = "transactions" if work is _write else "snapshots"
+    try:
+        ready.wait(timeout=300)
+        end = time.time() + seconds
+        while time.time() < end and not problems:
+            count += work(memory, min(end, time.time() + 1.0), k, problems)
+    except Exception as error:  # whatever it is, it is a problem to report
+        problems.append(f"{name}: {type(error).__name__}: {error}")
+    queue.put((name, count, problems))
+
+
+def _write(memory: str, end: float, _: int, problems: list[str]) -> int:
+    count = 0
+    with Store.open(memory, writable=True) as store:
+        kept = {i.id: i for i in store.instances()}
+        nodes = [(n.chunk_id, n.local_id) for n in store.local_nodes()]
+        n = int(store.get_value("round", 0))
+        while time.time() < end:
+            n += 1
+            with store.transaction():
+                _write_round(store, list(kept.values()), nodes, n)
+            count += 1
+    return count
+
+
+def _write_round(store: Store, instances: list[Any], nodes: list[tuple[int, int]], n: int) -> None:
+    """All instances get new ids, and everything that points to them follows."""
+    from dataclasses import replace
+
+    old = [i.id for i in store.instances()]
+    for k in old:
+        store.drop_instance(k, None)
+    fresh = [replace(i, id=1 + 10 * n + k, label=f"round {n}") for k, i in enumerate(instances[: 3 + n % 4])]
+    ids = [i.id for i in fresh]
+    store.put_instances(fresh)
+    store.clear_observations()
+    store.set_observations(Observation(ids[k % len(ids)], *node) for k, node in enumerate(nodes))
+    store.put_embeddings("test@1/16", ids, np.full((len(ids), 16), n, np.float32))
+    store.replace_relations(None, [Relation(a, "near", b, 1.0, 0.0) for a in ids for b in ids if a != b])
+    store.set_value("round", n)
+    store.set_value("held", len(ids))
+
+
+def _read(memory: str, end: float, k: int, problems: list[str]) -> int:
+    count = 0
+    with Store.open(memory) as store:
+        while time.time() < end:
+            with store.snapshot():
+                problems += torn(store)
+            count += 1
+            if problems:
+                break
+    return count
+
+
+def torn(store: Store) -> list[str]:
+    """What does not fit together in one snapshot."""
+    instances = store.instances()
+    ids = {i.id for i in instances}
+    n, held = store.get_value("round", 0), store.get_value("held", len(ids))
+    found = []
+    if len(ids) != held:
+        found.append(f"{len(ids)} instances, {held} are counted")
+    if n and {i.label for i in instances} != {f"round {n}"}:
+        found.append("instances of several rounds")
+    if not {o.instance_id for o in store.observations()} <= ids:
+        found.append("an observation of an instance that is not there")
+    if n and len(store.relations()) != held * (held - 1):
+        found.append("relations are missing")
+    if set(store.ids_in_box([-1e3] * 3, [1e3] * 3)) != ids:
+        found.append("the R*Tree holds other instances")
+    vectors = store.embeddings("test@1/16")
+    if n and (set(vectors[0].tolist()) != ids or not (vectors[1] == n).all()):
+        found.append("vectors of another round")
+    return found
+
+
+# ------------------------------------------------------------------------------------------- flips
+
+
+def flip(memory: Path, folder: Path, count: int, seed: int = 0) -> Result:
+    """Damage copies of a memory and look at what opening, reading and `verify` make of it; in a process of its own."""
+    outcomes: Counter[str] = Counter()
+    problems: list[str] = []
+    context = multiprocessing.get_context("spawn")
+    batch = 100
+    for first in range(0, count, batch):
+        queue: Any = context.Queue()
+        arguments = (str(memory), str(folder), range(first, min(first + batch, count)), seed, queue)
+        process = context.Process(target=_flip_batch, args=arguments)
+        process.start()
+        found: list[tuple[str, str]] = []
+        while True:
+            try:
+                found.append(queue.get(timeout=1.0))
+            except Exception:
+                if not process.is_alive() and queue.empty():
+                    break
+        process.join()
+        if process.exitcode != 0:
+            problems.append(f"a crash with status {process.exitcode} after {len(found)} of {arguments[2]}")
+        outcomes.update(outcome for outcome, _ in found)
+        problems += [text for outcome, text in found if outcome in ("traceback", "silent")]
+    return {"damages": count, **outcomes, "problems": problems}
+
+
+def _flip_batch(memory: str, folder: str, numbers: range, seed: int, queue: Any) -> None:
+    original = Path(memory).read_bytes()
+    with Store.open(memory) as store:
+        wanted = answers(store)
+    copy = Path(folder) / f"flipped-{numbers.start}.l3r"
+    for n in numbers:
+        rng = random.Random(seed * 1_000_003 + n)
+        remove_memory(copy)
+        data, what = damaged(original, rng)
+        copy.write_bytes(data)
+        queue.put(outcome_of(copy, wanted, what))
+    remove_memory(copy)
+
+
+def damaged(original: bytes, rng: random.Random) -> tuple[bytes, str]:
+    """A copy with one byte changed, or, one time in ten, cut short."""
+    if rng.random() < 0.1:
+        length = rng.randrange(len(original))
+        return original[:length], f"cut to {length} bytes"
+    at = rng.randrange(100) if rng.random() < 0.05 else rng.randrange(len(original))
+    data = bytearray(original)
+    data[at] ^= rng.randrange(1, 256)
+    return bytes(data), f"byte {at} changed from {original[at]} to {data[at]}"
+
+
+def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
+    """(detected at open, detected by reading, detected by verify, harmless, silent or traceback, what was done)."""
+    try:
+        store = Store.open(copy)
+    except MemoryFileError:
+        return "detected at open", what
+    except Exception as error:
+        return "traceback", f"{what}: {type(error).__name__}: {error}"
+    said = "detected by verify"
+    got = None
+    try:
+        with store:
+            got = answers(store)
+    except List3rError:
+        said = "detected by reading"
+    except Exception as error:
+        return "traceback", f"{what}: {type(error).__name__}: {error}"
+    try:
+        with Store.open(copy) as again:
+            if again.verify():
+                return said, what
+    except MemoryFileError:
+        return said, what
+    if said == "detected by reading":
+        return "silent", f"{what}: reading fails, verify finds nothing"
+    return ("harmless", what) if same(got, wanted) else ("silent", what)
+
+
+def answers(store: Store) -> list[Any]:
+    """All that a memory can be asked."""
+    out: list[Any] = [scene_dict(store), sorted(store.aliases().items()), [repr(d) for d in store.decisions()]]
+    for chunk in store.chunks():
+        out += [chunk.S_world_chunk.as_matrix(), *(k.depth_small for k in store.keyframes(chunk.chunk_id))]
+        out += [store.frame_samples(chunk.chunk_id).points, store.cannot_links(chunk.chunk_id)]
+    for instance in store.instances():
+        out.append(store.support(instance.id).points)
+    for o in store.observations():
+        out += store.mask_track(o.chunk_id, o.local_id).masks
+    out += [store.embeddings(space) for space in store.embedding_spaces()]
+    return out + [f.T_chunk_cam for f in store.frames()] + [e.S_v_u.as_matrix() for e in store.edges()]
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two answers are equal, arrays to the bit."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return bool(a == b)
+
+
+def repair_flips(memory: Path, folder: Path, count: int, seed: int = 1) -> Result:
+    """Damage copies and repair them: the result must verify, or the command must say why it cannot be done."""
+    original = memory.read_bytes()
+    outcomes: Counter[str] = Counter()
+    problems: list[str] = []
+    for n in range(count):
+        copy, out = folder / "broken.l3r", folder / "mended.l3r"
+        remove_memory(copy)
+        remove_memory(out)
+        data, what = damaged(original, random.Random(seed * 1_000_003 + n))
+        copy.write_bytes(data)
+        try:
+            report = repair(copy, out)
+            outcomes["nothing lost" if not report.lost else "repaired with losses"] += 1
+            with Store.open(out) as store:
+                problems += [f"{what}: {text}" for text in store.verify()]
+        except MemoryFileError:
+            outcomes["refused"] += 1
+        except Exception as error:
+            problems.append(f"{what}: {type(error).__name__}: {error}")
+    return {"damages": count, **outcomes, "problems": problems}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200, help="kills in all; a third of them while building")
+    parser.add_argument("--minutes", type=float, default=5.0, help="how long eight readers and a writer run")
+    parser.add_argument("--flips", type=int, default=1000)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--edit", nargs=2, help=argparse.SUPPRESS)
+    words = parser.parse_args()
+    if words.edit:
+        edit_for_ever(words.edit[0], int(words.edit[1]))
+    from machine import machine, write_json
+
+    from list3r.simulation.dataset import WalkSettings, write_walk
+
+    print(machine())
+    result: Result = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        walk = write_walk(folder / "walk", WalkSettings(seed=3, frames=44, size=(160, 120)), workers=1)
+        builds = words.kills // 3
+        result["kills while building"] = kill_builds(walk, folder, builds)
+        memory = folder / "whole.l3r"
+        result["flips"] = flip(memory, folder, words.flips)
+        result["repairs"] = repair_flips(memory, folder, words.flips // 10)
+        result["file_mb"] = round(memory.stat().st_size / 1e6, 2)
+        started = time.process_time()
+        with Store.open(memory) as store:
+            store.verify()
+        result["verify_s"] = round(time.process_time() - started, 3)
+        result["kills while editing"] = kill_edits(memory, words.kills - builds)
+        result["readers"] = write_and_read(folder / "killed.l3r", 60 * words.minutes)
+    for key, value in result.items():
+        print(key, json.dumps(value, indent=2))
+    write_json(words.json, result)
+    if any(isinstance(v, dict) and v["problems"] for v in result.values()):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
