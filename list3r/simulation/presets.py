@@ -231,16 +231,15 @@ def _film_loop(take: _Take) -> None:
     if take.rng.integers(2):
         there, back = rows[0][::-1], rows[1]
     director, frames = take.director(), int(take.rng.integers(1120, 1280))
-    first = director.plan_views(there[0], 2, 120.0)
-    director.film(first)
+    director.film(director.plan_views(there[0], 2, 120.0))
     for room in (*there[1:], *back):
         director.film(director.plan_views(room, 1, 90.0))
     if not back:
         director.walk_to(there[-1].doorways[0])
         director.walk_to(there[0].doorways[0])
-    director.film(first[:1])
+    director.film(director.plan_views(there[0], 1, 120.0))
     take.fit(director, round(frames * take.rng.uniform(0.74, 0.82)))
-    director.film(first[1:])
+    director.film(director.plan_views(there[0], 1, 120.0))
     for room in there[1:]:
         director.film(director.plan_views(room, 2, 120.0))
     take.shoot(director, frames)
