@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store import Store
@@ -17,12 +18,15 @@ class MemoryEdits:
     """What an operator can put right. Edits are kept with their author and hold for all that is added later."""
 
     store: Store
+    _lock: AbstractContextManager[Any]
+    """Threads take turns."""
 
     def merge(self, a: int, b: int, *, author: str | None = None) -> EditReport:
         """Two instances are one thing; the older id stays, the other becomes its alias for ever."""
         from list3r.memory import edits
 
-        return edits.merge(self._writable(), a, b, author)
+        with self._lock:
+            return edits.merge(self._writable(), a, b, author)
 
     def split(
         self, instance_id: int, out: Sequence[tuple[int, int]] | None = None, *, author: str | None = None
@@ -30,31 +34,36 @@ class MemoryEdits:
         """An instance is two: `out` (chunk id, local id) leaves it, or what the evidence parts from it best."""
         from list3r.memory import edits
 
-        return edits.split(self._writable(), instance_id, out, author)
+        with self._lock:
+            return edits.split(self._writable(), instance_id, out, author)
 
     def label(self, instance_id: int, text: str | None, *, author: str | None = None) -> EditReport:
         """Name an instance; None takes the name away."""
         from list3r.memory import edits
 
-        return edits.label(self._writable(), instance_id, text, author)
+        with self._lock:
+            return edits.label(self._writable(), instance_id, text, author)
 
     def delete(self, instance_id: int, *, author: str | None = None) -> EditReport:
         """Take an instance out, with all that is seen of it later."""
         from list3r.memory import edits
 
-        return edits.delete(self._writable(), instance_id, author)
+        with self._lock:
+            return edits.delete(self._writable(), instance_id, author)
 
     def undo(self, entry: int | None = None, *, author: str | None = None) -> EditReport:
         """Take back an edit or a decision of the merge log by its entry; without one, the last edit that stands."""
         from list3r.memory import edits
 
-        return edits.undo(self._writable(), entry, author)
+        with self._lock:
+            return edits.undo(self._writable(), entry, author)
 
     def merges(self, instance_id: int | None = None) -> list[LogEntry]:
         """The merge log, oldest first; only what concerns one instance where asked. Raises `UnknownIdError`."""
         from list3r.memory.merge_log import merge_log
 
-        return merge_log(self.store, instance_id)
+        with self._lock:
+            return merge_log(self.store, instance_id)
 
     def _writable(self) -> Store:
         if not self.store.writable:

@@ -12,6 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from list3r.memory import edits
 from list3r.memory.constraints import Key
+from list3r.memory.errors import UnknownIdError
 from list3r.memory.store import Store
 from tests.memory_scenes import BOX, MUG, TWIN
 from tests.test_consolidation import add, chunk, create
@@ -193,8 +194,12 @@ class StoreAgainstModel(RuleBasedStateMachine):
             self.held[n] = keys
         seen = {k for _, keys in now.values() for k in keys}
         for n, keys in self.held.items():
-            if keys & seen:
+            try:
                 assert self.store.resolve(n) in now
+            except UnknownIdError as error:
+                assert "was deleted" in str(error)
+                assert any(s.kind == "delete" for s in self.said.values())
+                assert not (n in now and keys & seen)
 
 
 StoreAgainstModel.TestCase.settings = settings(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from list3r.memory.codec import to_json
-from list3r.memory.constraints import Constraints, Edit, Key
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.constraints import Constraints, Edit, Key, standing
+from list3r.memory.errors import MemoryFileError, UnknownIdError
 from list3r.memory.instance_verbs import InstanceVerbs
 from list3r.memory.records import MergeDecision
 
@@ -34,6 +34,31 @@ class EditVerbs(InstanceVerbs):
     def writable(self) -> bool:
         """Whether the file was opened for writing."""
         return self._lock is not None
+
+    def resolve(self, instance_id: int) -> int:
+        """The id that stands for an id today. Raises `UnknownIdError`, which says so of what was deleted."""
+        wanted = int(instance_id) if 0 < instance_id < 2**63 else -1
+        try:
+            return super().resolve(wanted)
+        except UnknownIdError:
+            entry = self._deletion_of(wanted)
+            if entry is not None:
+                raise UnknownIdError(
+                    f"#{wanted} was deleted; `list3r undo {self.path} {entry}` brings it back"
+                ) from None
+            raise UnknownIdError(
+                f"{self.path} has no instance {instance_id}; `list3r list {self.path}` shows the ids"
+            ) from None
+
+    def _deletion_of(self, instance_id: int) -> int | None:
+        """The standing edit that deleted an instance, by any id that it ever had."""
+        aliases = self.aliases()
+        names = {instance_id}
+        while aliases.get(instance_id, instance_id) not in names:
+            instance_id = aliases[instance_id]
+            names.add(instance_id)
+        deletions = [e for e in standing(self.edits()) if e.kind == "delete"]
+        return next((e.entry for e in deletions if any(n in names for n, _, _ in e.before)), None)
 
     def log_entries(self) -> list[LogEntry]:
         """The merge log with its numbers, oldest first."""

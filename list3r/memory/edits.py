@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from list3r.memory.consolidation import consolidate
 from list3r.memory.constraints import Edit, Key, standing
 from list3r.memory.edit_verbs import LogEntry
-from list3r.memory.errors import OptionError, UnknownIdError
+from list3r.memory.errors import OptionError
 from list3r.memory.parting import part_best
 from list3r.memory.records import MergeDecision, Observation
 from list3r.memory.store import Store
@@ -53,7 +53,7 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
     Raises `UnknownIdError`, and `OptionError` for two that are one already or lie in parts that were never joined.
     """
     with store.transaction():
-        first, second = sorted((_known(store, a), _known(store, b)))
+        first, second = sorted((store.resolve(a), store.resolve(b)))
         if first == second:
             raise OptionError(f"{a} and {b} are one instance already, #{first}")
         if store.instance(first).component != store.instance(second).component:
@@ -73,7 +73,7 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
     Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.
     """
     with store.transaction():
-        known = _known(store, instance_id)
+        known = store.resolve(instance_id)
         before = _as_they_are(store, [known])
         keys = before[0][2]
         if len(keys) < 2:
@@ -91,7 +91,7 @@ def label(store: Store, instance_id: int, text: str | None, author: str | None =
     if cleaned is not None and (len(cleaned) > _LONGEST_LABEL or not cleaned.isprintable()):
         raise OptionError(f"a label is one line of at most {_LONGEST_LABEL} printable characters")
     with store.transaction():
-        known = _known(store, instance_id)
+        known = store.resolve(instance_id)
         before = _as_they_are(store, [known])
         edit = replace(_edit("label", (before[0][2],), before, author), text=cleaned)
         reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} took the label of #{known}"
@@ -103,7 +103,7 @@ def label(store: Store, instance_id: int, text: str | None, author: str | None =
 def delete(store: Store, instance_id: int, author: str | None = None) -> EditReport:
     """Take an instance out of the library, with all that is seen of it later. Raises `UnknownIdError`."""
     with store.transaction():
-        known = _known(store, instance_id)
+        known = store.resolve(instance_id)
         before = _as_they_are(store, [known])
         edit = _edit("delete", (before[0][2],), before, author)
         return _carry_out(store, edit, (f"#{known}", ""), f"{edit.author} deleted #{known}")
@@ -181,21 +181,6 @@ def _user() -> str:
         return "somebody"
 
 
-def _known(store: Store, instance_id: int) -> int:
-    """The id that stands for an id today. Raises `UnknownIdError`, which says so of one that was deleted."""
-    if not 0 < instance_id < 2**63:
-        raise UnknownIdError(f"{store.path} has no instance {instance_id}; `list3r list {store.path}` shows the ids")
-    try:
-        return store.resolve(instance_id)
-    except UnknownIdError:
-        for e in standing(store.edits()):
-            if e.kind == "delete" and any(n == instance_id for n, _, _ in e.before):
-                raise UnknownIdError(
-                    f"#{instance_id} was deleted; `list3r undo {store.path} {e.entry}` brings it back"
-                ) from None
-        raise
-
-
 def _as_they_are(store: Store, ids: Sequence[int]) -> Before:
     """What an undo brings back: ids, labels and local instances of instances."""
     return tuple(
@@ -251,7 +236,9 @@ def _give_back(store: Store, before: Before, there: Collection[int], aliases: Ma
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     for instance_id, _, keys in before:
         if instance_id not in there:
-            heir = store.resolve(instance_id) if instance_id in aliases else None
+            heir = aliases.get(instance_id)
+            while heir is not None and heir not in there and heir in aliases:
+                heir = aliases[heir]
             own = [k for k in keys if home.get(k) in (None, heir)]
             store.set_observations(Observation(instance_id, *key) for key in own)
 

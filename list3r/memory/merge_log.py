@@ -15,7 +15,7 @@ def merge_log(store: Store, instance_id: int | None = None) -> list[LogEntry]:
     entries = store.log_entries()
     if instance_id is None:
         return entries
-    current = store.resolve(min(max(instance_id, -1), 2**62))
+    current = store.resolve(instance_id)
     names = {f"#{current}", *(f"#{old}" for old in store.aliases() if _becomes(store, old, current))}
     names |= {f"{o.chunk_id}:{o.local_id}" for o in store.observations(current)}
     edits = {e.entry for e in store.edits() if any(f"#{n}" in names for n, _, _ in e.before)}
