@@ -1,0 +1,95 @@
+"""update through the real program: a second walk is placed in the first one's world, and errors name the fix."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import list3r
+from list3r.chunk_stage import BuildSettings
+from list3r.cli.app import run
+from list3r.frames.chunks import ChunkSettings
+from list3r.frames.source import open_source
+from list3r.memory.errors import OptionError
+from list3r.memory.store import Store
+from list3r.simulation.dataset import WalkSettings, write_walk
+from list3r.updating import ties, update
+
+SETTINGS = BuildSettings(poses="estimate", chunks=ChunkSettings(length=40, overlap=12))
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two walks through one room, of which the second starts elsewhere."""
+    folder = tmp_path_factory.mktemp("walks")
+    first = WalkSettings(seed=3, frames=44, size=(192, 144))
+    second = WalkSettings(seed=3, walk_seed=77, frames=36, start=14, size=(192, 144))
+    return write_walk(folder / "first", first), write_walk(folder / "second", second)
+
+
+@pytest.fixture(scope="module")
+def one(walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The memory of the first walk."""
+    path = tmp_path_factory.mktemp("memory") / "one.l3r"
+    list3r.build(walks[0], path, settings=SETTINGS, workers=1).close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def two(one: Path, walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The memory of both."""
+    path = tmp_path_factory.mktemp("memory") / "two.l3r"
+    shutil.copy(one, path)
+    report = update(path, walks[1], settings=SETTINGS, workers=1)
+    assert report.placed == report.chunks
+    assert report.ties > 0
+    assert report.session == 2
+    assert report.posed > 30
+    return path
+
+
+def test_the_second_session_lies_in_the_world_of_the_first(two: Path, one: Path) -> None:
+    with Store.open(two) as store, Store.open(one) as before:
+        assert {c.component for c in store.chunks()} == {store.chunks()[0].component}
+        first, was = store.chunks()[0].S_world_chunk, before.chunks()[0].S_world_chunk
+        np.testing.assert_allclose(first.as_matrix(), was.as_matrix(), atol=0.02)
+        assert ties(store, 2)
+        assert [s.state for s in store.sessions()] == ["complete", "complete"]
+        assert store.verify() == []
+
+
+def test_ids_of_the_first_session_live_on_and_nothing_is_said_to_have_changed(two: Path, one: Path) -> None:
+    with Store.open(two) as store, Store.open(one) as before:
+        for instance in before.instances(structure=False):
+            store.resolve(instance.id)
+        assert [e for e in store.events(2) if e.kind in ("removed", "moved")] == []
+        assert any(e.kind == "seen_again" for e in store.events(2))
+
+
+def test_a_video_that_is_in_the_memory_already_is_refused(two: Path, walks: tuple[Path, Path]) -> None:
+    for walk in walks:
+        with pytest.raises(OptionError, match="already, as session"):
+            update(two, walk, settings=SETTINGS)
+
+
+def test_an_interrupted_build_or_update_is_finished_first(tmp_path: Path, walks: tuple[Path, Path]) -> None:
+    path = tmp_path / "begun.l3r"
+    info = open_source(walks[0]).info
+    with Store.create(path) as store, store.transaction():
+        store.add_session(str(walks[0]), info.fingerprint, {}, 44)
+    with pytest.raises(OptionError, match="holds no video yet"):
+        update(path, walks[1], settings=SETTINGS)
+
+
+def test_the_program_says_in_one_line_what_is_wrong(
+    tmp_path: Path, walks: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["update", str(tmp_path / "none.l3r"), str(walks[1])]) == 2
+    assert run(["update", str(tmp_path / "none.l3r"), str(tmp_path / "nowhere")]) == 2
+    assert run(["query", "changes", str(tmp_path / "none.l3r")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("error: ") for line in lines)
