@@ -184,6 +184,8 @@ def test_edits_do_not_change_what_they_do_not_speak_of(path: Path) -> None:
         lambda s: edits.split(s, 1, []),
         lambda s: edits.label(s, 10**30, "x"),
         lambda s: edits.delete(s, -1),
+        lambda s: edits.delete(s, 1, author="a\udc80"),
+        lambda s: edits.label(s, 1, "\ud800"),
         lambda s: edits.undo(s),
         lambda s: edits.undo(s, 10**30),
     ],

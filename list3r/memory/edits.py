@@ -20,7 +20,7 @@ from list3r.memory.records import MergeDecision, Observation
 from list3r.memory.store import Store
 
 Before = tuple[tuple[int, str | None, tuple[Key, ...]], ...]
-_LONGEST_LABEL = 200
+_LONGEST = 200
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,7 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
 
 def label(store: Store, instance_id: int, text: str | None, author: str | None = None) -> EditReport:
     """Give an instance a name; nothing, or an empty text, takes it away. Raises `UnknownIdError` and `OptionError`."""
-    cleaned = " ".join((text or "").split()) or None
-    if cleaned is not None and (len(cleaned) > _LONGEST_LABEL or not cleaned.isprintable()):
-        raise OptionError(f"a label is one line of at most {_LONGEST_LABEL} printable characters")
+    cleaned = _line(text or "", "label") or None
     with store.transaction():
         known = store.resolve(instance_id)
         before = _as_they_are(store, [known])
@@ -171,13 +169,21 @@ def _key(name: str, entry: LogEntry) -> Key:
 
 def _edit(kind: str, parts: tuple[tuple[Key, ...], ...], before: Before, author: str | None) -> Edit:
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    return Edit(0, now, author or _user(), kind, parts, 0, before)
+    return Edit(0, now, _line(author or "", "author") or _user(), kind, parts, 0, before)
+
+
+def _line(text: str, what: str) -> str:
+    """The text on one line. Raises `OptionError` when it is none that people can read."""
+    line = " ".join(text.split())
+    if len(line) > _LONGEST or not line.isprintable():
+        raise OptionError(f"the {what} is one line of at most {_LONGEST} printable characters")
+    return line
 
 
 def _user() -> str:
     try:
-        return getpass.getuser()
-    except (OSError, KeyError, ImportError):
+        return _line(getpass.getuser(), "user")
+    except (OSError, KeyError, ImportError, OptionError):
         return "somebody"
 
 
