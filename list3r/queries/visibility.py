@@ -22,8 +22,10 @@ _WIDTH = 160
 """Cells across the depth buffer."""
 _NEAR = 0.02
 """Nothing nearer than this share of the median depth is drawn: the camera stands inside of it."""
-_MAX_REACH = 6
+_MAX_REACH = 40
 """Cells that one point reaches to each side at most."""
+_BY_CELLS = 6
+"""Points that reach further, few and near, are drawn one by one."""
 _FEW = 9
 """With fewer points than this the box stands for the surface, so many points along each edge."""
 _NOISE = 0.02
@@ -109,20 +111,39 @@ def _draw(
     x, y, z = points[ahead].T
     u, v = (fx * x / z + cx + 0.5) / step, (fy * y / z + cy + 0.5) / step
     within = (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0])
-    if not within.any():
+    reach = np.clip(np.round(0.5 * spacing * fx / (step * z)), 0, _MAX_REACH).astype(np.int64)
+    meets = (u >= -reach) & (v >= -reach) & (u < size[1] + reach) & (v < size[0] + reach)
+    if not meets.any():
         return None
-    column, row, depth = u[within].astype(np.int64), v[within].astype(np.int64), z[within]
-    reach = np.clip(np.round(0.5 * spacing * fx / (step * depth)), 0, _MAX_REACH).astype(np.int64)
-    buffer = np.full(size[0] * size[1], np.inf)
-    for r in np.unique(reach).tolist():
+    column, row = np.floor(u[meets]).astype(np.int64), np.floor(v[meets]).astype(np.int64)
+    buffer = _splat(column, row, z[meets], reach[meets], size)
+    cells = np.flatnonzero(np.isfinite(buffer))
+    return _Drawn(instance, float(within.sum()) / len(points), cells, buffer[cells])
+
+
+def _splat(
+    column: NDArray[np.int64],
+    row: NDArray[np.int64],
+    depth: NDArray[np.float64],
+    reach: NDArray[np.int64],
+    size: tuple[int, int],
+) -> NDArray[np.float64]:
+    """Least depth in each cell when every point covers `reach` cells to each side; infinite where nothing is."""
+    height, width = size
+    buffer = np.full((height, width), np.inf)
+    flat = buffer.ravel()
+    for r in np.unique(reach[reach <= _BY_CELLS]).tolist():
         at = reach == r
         for dy in range(-r, r + 1):
             for dx in range(-r, r + 1):
                 c, w = column[at] + dx, row[at] + dy
-                fits = (c >= 0) & (w >= 0) & (c < size[1]) & (w < size[0])
-                np.minimum.at(buffer, w[fits] * size[1] + c[fits], depth[at][fits])
-    cells = np.flatnonzero(np.isfinite(buffer))
-    return _Drawn(instance, float(within.sum()) / len(points), cells, buffer[cells])
+                fits = (c >= 0) & (w >= 0) & (c < width) & (w < height)
+                np.minimum.at(flat, w[fits] * width + c[fits], depth[at][fits])
+    for k in np.flatnonzero(reach > _BY_CELLS).tolist():
+        c, w, r = int(column[k]), int(row[k]), int(reach[k])
+        part = buffer[max(w - r, 0) : w + r + 1, max(c - r, 0) : c + r + 1]
+        np.minimum(part, depth[k], out=part)
+    return flat
 
 
 def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:

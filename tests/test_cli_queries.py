@@ -1,0 +1,113 @@
+"""query find, seen, path, and what cameras and viewpoints answer, through the program."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from list3r.cli.app import run
+from list3r.memory.store import Store
+from tests.conftest import write_small_room
+
+FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("queries") / "room.l3r"
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+    return path
+
+
+@pytest.fixture
+def ask(room: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    """A function that runs `list3r query COMMAND room ...` and gives (status, standard output, standard error)."""
+
+    def asked(command: str, *arguments: object) -> tuple[int, str, str]:
+        status = run(["query", command, str(room), *map(str, arguments)])
+        out = capsys.readouterr()
+        return status, out.out, out.err
+
+    return asked
+
+
+@pytest.mark.parametrize("command", ["find", "seen", "path", "relations", "within", "nearest", "similar"])
+def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["query", command, "--help"]) == 0
+    assert f"Example: list3r query {command}" in capsys.readouterr().out
+
+
+def test_find(ask: Any) -> None:
+    status, out, err = ask("find", "mug on table")
+    assert status == 0 and "on #2 table" in out and "2 things answer" in err
+    found = json.loads(ask("find", "mug on table", "--json")[1])
+    assert [m["id"] for m in found["matches"]] == [MUG, TWIN] and found["ambiguous"]
+    assert found["matches"][0]["view"]["frame"] == 3
+    nothing = json.loads(ask("find", "elephant on table", "--json")[1])
+    assert nothing["matches"] == [] and nothing["unknown_words"] == ["elephant"]
+    assert "nothing found" in ask("find", "elephant")[1]
+
+
+def test_seen(ask: Any) -> None:
+    status, out, _ = ask("seen", MUG)
+    assert status == 0 and "20 frames" in out
+    assert json.loads(ask("seen", MUG, "--json")[1])["spans"] == [{"session": 1, "from_s": 0.0, "to_s": 0.633333}]
+    status, out, err = ask("seen", "--time", "0.1")
+    assert status == 0 and "frame 3 of session 1, 0.10 s" in err
+    at = json.loads(ask("seen", "--pose", "0,0,0.9,0.5,-0.5,0.5,-0.5", "--json")[1])
+    assert {TABLE, MUG, TWIN} <= {m["id"] for m in at}
+
+
+def test_within_a_view(ask: Any) -> None:
+    found = json.loads(ask("within", "--view", 3, "--no-occlusion", "--structure", "--json")[1])
+    assert TABLE in [m["id"] for m in found] and all(m["view"]["frame"] == 3 for m in found)
+
+
+def test_relations_from_somewhere_and_between(ask: Any) -> None:
+    found = json.loads(ask("relations", "--predicate", "left_of", "--object", TWIN, "--from", "0,0,1", "--json")[1])
+    assert found["state"] == "known" and MUG in [r["subject"] for r in found["relations"]]
+    status, out, err = ask("relations", "--subject", "mug", "--from", "camera")
+    assert status == 0 and "left_of" in out and "as seen from frame 19" in err
+    assert (
+        json.loads(ask("relations", "--predicate", "between", "--object", MUG, "--and", TWIN, "--json")[1])["relations"]
+        == []
+    )
+
+
+def test_path(ask: Any) -> None:
+    found = json.loads(ask("path", MUG, CHAIR, "--json")[1])
+    assert [r["predicate"] for r in found["relations"]] == ["on", "next_to"]
+    assert "no relation leads there" in ask("path", MUG, WALL)[2]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("find", ""),
+        ("find", "mug on"),
+        ("find", "chair next to 99"),
+        ("find", "mug", "-k", "0"),
+        ("seen",),
+        ("seen", 99),
+        ("seen", 3, "--time", "1"),
+        ("seen", "--time", "nan"),
+        ("seen", "--view", 4711),
+        ("seen", "--pose", "1,2,3"),
+        ("seen", "--pose", "0,0,0,0,0,0,0"),
+        ("within", "--view", 3, "--point", "0,0,0", "--radius", "1"),
+        ("within", "--point", "0,0,0", "--radius", "1", "--max-depth", "1"),
+        ("relations", "--predicate", "left_of"),
+        ("relations", "--predicate", "between", "--object", 2),
+        ("relations", "--from", "nowhere"),
+        ("path", 3, 99),
+        ("path", 3, 10**30),
+    ],
+)
+def test_what_makes_no_sense_is_said_in_one_line(ask: Any, arguments: tuple[object, ...]) -> None:
+    status, out, err = ask(*arguments)
+    assert status == 2 and out == ""
+    assert err.startswith("error: ") and err.count("\n") == 1

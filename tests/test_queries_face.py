@@ -1,0 +1,129 @@
+"""The face for Python: one memory in many threads, tables, filters, read-only."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import list3r
+from list3r.memory.errors import MemoryFileError, OptionError, UnknownIdError
+from list3r.memory.store import Store
+from list3r.scene_memory import SceneMemory
+from tests.conftest import write_small_room
+
+FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("face") / "room.l3r"
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+    return path
+
+
+@pytest.fixture
+def memory(room: Path) -> Iterator[SceneMemory]:
+    with list3r.open(room) as opened:
+        yield opened
+
+
+def questions(memory: SceneMemory) -> list[Callable[[], object]]:
+    """One of each kind, as plain values that can be compared."""
+
+    def plain(matches: list[object]) -> list[tuple[object, ...]]:
+        return [(m.instance.id, m.score, m.distance_m, m.reason) for m in matches]  # type: ignore[attr-defined]
+
+    return [
+        lambda: plain(memory.nearest((1.8, 0.1, 1.0), 4)),
+        lambda: plain(memory.nearest(MUG, 4)),
+        lambda: plain(memory.within(center=(2.0, 0.0, 0.7), radius=0.5)),
+        lambda: plain(memory.visible(memory.camera(frame=4), structure=True)),
+        lambda: plain(memory.find("mug on table")),
+        lambda: plain(memory.similar(MUG)),
+        lambda: list(memory.relations(subject=MUG, viewpoint=CHAIR)),
+        lambda: list(memory.path_between(MUG, CHAIR)),
+        lambda: memory.seen(TABLE),
+        lambda: sorted(memory.relation_graph().edges),
+        lambda: len(memory.merge_graph()),
+        lambda: memory.to_records("frames"),
+        lambda: memory.support(MUG).points.sum(),
+    ]
+
+
+def test_eight_threads_ask_one_memory_and_get_what_one_thread_gets(room: Path) -> None:
+    with list3r.open(room) as alone:
+        expected = [ask() for ask in questions(alone)]
+    with list3r.open(room) as shared, ThreadPoolExecutor(8) as pool:
+
+        def all_of_them(start: int) -> list[object]:
+            asks = questions(shared)
+            order = [(start + k) % len(asks) for k in range(len(asks))]
+            answers = {n: asks[n]() for n in order}
+            return [answers[n] for n in range(len(asks))]
+
+        for found in pool.map(all_of_them, range(16)):
+            assert found == expected
+
+
+def test_a_memory_that_is_read_refuses_to_be_written(memory: SceneMemory) -> None:
+    with pytest.raises(MemoryFileError, match=r"read-only|reading"), memory.store.transaction():
+        memory.store.set_value("gravity", "known")
+
+
+def test_tables_are_flat_and_alike(memory: SceneMemory) -> None:
+    for table, count in (("instances", 6), ("relations", 4), ("frames", 20)):
+        rows = memory.to_records(table)  # type: ignore[arg-type]
+        assert len(rows) == count and len({tuple(r) for r in rows}) == 1
+        assert all(v is None or type(v) in (int, float, str, bool) for r in rows for v in r.values())
+    mug = next(r for r in memory.to_records() if r["id"] == MUG)
+    assert (mug["center_x"], mug["box_size_z"], mug["structure"]) == (pytest.approx(1.8), pytest.approx(0.1), None)
+    with pytest.raises(KeyError, match="instances"):
+        memory.to_records("things")  # type: ignore[arg-type]
+
+
+def test_every_filter_filters(memory: SceneMemory) -> None:
+    def ask(**filters: object) -> list[int]:
+        return sorted(m.instance.id for m in memory.nearest((2.0, 0.0, 0.5), 9, **filters))  # type: ignore[arg-type]
+
+    assert ask() == [TABLE, MUG, TWIN, CHAIR]
+    assert ask(label="mug") == [MUG, TWIN]
+    assert ask(max_size=0.2) == [MUG, TWIN]
+    assert ask(min_size=0.8, max_size=1.0) == [CHAIR]
+    assert ask(color="white") == ask() and ask(color="red") == []
+    assert ask(component=2) == [] and ask(dynamic=True) == []
+    assert ask(structure=True) == [FLOOR, TABLE, MUG, TWIN, CHAIR, WALL]
+    assert ask(max_distance=0.05) == ask(max_distance=0.05, state="present")
+    for wrong in ({"label": " "}, {"min_size": -1.0}, {"max_size": float("nan")}, {"state": "gone"}):
+        with pytest.raises(OptionError):
+            ask(**wrong)
+
+
+def test_what_moves_is_near_where_it_was_last(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "moving.l3r") as store, store.transaction():
+        write_small_room(store)
+        mug = store.instance(MUG)
+        gone = mug.aabb + np.array([0.0, 1.5, 0.0])
+        box = dataclasses.replace(mug.box, center=mug.box.center + np.array([0.0, 1.5, 0.0]))
+        store.put_instances([dataclasses.replace(mug, dynamic=True, aabb=gone, box=box, center=gone.mean(axis=0))])
+        memory = SceneMemory(store)
+        found = memory.nearest((1.8, 1.6, 0.77), k=1, dynamic=True)
+        assert [m.instance.id for m in found] == [MUG] and (found[0].distance_m or 0.0) < 0.1
+
+
+def test_numbers_that_no_id_can_be_are_unknown(memory: SceneMemory) -> None:
+    for number in (-1, 0, 77, 2**63, 10**40):
+        for ask in (memory.nearest, memory.similar, memory.seen):
+            with pytest.raises(UnknownIdError):
+                ask(number)
+
+
+def test_a_camera_has_one_name(memory: SceneMemory) -> None:
+    for wrong in ({}, {"frame": 1, "time_s": 0.1}, {"position": (0, 0, 0)}, {"quat_wxyz": (1, 0, 0, 0), "frame": 1}):
+        with pytest.raises(OptionError):
+            memory.camera(**wrong)  # type: ignore[arg-type]

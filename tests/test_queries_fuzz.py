@@ -1,0 +1,171 @@
+"""Thousands of questions that nobody would ask: an answer, or an error that names what is wrong, never else."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import list3r
+from list3r.cli.app import run
+from list3r.memory.errors import List3rError
+from list3r.memory.store import Store
+from list3r.queries.grammar import RELATIONS
+from list3r.queries.match import Match
+from list3r.queries.relations import ALL_PREDICATES
+from list3r.scene_memory import SceneMemory
+from tests.conftest import write_small_room
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("fuzz") / "room.l3r"
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+    return path
+
+
+@pytest.fixture(scope="module")
+def memory(room: Path) -> Iterator[SceneMemory]:
+    with list3r.open(room) as opened:
+        yield opened
+
+
+WORDS = st.one_of(
+    st.sampled_from(
+        [*RELATIONS, *ALL_PREDICATES, "the", "and", "a", "mug", "table", "white", "small", "biggest", "wall"]
+    ),
+    st.sampled_from(
+        ["#3", "2", "77", "-1", "0", "9" * 40, "thing", "chairs", "huge", "elephant", "between", "", "\x00"]
+    ),
+    st.text(max_size=8),
+)
+TEXTS = st.one_of(st.lists(WORDS, max_size=9).map(" ".join), st.text(max_size=30))
+NUMBERS = st.one_of(st.floats(), st.floats(-5, 5), st.sampled_from([0.0, 1e308, -1e308, 5e-324, math.inf, math.nan]))
+POINTS = st.one_of(st.lists(NUMBERS, min_size=3, max_size=3), st.lists(NUMBERS, max_size=4))
+IDS = st.one_of(st.integers(-2, 9), st.integers())
+THINGS = st.one_of(IDS, TEXTS)
+VIEWPOINTS = st.one_of(st.none(), IDS, POINTS, st.sampled_from(["camera", "camera:3", "camera:99", "#4"]), TEXTS)
+FILTERS = st.fixed_dictionaries(
+    {},
+    optional={
+        "structure": st.booleans(),
+        "min_confidence": NUMBERS,
+        "state": st.one_of(st.none(), st.sampled_from(["present", "moved", "gone"])),
+        "label": TEXTS,
+        "color": st.one_of(st.just("white"), TEXTS),
+        "min_size": NUMBERS,
+        "max_size": NUMBERS,
+        "component": st.integers(-1, 3),
+        "dynamic": st.booleans(),
+    },
+)
+often = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+
+
+def answers(ask: Callable[[], Any]) -> Any:
+    """The answer, or nothing after an error in one line; numbers in answers are finite."""
+    try:
+        found = ask()
+    except List3rError as error:
+        assert "\n" not in str(error)
+        assert str(error)
+        return None
+    for match in found if isinstance(found, list) else []:
+        if isinstance(match, Match):
+            numbers = (match.score, match.distance_m or 0.0, match.center_distance_m or 0.0)
+            assert all(math.isfinite(n) for n in numbers)
+            assert match.reason
+    return found
+
+
+@settings(often, max_examples=1000)
+@given(text=TEXTS, k=st.integers(-1, 5), viewpoint=VIEWPOINTS)
+def test_find(memory: SceneMemory, text: str, k: int, viewpoint: Any) -> None:
+    found = answers(lambda: memory.find(text, k, viewpoint=viewpoint))
+    if found is not None:
+        assert len(found) <= k
+        assert [m.score for m in found] == sorted((m.score for m in found), reverse=True)
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
+@settings(often)
+@given(target=st.one_of(THINGS, POINTS), k=st.integers(-1, 2**70), limit=st.one_of(st.none(), NUMBERS), filters=FILTERS)
+def test_nearest(memory: SceneMemory, target: Any, k: int, limit: float | None, filters: Any) -> None:
+    answers(lambda: memory.nearest(target, k, max_distance=limit, **filters))
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
+@settings(often)
+@given(one=POINTS, two=POINTS, radius=NUMBERS, sphere=st.booleans(), filters=FILTERS)
+def test_within(memory: SceneMemory, one: Any, two: Any, radius: float, sphere: bool, filters: Any) -> None:
+    region = {"center": one, "radius": radius} if sphere else {"lower": one, "upper": two}
+    answers(lambda: memory.within(**region, **filters))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@settings(often, max_examples=150)
+@given(
+    place=POINTS, quat=st.lists(NUMBERS, min_size=3, max_size=4), depth=st.one_of(st.none(), NUMBERS), filters=FILTERS
+)
+def test_within_what_a_camera_sees(memory: SceneMemory, place: Any, quat: Any, depth: Any, filters: Any) -> None:
+    answers(lambda: memory.within(camera=memory.camera(position=place, quat_wxyz=quat), max_depth=depth, **filters))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@settings(often)
+@given(
+    subject=st.one_of(st.none(), THINGS),
+    predicate=st.one_of(st.none(), st.sampled_from(ALL_PREDICATES), TEXTS),
+    object=st.one_of(st.none(), THINGS),
+    other=st.one_of(st.none(), THINGS),
+    viewpoint=VIEWPOINTS,
+    least=st.one_of(st.just(0.0), NUMBERS),
+)
+def test_relations(memory: SceneMemory, **arguments: Any) -> None:
+    least = arguments.pop("least")
+    for r in answers(lambda: memory.relations(min_confidence=least, **arguments)) or []:
+        assert 0.0 <= r.confidence <= 1.0
+        assert math.isfinite(r.margin)
+
+
+@settings(often, max_examples=200)
+@given(one=IDS, two=IDS, gap=NUMBERS, structure=st.booleans())
+def test_path_and_seen(memory: SceneMemory, one: int, two: int, gap: float, structure: bool) -> None:
+    answers(lambda: memory.path_between(one, two, structure=structure))
+    answers(lambda: memory.seen(one, gap_s=gap))
+    answers(lambda: memory.similar(one, two))
+
+
+VALUES = st.one_of(TEXTS, NUMBERS.map(repr), IDS.map(str), POINTS.map(lambda p: ",".join(map(repr, p))))
+LINES = st.tuples(
+    st.sampled_from(["find", "nearest", "within", "relations", "similar", "seen", "path"]),
+    st.lists(VALUES, max_size=2),
+    st.lists(
+        st.tuples(
+            st.sampled_from(
+                "--id --point -k --radius --box --view --time --pose --session --from --subject --object --and"
+                " --predicate --max-depth --max-distance --label --color --min-size --structure --no-occlusion"
+                " --json".split()
+            ),
+            VALUES,
+        ),
+        max_size=3,
+    ),
+)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@settings(often, max_examples=200)
+@given(line=LINES)
+def test_the_command_line(room: Path, line: tuple[str, list[str], list[tuple[str, str]]]) -> None:
+    command, values, options = line
+    flags = ("--structure", "--no-occlusion", "--json")
+    arguments = [part for name, value in options for part in ((name,) if name in flags else (name, value))]
+    assert run(["query", command, str(room), *values, *arguments]) in (0, 2), shlex.join([command, *values, *arguments])

@@ -1,0 +1,150 @@
+"""Relations from a viewpoint and between things, ways through the graph, and what is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from list3r.memory.errors import OptionError, UnknownIdError
+from list3r.memory.records import Relation
+from list3r.memory.store import Store
+from list3r.queries.path import path
+from list3r.queries.relations import Relations, relations
+from list3r.queries.viewpoint import Viewer, viewed
+from tests.conftest import instance, write_small_room
+
+FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    with Store.create(tmp_path_factory.mktemp("relations") / "room.l3r") as opened, opened.transaction():
+        write_small_room(opened)
+        yield opened
+
+
+def triples(found: Relations) -> list[tuple[int, str, int]]:
+    return [(r.subject, r.predicate, r.object) for r in found]
+
+
+def test_left_and_front_from_a_point(store: Store) -> None:
+    """From the origin towards +x: left is +y, in front is smaller x."""
+    found = relations(store, MUG, None, TWIN, viewpoint=(0.0, 0.0, 0.8))
+    assert {p for _, p, _ in triples(found)} == {"left_of", "in_front_of"}
+    assert found.state == "known" and "the point 0, 0, 0.8" in found.reason
+    opposite = relations(store, MUG, None, TWIN, viewpoint=(4.0, 0.0, 0.8))
+    assert {p for _, p, _ in triples(opposite)} == {"right_of", "behind"}
+
+
+def test_from_an_instance_and_from_a_camera(store: Store) -> None:
+    """The chair stands at y = 1 and looks towards -y: its left is +x."""
+    assert triples(relations(store, "mug", "left_of", MUG, viewpoint=CHAIR)) == [(TWIN, "left_of", MUG)]
+    assert triples(relations(store, MUG, "left_of", TWIN, viewpoint="camera")) == [(MUG, "left_of", TWIN)]
+    assert "frame 3" in relations(store, MUG, "left_of", TWIN, viewpoint="camera:3").reason
+    assert relations(store, viewpoint=f"{CHAIR}", subject=CHAIR, predicate="behind") == []
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=9, max_size=9), st.lists(st.floats(0.05, 1.0), min_size=6, max_size=6))
+def test_sides_are_inverse_and_turn_with_the_world(places: list[float], sizes: list[float]) -> None:
+    a = instance(1, tuple(places[:3]), tuple(sizes[:3]), (1, 1, 1))
+    b = instance(2, tuple(places[3:6]), tuple(sizes[3:]), (1, 1, 1))
+    viewer = Viewer(np.array(places[6:]), UP, "here")
+    one, two = viewed(viewer, a, b, 0.015), viewed(viewer, b, a, 0.015)
+    assert (one is None) == (two is None)
+    if one is None or two is None:
+        return
+    inverse = {"left_of": "right_of", "right_of": "left_of", "in_front_of": "behind", "behind": "in_front_of"}
+    assert {(inverse[r.predicate], r.margin) for r in one} == {(r.predicate, r.margin) for r in two}
+    assert all(r.margin > 0 and 0.5 <= r.confidence <= 1 for r in one)
+    moved = [instance(n, tuple(i.center + 5), tuple(i.box.size), (1, 1, 1)) for n, i in ((1, a), (2, b))]
+    again = viewed(Viewer(viewer.place + 5, UP, "there"), *moved, 0.015) or []
+    assert {r.predicate for r in again if r.margin > 1e-4} == {r.predicate for r in one if r.margin > 1e-4}
+
+
+def test_between_two_things(store: Store) -> None:
+    with_box = instance(20, (2.0, 0.0, 0.77), (0.06, 0.06, 0.1), (1, 1, 1))
+    store.put_instances([with_box])
+    try:
+        found = relations(store, None, "between", MUG, other=TWIN)
+        assert triples(found) == [(20, "between", MUG)] and vars(found[0])["other"] == TWIN
+        assert relations(store, TABLE, "between", MUG, other=TWIN) == [], "it is under both"
+        assert triples(relations(store, 20, "between", TWIN, other=MUG)) == [(20, "between", TWIN)]
+    finally:
+        store.drop_instance(20, None)
+
+
+def test_words_stand_for_things(store: Store) -> None:
+    assert triples(relations(store, "mug", "on", "table")) == [(MUG, "on", TABLE), (TWIN, "on", TABLE)]
+    assert relations(store, "elephant", "on", "table") == []
+    assert triples(relations(store, "#3")) == [(MUG, "on", TABLE)]
+
+
+def test_what_needs_gravity_is_unknown_without_it(store: Store) -> None:
+    held = store.relations()
+    store.set_value("gravity", "unknown")
+    store.replace_relations(None, [r for r in held if r.predicate == "next_to"])
+    try:
+        found = relations(store, predicate="on")
+        assert found == [] and found.state == "unknown" and "up" in found.reason
+        assert relations(store, predicate="next_to").state == "known"
+        assert relations(store, MUG, "left_of", TWIN, viewpoint=(0, 0, 1)).state == "unknown"
+        assert relations(store, MUG, "left_of", TWIN, viewpoint=CHAIR).state == "unknown"
+        assert triples(relations(store, MUG, "left_of", TWIN, viewpoint="camera")) == [(MUG, "left_of", TWIN)]
+    finally:
+        store.set_value("gravity", "estimated")
+        store.replace_relations(None, held)
+
+
+def test_parts_that_are_not_joined_have_no_sides(store: Store) -> None:
+    a, b = instance(1, (1, 0, 0), (1, 1, 1), (1, 1, 1)), instance(2, (3, 3, 0), (1, 1, 1), (1, 1, 1), component=2)
+    assert viewed(Viewer(np.zeros(3), UP, "here"), a, b, 0.01) is None
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"predicate": "left_of"},
+        {"predicate": "on", "viewpoint": (0, 0, 1)},
+        {"predicate": "between"},
+        {"predicate": "between", "object": 2},
+        {"predicate": "on", "other": 3},
+        {"other": 3},
+        {"predicate": "upon"},
+        {"viewpoint": "here"},
+        {"viewpoint": "1,2"},
+        {"viewpoint": (0.0, float("nan"), 0.0)},
+        {"subject": "the"},
+        {"min_confidence": 1.5},
+    ],
+)
+def test_nonsense_is_refused(store: Store, arguments: dict[str, object]) -> None:
+    with pytest.raises(OptionError) as caught:
+        relations(store, **arguments)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_ways_are_the_shortest_and_then_the_surest(store: Store) -> None:
+    assert triples(path(store, MUG, CHAIR)) == [(MUG, "on", TABLE), (TABLE, "next_to", CHAIR)]
+    assert triples(path(store, MUG, FLOOR)) == [(MUG, "on", TABLE), (TABLE, "on", FLOOR)]
+    assert triples(path(store, FLOOR, MUG)) == [(FLOOR, "supports", TABLE), (TABLE, "supports", MUG)]
+    assert path(store, MUG, MUG).reason == "both are #3"
+    nowhere = path(store, MUG, WALL)
+    assert nowhere == [] and "no relation leads there" in nowhere.reason
+    with pytest.raises(UnknownIdError):
+        path(store, MUG, 77)
+
+
+def test_ways_need_not_lead_over_the_floor(store: Store) -> None:
+    held = store.relations()
+    store.replace_relations(None, [Relation(TABLE, "on", FLOOR, 0.9, 0.1), Relation(CHAIR, "on", FLOOR, 0.9, 0.1)])
+    try:
+        assert len(path(store, TABLE, CHAIR)) == 2
+        assert path(store, TABLE, CHAIR, structure=False) == []
+    finally:
+        store.replace_relations(None, held)
