@@ -195,6 +195,7 @@ class _Story:
         fresh = [n for n, s in enumerate(self._sessions) if s[0] == session and self._component[n] in components]
         fresh = [n for n in fresh if self._counts[n] and self._known_before(n, session)]
         looks = {n: self._look(n, session, before=False) for n in fresh}
+        left = [thing.now for thing, _ in gone]
         for thing, place in self._moved(gone, fresh, session):
             fresh.remove(place)
             self._move(thing, place, session, looks[place])
@@ -202,7 +203,7 @@ class _Story:
         for thing, found in gone:
             self._remove(thing, session, found)
         for n in fresh:
-            replaces = any(self._replaces(n, thing.now, session) for thing, _ in gone)
+            replaces = any(self._replaces(n, place, session) for place in left)
             if looks[n].verdict == "gone" or replaces:
                 self._add(n, session, looks[n])
 

@@ -86,14 +86,18 @@ def consolidate(
     groups, movers, joined = _with_movers(store, groups, chunks, summaries, motions, word, s)
     groups, movers = word.joined(groups, {c.chunk_id: c.component for c in chunks}, movers)
     posed = store.posed_count()
-    shown = word.shown(groups, [e.shown(s.evidence, posed) for e in weigh(groups, shapes, pairs, s.evidence)])
+    evidence = weigh(groups, shapes, pairs, s.evidence)
+    shown = word.shown(groups, [e.shown(s.evidence, posed) for e in evidence])
     changes = find_changes(store, groups, shown, frozenset(movers), chunks, summaries, s.changes)
-    groups = changes.groups
+    if changes.current:
+        groups, evidence = changes.groups, weigh(changes.groups, shapes, pairs, s.evidence)
     decisions += joined + changes.decisions
     before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
-    evidence = weigh(groups, shapes, pairs, s.evidence)
     weights = {key: len(summaries[key[0]].shapes.frames[_at(summaries, key)]) for group in groups for key in group}
-    shown = word.shown(groups, [e.shown(s.evidence, posed) for e in evidence])
+    told = {c.first for c in changes.events}
+    shown = word.shown(
+        groups, [e.shown(s.evidence, posed) or g[0] in told for e, g in zip(evidence, groups, strict=True)]
+    )
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
     things = _things(store, groups, ids, evidence, chunks, summaries, s, movers, changes.current)
