@@ -88,6 +88,7 @@ def test_words_that_nothing_bears_are_named_with_those_that_things_bear(store: S
 
 
 def test_what_does_not_hold_is_said(store: Store) -> None:
+    assert find(store, "white table").notes == ("no one thing is all of 'white', 'table'",)
     found = find(store, "mug on chair")
     assert found == [] and "on" in found.notes[0] and found.unknown_words == ()
 

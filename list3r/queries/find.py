@@ -172,6 +172,8 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
             score = float(np.mean([search.vocabulary[n][w] for w in phrase.words])) if phrase.words else 1.0
             reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
             out.append(_Candidate(i, score, reasons))
+    if not out and len(phrase.words) > 1:
+        search.notes.append("no one thing is all of " + ", ".join(repr(w) for w in phrase.words))
     return out
 
 
