@@ -16,6 +16,7 @@ from list3r.memory.errors import List3rError, MemoryFileError, OptionError, Unkn
 from list3r.memory.geometry import Sim3
 from list3r.memory.merge_log import merge_log
 from list3r.memory.store import Store
+from tests.conftest import instance
 from tests.memory_scenes import CHAIR, MUG, TABLE, TWIN
 from tests.test_consolidation import add, chunk, content, create
 
@@ -197,6 +198,21 @@ def test_edits_that_make_no_sense_change_nothing(path: Path, verb: object) -> No
             verb(store)  # type: ignore[operator]
         assert "\n" not in str(error.value)
         assert (content(store), store.edits(), store.log_entries()) == before
+
+
+def test_things_that_no_chunk_of_the_file_shows_can_be_named_but_not_regrouped(tmp_path: Path) -> None:
+    with create(tmp_path / "a.l3r") as store:
+        with store.transaction():
+            store.put_instances(
+                [instance(1, (0, 0, 0), (1, 1, 1), (9, 9, 9)), instance(2, (3, 0, 0), (1, 1, 1), (9, 9, 9))]
+            )
+        edits.label(store, 1, "cube")
+        assert store.instance(1).label == "cube"
+        for verb in (lambda: edits.merge(store, 1, 2), lambda: edits.split(store, 1), lambda: edits.delete(store, 1)):
+            with pytest.raises(OptionError):
+                verb()
+        edits.undo(store)
+        assert store.instance(1).label is None and len(store.instances()) == 2
 
 
 def test_things_of_parts_that_were_never_joined_are_not_merged(tmp_path: Path) -> None:

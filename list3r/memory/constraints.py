@@ -263,7 +263,6 @@ class Growing:
 
 def _bind(bonds: Bonds, sets: Iterable[Sequence[Key]]) -> None:
     for keys in sets:
-        first, *rest = sorted(keys)
-        for key in rest:
-            if not bonds.parted(first, key):
-                bonds.join(first, key)
+        for key in sorted(keys)[1:]:
+            if not bonds.parted(min(keys), key):
+                bonds.join(min(keys), key)

@@ -202,7 +202,7 @@ def _owners(store: Store, keys: Sequence[Key]) -> Before:
 
 def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -> Edit:
     """Append the edit to the log and to the edits; the edit with its number."""
-    through = max(c.chunk_id for c in store.chunks())
+    through = max((c.chunk_id for c in store.chunks()), default=0)
     entry = store.add_log_entry(through, MergeDecision(f"edit {edit.kind}", *names, {}, reason))
     edit = replace(edit, entry=entry, through=through)
     store.add_edit(edit)
@@ -211,6 +211,8 @@ def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -
 
 def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, bring_back: Before = ()) -> EditReport:
     """Write the edit down, derive the library anew, and see to it that every id still resolves."""
+    if any(not keys for _, _, keys in edit.before):
+        raise OptionError(f"{store.path} does not hold what {names[0]} was made from; only its label can be changed")
     edit = _write_down(store, edit, names, reason)
     there = {i.id for i in store.instances()}
     aliases = store.aliases()
