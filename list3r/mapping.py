@@ -6,14 +6,16 @@ as one that was never interrupted.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from list3r.association.edges import EdgeSettings, measure_edge
+from list3r.association.graph_growth import extend
 from list3r.association.joint_window import JointReconstructor
-from list3r.association.pose_graph import GraphSettings, optimize
+from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.frames.base import Camera
 from list3r.instances.overlays import write_support
@@ -59,7 +61,7 @@ def add_chunk(
             store.add_edges(_adjacent_edge(store, session_id, chosen.edges, debug_dir))
         if not given or len(store.sessions()) > 1:
             store.add_edges(find_loops(store, chunk_id, joint, chosen.revisits))
-        place_chunks(store, chosen.graph)
+        place_chunks(store, chosen.graph, chunk_id)
         if library:
             consolidate(store, chunk_id)
     return chunk_id
@@ -118,14 +120,24 @@ def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
     return [Edge(u, v, "adjacent", Sim3.identity(), 1.0, 1.0, 0, 0.0, True, "both lie in the source's own world")]
 
 
-def place_chunks(store: Store, settings: GraphSettings | None = None) -> None:
-    """Optimise the graph, find which way is up, and write where every chunk lies."""
+SOLVED_WHOLE = 60
+"""Chunks up to which every new one solves the whole graph again (some milliseconds); beyond, it is fitted in."""
+
+
+def place_chunks(store: Store, settings: GraphSettings | None = None, new: int | None = None) -> None:
+    """Optimise the graph, find which way is up, and write where every chunk lies.
+
+    With the id of a `new` chunk in a long video only what that chunk touches is solved; `finish_session` solves all.
+    """
     chunks = store.chunks()
     edges = store.edges()
+    ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
-    initial = _graph_poses(store)
-    graph = optimize([c.chunk_id for c in chunks], edges, initial, metric=metric, settings=settings)
-    store.add_edges(graph.edges)
+    if new is not None and len(chunks) > SOLVED_WHOLE:
+        graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, settings)
+    else:
+        graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=settings)
+    store.add_edges(after for before, after in zip(edges, graph.edges, strict=True) if after is not before)
     known = {} if store.get_value("poses") == "given" else graph.covariances
     store.place_chunks(graph.S_graph_chunk, graph.components, known)
     store.set_value("T_world_graph", np.eye(4).tolist())
@@ -146,6 +158,19 @@ def finish_session(
         if library:
             consolidate(store)
         store.complete_session(session_id)
+
+
+def _placed(store: Store, chunks: Sequence[ChunkRow], edges: Sequence[Edge], new: int) -> GraphResult:
+    """The graph as it was solved before the new chunk came."""
+    known = [c for c in chunks if c.chunk_id != new]
+    poses = _graph_poses(store)
+    return GraphResult(
+        S_graph_chunk={c.chunk_id: poses[c.chunk_id] for c in known},
+        components={c.chunk_id: c.component for c in known},
+        edges=tuple(edges),
+        residual=1.0,
+        covariances={c.chunk_id: np.zeros((7, 7)) if c.covariance is None else c.covariance for c in known},
+    )
 
 
 def _graph_poses(store: Store) -> dict[int, Sim3]:
