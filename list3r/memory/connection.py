@@ -19,6 +19,8 @@ from list3r.memory.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, exp
 from list3r.memory.sums import Sums, write_all
 from list3r.memory.writer_lock import WriterLock, lock_path
 
+FAILURES = (sqlite3.Error, UnicodeError)
+"""What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
 _WAIT_S = 30.0
 """How long one process waits for what another holds only for a moment."""
 
@@ -78,7 +80,7 @@ class Connection:
             return cls._open_to_read(path)
         try:
             return cls._connect(path, WriterLock(path.resolve()))
-        except sqlite3.Error as error:
+        except FAILURES as error:
             raise MemoryFileError(_explain(path, error)) from error
 
     @classmethod
@@ -101,7 +103,7 @@ class Connection:
                 database = _database(path, "ro") if _writable_now(cls, path) else _migrated_copy(path)
             database.execute("PRAGMA query_only=ON")
             return cls(path, database, None)
-        except sqlite3.Error as error:
+        except FAILURES as error:
             raise MemoryFileError(_explain(path, error)) from error
 
     @classmethod
@@ -120,7 +122,7 @@ class Connection:
             if database is not None:
                 database.close()
             lock.release()
-            if isinstance(error, sqlite3.Error):
+            if isinstance(error, FAILURES):
                 raise MemoryFileError(_explain(path, error)) from error
             raise
 
@@ -212,7 +214,7 @@ class Connection:
     def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         try:
             return self._database.execute(query, arguments).fetchall()
-        except sqlite3.DatabaseError as error:
+        except FAILURES as error:
             raise MemoryFileError(_explain(self.path, error)) from error
 
 
@@ -226,7 +228,7 @@ def remove_memory(path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _explain(path: Path, error: sqlite3.Error) -> str:
+def _explain(path: Path, error: Exception) -> str:
     text = str(error)
     if "not a database" in text:
         return f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`"

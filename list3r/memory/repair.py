@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from list3r.memory.codec import checksum, unpack
-from list3r.memory.connection import check_schema, protect
+from list3r.memory.connection import FAILURES, check_schema, protect
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.schema import SCHEMA_VERSION
@@ -124,7 +124,7 @@ def _connect(path: Path, copy: Path) -> sqlite3.Connection:
         protect(database)
         database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         check_schema(path, database, SCHEMA_VERSION)
-    except (sqlite3.Error, MemoryFileError) as error:
+    except (*FAILURES, MemoryFileError) as error:
         database.close()
         raise MemoryFileError(
             f"{path} cannot be repaired: what says which tables it holds is damaged ({error}); use a backup"
@@ -171,7 +171,7 @@ def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) ->
     """Rows of a table by key that match the checksums written of them."""
     try:
         sums, _ = stored_sums(damaged, table)
-    except sqlite3.Error:
+    except FAILURES:
         sums = {}
     summed = [table.columns.index(c) for c in table.summed]
     kept: dict[Row, Row] = {}
@@ -204,13 +204,13 @@ def _readable(damaged: sqlite3.Connection, table: SummedTable, parts: list[int])
         try:
             for part, *row in damaged.execute(f"{select} ORDER BY {ordered}"):
                 yield part, tuple(row[k] for k in keys), tuple(row)
-        except sqlite3.Error:
+        except FAILURES:
             whole = False
         if whole:
             return
     for part in parts:
         clause, arguments = table.where(part)
-        with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(*FAILURES):
             for _, *row in damaged.execute(f"{select} WHERE {clause}", arguments):
                 yield part, tuple(row[k] for k in keys), tuple(row)
 

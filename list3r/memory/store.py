@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from list3r.memory.connection import FAILURES
 from list3r.memory.edit_verbs import EditVerbs
 from list3r.memory.event_verbs import EventVerbs
 from list3r.memory.sums import OWN_CRC, bad_rows_of, own_crc_wrong, summed_tables
@@ -62,7 +62,7 @@ class Store(EditVerbs, EventVerbs):
                 if name in OWN_CRC:
                     yield from map(str, own_crc_wrong(self._database, name, table.key))
                 yield from map(str, bad_rows_of(self._database, table))
-            except sqlite3.Error as error:
+            except FAILURES as error:
                 yield f"{name}: {error}"
         for source, column, other, target in _REFERENCES:
             query = f"SELECT DISTINCT {column} FROM {source} WHERE {column} NOT IN (SELECT {target} FROM {other})"
@@ -79,7 +79,7 @@ class Store(EditVerbs, EventVerbs):
         """Rows of a query; what SQLite says where it fails, as one row."""
         try:
             yield from self._database.execute(query)
-        except sqlite3.Error as error:
+        except FAILURES as error:
             yield (str(error),)
 
 

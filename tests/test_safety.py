@@ -1,0 +1,232 @@
+"""What a memory survives: kills, readers beside a writer, flipped bytes, files of strangers and of older programs."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import shutil
+import sqlite3
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from list3r.exporters.scene_json import scene_dict
+from list3r.memory.codec import pack, unpack
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.schema import SCHEMA_VERSION
+from list3r.memory.store import Store
+from list3r.simulation.dataset import WalkSettings, write_walk
+
+Make = Callable[..., Path]
+FIXTURES = Path(__file__).parent / "fixtures"
+OLD = ["schema1.l3r", "schema2.l3r"]
+
+
+@pytest.fixture(scope="module")
+def safety() -> ModuleType:
+    """`benchmarks/safety.py`, which does the same at length."""
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "safety.py"
+    spec = importlib.util.spec_from_file_location("safety", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["safety"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def program(text: str) -> subprocess.Popen[str]:
+    """Another process, which prints a line when it is ready and ends when its input does."""
+    command = [sys.executable, "-c", text + "\nprint('ready', flush=True); input()"]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+# ------------------------------------------------------------------------------------------- kills and readers
+
+
+def test_a_killed_build_loses_nothing_and_is_completed(safety: ModuleType, tmp_path: Path) -> None:
+    walk = write_walk(tmp_path / "walk", WalkSettings(seed=3, frames=20, size=(128, 96)), workers=1)
+    report = safety.kill_builds(walk, tmp_path, 1)
+    assert report["problems"] == [] and report["kills"] == 1
+
+
+def test_killed_edits_are_whole_or_not_there(safety: ModuleType, make_memory: Make) -> None:
+    report = safety.kill_edits(make_memory(), 3)
+    assert report["problems"] == [] and report["edits"] >= 3
+
+
+def test_readers_in_other_processes_see_whole_transactions(
+    safety: ModuleType, make_memory: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(Path(safety.__file__).parent)
+    report = safety.write_and_read(make_memory(), 3.0, readers=3)
+    assert report["problems"] == []
+    assert report["transactions"] > 0 and report["snapshots"] > 0
+
+
+# ------------------------------------------------------------------------------------------- damage
+
+
+def test_a_flipped_byte_is_found_or_does_no_harm(safety: ModuleType, make_memory: Make, tmp_path: Path) -> None:
+    path = make_memory()
+    original = path.read_bytes()
+    with Store.open(path) as store:
+        wanted = safety.answers(store)
+    seen = set()
+    for n in range(60):
+        data, what = safety.damaged(original, safety.random.Random(n))
+        (tmp_path / "flipped.l3r").write_bytes(data)
+        outcome, text = safety.outcome_of(tmp_path / "flipped.l3r", wanted, what)
+        assert outcome not in ("silent", "traceback"), text
+        seen.add(outcome)
+    assert {"detected by verify", "harmless"} <= seen
+
+
+def lying_archive(header: bytes, claimed: int | None = None) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(16))
+    data = bytearray(buffer.getvalue())
+    if claimed is not None:
+        at = data.index(b"PK\x01\x02") + 24
+        data[at : at + 4] = claimed.to_bytes(4, "little")
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    "blob",
+    [
+        lying_archive(b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000,), }\n"),
+        lying_archive(b"{'descr': '|O', 'fortran_order': False, 'shape': (2,), }\n"),
+        lying_archive(b"{'descr': '<f8', 'fortran_order': False, 'shape': (-2, -1), }\n"),
+        lying_archive(b"{'descr': '<f8', 'fortran_order': False, 'shape': (2,), }\n", claimed=2**32 - 2),
+        lying_archive(b"[" * 4000),
+        b"",
+    ],
+)
+def test_headers_that_lie_are_refused_without_taking_memory(blob: bytes) -> None:
+    with pytest.raises(MemoryFileError):
+        unpack(blob, "a row")
+
+
+def test_any_change_of_packed_arrays_is_refused_or_harmless() -> None:
+    arrays = {"a": np.arange(40), "b": np.ones((3, 2), np.float32), "c": np.asfortranarray(np.eye(3)[:, :2])}
+    blob = pack(arrays)
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        data = bytearray(blob)
+        data[rng.integers(len(data))] ^= int(rng.integers(1, 256))
+        try:
+            found = unpack(bytes(data), "a row")
+        except MemoryFileError:
+            continue
+        assert {str(a.tolist()) for a in found.values()} <= {str(a.tolist()) for a in arrays.values()}
+
+
+# ------------------------------------------------------------------------------------------- strangers
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE TRIGGER t AFTER INSERT ON memory BEGIN DELETE FROM instances; END",
+        "CREATE VIEW v AS SELECT * FROM memory",
+        "CREATE TABLE more (x)",
+        "CREATE INDEX i ON instances (label)",
+        "DROP TABLE relations",
+        "ALTER TABLE memory ADD COLUMN x",
+    ],
+)
+@pytest.mark.parametrize("writable", [False, True])
+def test_what_no_memory_has_is_refused(statement: str, writable: bool, make_memory: Make) -> None:
+    path = make_memory()
+    with sqlite3.connect(path) as database:
+        database.execute(statement)
+    with pytest.raises(MemoryFileError, match=r"not opened|damaged or not ours"):
+        Store.open(path, writable=writable)
+
+
+def test_a_view_in_the_place_of_a_table_is_refused(make_memory: Make) -> None:
+    path = make_memory()
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE relations")
+        database.execute("CREATE VIEW relations AS SELECT randomblob(1000000000)")
+    with pytest.raises(MemoryFileError, match="view 'relations'"):
+        Store.open(path)
+
+
+# ------------------------------------------------------------------------------------------- older programs
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_an_old_memory_is_migrated_where_it_lies(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    shutil.copy(FIXTURES / name, path)
+    with Store.open(path) as store:
+        assert store.verify() == [] and len(store.instances()) >= 5
+    with sqlite3.connect(path) as database:
+        assert database.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_an_old_memory_that_may_not_be_written_is_read_from_a_copy(name: str, tmp_path: Path) -> None:
+    path, other = tmp_path / "old.l3r", tmp_path / "other.l3r"
+    shutil.copy(FIXTURES / name, path)
+    shutil.copy(FIXTURES / name, other)
+    path.chmod(0o444)
+    before = path.read_bytes()
+    with Store.open(path) as copy, Store.open(other) as migrated:
+        assert copy.verify() == [] and copy.path == path
+        assert scene_dict(copy) == scene_dict(migrated)
+    assert path.read_bytes() == before
+
+
+def test_an_old_memory_that_another_process_holds_is_read_from_a_copy(tmp_path: Path) -> None:
+    path = tmp_path / "old.l3r"
+    shutil.copy(FIXTURES / "schema2.l3r", path)
+    holder = program(f"from list3r.memory.writer_lock import *; held = WriterLock(Path({str(path)!r}))")
+    with Store.open(path) as store:
+        assert store.verify() == []
+    with sqlite3.connect(path) as database:
+        assert database.execute("PRAGMA user_version").fetchone()[0] == 2
+    holder.communicate("\n", timeout=60)
+
+
+# ------------------------------------------------------------------------------------------- the lock
+
+
+def test_the_lock_names_its_holder_and_ends_with_it(make_memory: Make, tmp_path: Path) -> None:
+    path = make_memory()
+    text = f"from list3r.memory.store import Store; store = Store.open({str(path)!r}, writable=True)"
+    holder = program(text)
+    with pytest.raises(MemoryFileError, match=rf"process {holder.pid} on .*, since 20.*wait for it to end"):
+        Store.open(path, writable=True)
+    with Store.open(path) as reader:
+        assert len(reader.instances()) == 6
+    holder.kill()
+    holder.communicate()
+    with Store.open(path, writable=True) as store:
+        assert store.verify() == []
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_reader_keeps_its_snapshot_when_the_same_process_opens_and_closes_the_file(make_memory: Make) -> None:
+    path = make_memory()
+    with Store.open(path, writable=True) as writer:
+        with Store.open(path) as reader, reader.snapshot():
+            count = len(reader.instances())
+            Store.open(path).close()
+            with writer.transaction():
+                writer.drop_instance(3, None)
+            assert len(reader.instances()) == count
+            assert 3 in {o.instance_id for o in reader.observations()}
+        assert len(writer.instances()) == count - 1
