@@ -91,7 +91,7 @@ class Connection:
                 version = _identify(path, database)
             except sqlite3.OperationalError as error:
                 database.close()
-                if error.sqlite_errorname not in _UNFINISHED or not _writable_now(cls, path):
+                if getattr(error, "sqlite_errorname", "") not in _UNFINISHED or not _writable_now(cls, path):
                     raise
                 database = _database(path, "ro")
                 version = _identify(path, database)
