@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import list3r
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.errors import MemoryFileError
@@ -154,5 +153,5 @@ def test_the_command_says_what_is_lost(make_memory: Make, capsys: pytest.Capture
 def test_what_cannot_be_understood_is_said_to_be_damage(make_memory: Make) -> None:
     path = make_memory()
     spoil(path, "UPDATE sessions SET settings = '{'")
-    with pytest.raises(MemoryFileError, match="repair"), list3r.open(path) as scene:
-        scene.store.sessions()
+    with pytest.raises(MemoryFileError, match="repair"), Store.open(path) as store:
+        store.sessions()
