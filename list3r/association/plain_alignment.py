@@ -26,8 +26,8 @@ def plain_align(
 ) -> Alignment:
     """The alignment of pairs (N, 3) with weights (N,) of frames (N,).
 
-    Its covariance is that of a robust fit to the pairs within three robust deviations. `residual_scale` is sigma_r as a share of the spread of v. Raises
-    `DegenerateError` when the pairs have no weight or no extent.
+    Its covariance is that of a robust fit to the pairs within three robust deviations. `residual_scale` is sigma_r as
+    a share of the spread of v. Raises `DegenerateError` when the pairs have no weight or no extent.
     """
     S_v_u = _ratio_of_radii(p_u, p_v, weight, metric)
     for _ in range(ROUNDS):

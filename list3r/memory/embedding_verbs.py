@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.chunk_verbs import ChunkVerbs
 from list3r.memory.errors import MemoryFileError
+from list3r.memory.writer_lock import WriterLock
 
 _BATCH = 500
 """Rows asked for by id in one statement."""
@@ -20,7 +21,7 @@ _BATCH = 500
 class EmbeddingVerbs(ChunkVerbs):
     """Vectors in, vectors out. Writing verbs are called inside `transaction()`."""
 
-    def __init__(self, path: Path, database: sqlite3.Connection, lock: int | None) -> None:
+    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
         super().__init__(path, database, lock)
         self.vectors_touched: list[int] = []
         """Instances whose vectors this store has written or dropped since it was opened, in order; may repeat."""
