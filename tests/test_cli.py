@@ -38,7 +38,8 @@ def ask(*arguments: str | Path) -> Any:
 
 COMMANDS = (
     "inspect build demo info list show export verify doctor query.nearest query.within query.relations query.similar"
-    " eval.trajectory eval.cloud eval.instances eval.revisits"
+    " eval.trajectory eval.cloud eval.instances eval.revisits query.find query.seen query.path"
+    " query.changes update merges undo merge split label delete repair"
 ).split()
 
 
