@@ -254,7 +254,8 @@ def _depth_steps(
     out = np.full((size, size), settings.least_step)
     for k, grid in enumerate(grids):
         row, column = cell[k].T
-        off = np.abs(np.log(np.where(row >= 0, grid.middle[row, column], np.nan) / depth[k]))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            off = np.abs(np.log(np.where(row >= 0, grid.middle[row, column], np.nan) / depth[k]))
         for a in range(size):
             mine = off[(used.place == a) & np.isfinite(off)]
             if a != k and len(mine) >= 20:
