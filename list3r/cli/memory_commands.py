@@ -125,6 +125,11 @@ def list_instances(
     print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind", "state"])
 
 
+def _give_or_take(sigma: float | None, units: str) -> str:
+    """How sure a position is, where the memory can tell."""
+    return "" if sigma is None else f", give or take {sigma:.2f} {units} against the start"
+
+
 def _triple(values: Any) -> str:
     return " ".join(f"{v:6.2f}" for v in values)
 
@@ -154,7 +159,7 @@ def show(
         return
     print(f"{instance.id}  {instance.label or instance.description}")
     for key, value in (
-        ("center", f"{_triple(instance.center)} {units}"),
+        ("center", f"{_triple(instance.center)} {units}{_give_or_take(instance.position_sigma_m, units)}"),
         ("size", f"{_triple(instance.box.size)} {units}"),
         (
             "confidence",
