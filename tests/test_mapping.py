@@ -1,0 +1,42 @@
+"""Chunks as they come: fitted in one by one or solved anew each time, the finished session is the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import list3r.mapping as mapping
+from list3r.frames.chunks import ChunkSettings, plan_chunks
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import ChunkResult
+from list3r.memory.store import Store
+from list3r.simulation.feedforward import FeedForwardModel
+from list3r.simulation.presets import make_video
+
+
+def placed(path: Path, chunks: list[ChunkResult], model: FeedForwardModel) -> list[Sim3]:
+    with Store.create(path) as store:
+        with store.transaction():
+            store.set_value("scale_kind", "relative")
+            session = store.add_session("simulation", "", {}, 400)
+        for chunk in chunks:
+            mapping.add_chunk(store, session, chunk, model, library=False)
+        mapping.finish_session(store, session, library=False)
+        rows = store.chunks()
+        assert len({c.component for c in rows}) == 1
+        assert all(c.covariance is not None for c in rows)
+        return [c.S_world_chunk for c in rows]
+
+
+def test_a_chunk_fitted_in_ends_where_solving_the_whole_graph_puts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = FeedForwardModel(make_video("calm", 102), seed=102)
+    chunks = [model.chunk(span) for span in plan_chunks(400, ChunkSettings())]
+    whole = placed(tmp_path / "whole.l3r", chunks, model)
+    monkeypatch.setattr(mapping, "SOLVED_WHOLE", 0)
+    grown = placed(tmp_path / "grown.l3r", chunks, model)
+    for a, b in zip(whole, grown, strict=True):
+        assert np.abs((a.inverse() @ b).log()).max() < 1e-6
