@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import list3r.mapping as mapping
+from list3r import mapping
 from list3r.frames.chunks import ChunkSettings, plan_chunks
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult
