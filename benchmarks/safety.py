@@ -19,6 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from queue import Empty
 from typing import Any
 
 import numpy as np
@@ -293,7 +294,7 @@ def flip(memory: Path, folder: Path, count: int, seed: int = 0) -> Result:
         while True:
             try:
                 found.append(queue.get(timeout=1.0))
-            except Exception:
+            except Empty:
                 if not process.is_alive() and queue.empty():
                     break
         process.join()

@@ -77,6 +77,9 @@ def test_perfect_and_short_results_are_drawn_too(tmp_path: Path) -> None:
     truth = Trajectory(np.arange(3.0), looking((0, 0, 1), 3))
     save(trajectory_figure(truth, truth.time_s, truth.positions(), np.zeros(3), ""), tmp_path / "a.png")
     save(instances_figure({}, {}, [], "nothing"), tmp_path / "b.png")
+    for name in ("a.png", "b.png"):
+        width, height = Image.open(tmp_path / name).size
+        assert min(width, height) > 200
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a", "a.txt", "png"])
