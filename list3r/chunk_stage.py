@@ -14,16 +14,17 @@ from pathlib import Path
 import numpy as np
 
 from list3r.association.motion import flag_moving
-from list3r.frames.base import BadFrame, Camera, Frame, FrameSource
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
-from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.errors import TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction, Reconstructor
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
+from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,16 @@ class BuildSettings:
     """The reconstruction model."""
     poses: str = "estimate"
     """given or estimate."""
+    device: str = "auto"
+    """Where neural models run: cpu, cuda, or auto, the first GPU where there is one."""
+    weights: str | None = None
+    """Weights of the reconstruction model instead of its own."""
+    discovery: str = "geometric"
+    """What finds things on anchor frames."""
+    tracking: str = "reprojection"
+    """What follows them through the chunk."""
+    features: str = "geometric"
+    """What things are known again by."""
     chunks: ChunkSettings = field(default_factory=ChunkSettings)
     instances: InstanceSettings = field(default_factory=InstanceSettings)
     keep_pictures: bool = True
@@ -52,21 +63,11 @@ class ChunkTask:
     """Folder for overlays, or None."""
 
 
-def make_reconstructor(settings: BuildSettings) -> Reconstructor:
-    """The reconstruction model that the settings name. Raises `OptionError` for a name that is not known."""
-    if settings.reconstruction != "rgbd":
-        raise OptionError(f"--reconstruction {settings.reconstruction} is not known; this version has: rgbd")
-    from list3r.reconstruction.rgbd import RgbdReconstructor
-
-    return RgbdReconstructor(poses=settings.poses)
-
-
 def process_chunk(task: ChunkTask) -> ChunkResult:
     """Frames of one chunk to poses, keyframes and a local instance library."""
     clock = _Clock()
     source = _source(task.path, task.options)
-    camera = source.info.camera
-    assert camera is not None
+    camera = source.info.camera or guessed_camera(source.info)
     read = list(source.read(task.span.start, task.span.stop))
     frames = [f for f in read if isinstance(f, Frame)]
     bad = tuple((f.index, f.reason) for f in read if isinstance(f, BadFrame))
@@ -74,7 +75,7 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     try:
         if not frames:
             raise TrackingError("no frame of the chunk could be decoded")
-        reconstruction = make_reconstructor(task.settings)(frames, camera)
+        reconstruction = _model(task.settings, source.info.camera is not None)(frames, camera)
     except TrackingError:
         return _without_geometry(task, frames, camera, bad, clock.seconds)
     clock.mark("reconstruction")
@@ -82,7 +83,7 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     clock.mark("instances")
     keyframes = make_keyframes(frames, reconstruction, keep_jpeg=task.settings.keep_pictures)
     samples = frame_samples(reconstruction, library)
-    library = flag_moving(samples, library, camera)
+    library = flag_moving(samples, library, reconstruction.camera)
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
@@ -134,7 +135,7 @@ def _without_geometry(
         camera=camera,
         depth=np.zeros((count, camera.height, camera.width), np.float32),
         confidence=np.zeros((count, camera.height, camera.width), np.float16),
-        scale_kind="metric",
+        scale_kind="metric" if any(f.depth is not None for f in frames) else "relative",
         keyframes=np.zeros(0, np.int64),
     )
     library = LocalLibrary((), np.zeros((0, 2), np.int32), FEATURE_SPACE)
@@ -146,6 +147,13 @@ def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
         return None
     missing = np.full((4, 4), np.nan)
     return np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
+
+
+@lru_cache(maxsize=2)
+def _model(settings: BuildSettings, camera_known: bool) -> Reconstructor:
+    """The model, loaded once in a process."""
+    options = ModelOptions(settings.poses, camera_known, settings.device, settings.weights)
+    return make_reconstructor(settings.reconstruction, options)
 
 
 @lru_cache(maxsize=2)

@@ -30,6 +30,7 @@ from list3r.memory.connection import remove_memory
 from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
 from list3r.memory.records import ChunkResult
 from list3r.memory.store import Store
+from list3r.reconstruction.registry import MODELS, entry
 from list3r.workers import OrderedPool, default_workers
 
 Progress = Callable[[int, int], None]
@@ -152,7 +153,7 @@ def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings
     if poses == "auto":
         poses = "given" if info.has_poses else "estimate"
     if reconstruction == "auto":
-        reconstruction = "rgbd"
+        reconstruction = "rgbd" if info.has_depth or "sfm" not in MODELS else "sfm"
     return replace(settings, poses=poses, reconstruction=reconstruction)
 
 
@@ -160,14 +161,13 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
     """Raise an error that names the fix when the source cannot be built with the settings."""
     if settings.poses not in ("given", "estimate"):
         raise OptionError(f"--poses {settings.poses} is not known; choose estimate, given or auto")
-    if settings.reconstruction != "rgbd":
-        raise OptionError(f"--reconstruction {settings.reconstruction} is not known; this version has: rgbd, auto")
-    if not info.has_depth:
+    model = entry(settings.reconstruction)
+    if model.needs_depth and not info.has_depth:
         raise OptionError(
-            f"{info.path} has no depth, and this version reconstructs from RGB-D only; "
+            f"{info.path} has no depth, and {settings.reconstruction} reconstructs from RGB-D only; "
             "give a folder in the 7-Scenes, TUM or Replica layout"
         )
-    if info.camera is None:
+    if model.needs_camera and info.camera is None:
         raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
     if settings.poses == "given" and not info.has_poses:
         raise OptionError(f"{info.path} has no poses; use --poses estimate")

@@ -76,6 +76,21 @@ class SourceInfo:
     """What was assumed, one sentence each."""
     missing: tuple[str, ...] = field(default=())
     """What is missing and which option supplies it, one sentence each."""
+    image_size: tuple[int, int] | None = None
+    """Height and width of the frames handed out, px, where the camera is unknown."""
+
+
+GUESSED_FOCAL = 1.2
+"""Focal length of an unknown camera by the longer side of its picture (a field of view of 45 degrees, between a
+phone's main camera, 65, and its tele lens)."""
+
+
+def guessed_camera(info: SourceInfo) -> Camera:
+    """A pinhole camera for a source whose intrinsics are unknown, for models that find the focal length themselves."""
+    assert info.image_size is not None
+    height, width = info.image_size
+    focal = GUESSED_FOCAL * max(width, height)
+    return Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,12 @@ from list3r.reconstruction.confidence import ConfidenceSettings, depth_confidenc
 from list3r.reconstruction.follow import FollowSettings, follow_movers
 from list3r.reconstruction.moving import MovingSettings, SmallFrames, find_moving
 from list3r.reconstruction.odometry import OdometrySettings, Tracker
+from list3r.reconstruction.registry import ModelOptions
+
+
+def make(options: ModelOptions) -> RgbdReconstructor:
+    """The model with its default settings; it runs on the CPU whatever device is named."""
+    return RgbdReconstructor(poses=options.poses)
 
 
 @dataclass(frozen=True)

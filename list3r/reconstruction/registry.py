@@ -1,0 +1,56 @@
+"""The reconstruction models by name. Each is one file of this room, imported only when it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+
+from list3r.memory.errors import OptionError
+from list3r.reconstruction.base import Reconstructor
+
+__all__ = ["MODELS", "ModelOptions", "make_reconstructor"]
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What every reconstruction model is told."""
+
+    poses: str = "estimate"
+    """given or estimate."""
+    camera_known: bool = True
+    """False where the camera handed over is only a guess, which the model may better."""
+    device: str = "auto"
+    """cpu, cuda, cuda:1, ... or auto: the first GPU where there is one."""
+    weights: str | None = None
+    """A folder, a file or `repository@revision` of weights instead of the model's own; None for its own."""
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """Where a model lives and what it needs."""
+
+    module: str
+    """Module under `list3r.reconstruction`, which has `make(options: ModelOptions) -> Reconstructor`."""
+    needs_depth: bool = False
+    """Works on RGB-D only."""
+    needs_camera: bool = False
+    """Must be told the intrinsics; the others find the focal length themselves."""
+
+
+MODELS: dict[str, ModelEntry] = {
+    "rgbd": ModelEntry("rgbd", needs_depth=True, needs_camera=True),
+}
+"""All that `--reconstruction` knows."""
+
+
+def make_reconstructor(name: str, options: ModelOptions) -> Reconstructor:
+    """The model of that name. Raises `OptionError` for a name that is not known or a package that is missing."""
+    model = import_module(f"list3r.reconstruction.{entry(name).module}").make(options)
+    return model  # type: ignore[no-any-return]
+
+
+def entry(name: str) -> ModelEntry:
+    """The entry of a name. Raises `OptionError` for one that is not known."""
+    if name not in MODELS:
+        raise OptionError(f"--reconstruction {name} is not known; choose one of {', '.join(MODELS)}, auto")
+    return MODELS[name]
