@@ -1,9 +1,9 @@
-"""What a memory survives: kill -9 while it is built and edited, readers beside a writer, flipped bytes, truncation.
+"""What a memory survives: kill -9 while it is built, updated and edited (`kills`), readers beside a writer, flipped
+bytes, truncation.
 
     python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --json benchmarks/results/safety.json
 
-Every process is real and is killed by the kernel. After each kill the file must verify, and hold all that was committed
-before; a build goes on with --resume and in the end must give the scene of a build that was left alone.
+Every process is real.
 """
 
 from __future__ import annotations
@@ -12,159 +12,26 @@ import argparse
 import json
 import multiprocessing
 import random
-import subprocess
-import sys
+import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import Empty
 from typing import Any
 
 import numpy as np
+from kills import kill_builds, kill_commands, kill_edits, kill_updates, kill_writes
 
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.connection import remove_memory
 from list3r.memory.errors import List3rError, MemoryFileError
-from list3r.memory.records import MergeDecision, Observation, Relation
+from list3r.memory.records import Observation, Relation
 from list3r.memory.repair import repair
 from list3r.memory.store import Store
 
 Result = dict[str, Any]
-BUILD = ("--poses", "given", "--chunk", "12", "--overlap", "4", "--workers", "1")
-
-
-# ------------------------------------------------------------------------------------------- kills
-
-
-def _build_command(walk: Path, memory: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "list3r", "build", str(walk), "-m", str(memory), *BUILD, *more]
-
-
-def kill_builds(walk: Path, folder: Path, kills: int, seed: int = 0) -> Result:
-    """Kill builds at random moments; each goes on from what is there, and begins anew once it is done."""
-    rng = random.Random(seed)
-    whole = folder / "whole.l3r"
-    started = time.monotonic()
-    subprocess.run(_build_command(walk, whole), check=True, capture_output=True)
-    length = time.monotonic() - started
-    with Store.open(whole) as store:
-        wanted = scene_dict(store)
-    memory = folder / "killed.l3r"
-    counts: Counter[str] = Counter()
-    problems: list[str] = []
-    while counts["kills"] < kills:
-        committed = _chunks(memory)
-        process = subprocess.Popen(
-            _build_command(walk, memory, "--resume"), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        )
-        try:
-            _, text = process.communicate(timeout=rng.uniform(0.2, 1.0) * length)
-        except subprocess.TimeoutExpired:
-            before = _chunks(memory)
-            process.kill()
-            process.communicate()
-            counts["kills"] += 1
-            counts["with chunks committed"] += before > 0
-            problems += _judge(memory, max(committed, before))
-            continue
-        counts["builds completed"] += 1
-        if process.returncode != 0:
-            problems.append(f"--resume failed: {text.strip()}")
-        else:
-            with Store.open(memory) as store:
-                if scene_dict(store) != wanted:
-                    problems.append("the resumed build differs from the one that was left alone")
-        remove_memory(memory)
-    final = subprocess.run(_build_command(walk, memory, "--resume"), check=False, capture_output=True, text=True)
-    counts["builds completed"] += 1
-    problems += _judge(memory, 0) + ([f"--resume failed: {final.stderr}"] if final.returncode else [])
-    with Store.open(memory) as store:
-        if scene_dict(store) != wanted:
-            problems.append("the last build differs from the one that was left alone")
-    return {**counts, "problems": problems}
-
-
-def _chunks(memory: Path) -> int:
-    """Chunks that a reader sees now."""
-    try:
-        with Store.open(memory) as store:
-            return len(store.chunks())
-    except MemoryFileError:
-        return 0
-
-
-def _judge(memory: Path, committed: int) -> list[str]:
-    """What is wrong with a memory after a kill."""
-    if not memory.exists():
-        return [f"{committed} committed chunks are gone with the file"] if committed else []
-    try:
-        with Store.open(memory) as store:
-            found = store.verify()
-            held = len(store.chunks())
-    except Exception as error:  # whatever it is, it is a problem to report
-        return [f"{type(error).__name__}: {error}"]
-    return [*found, *([f"{committed} chunks were committed, {held} are left"] if held < committed else [])]
-
-
-def edit_for_ever(path: str, first: int) -> None:
-    """Edit one transaction after another and say the number of each once it is committed."""
-    with Store.open(path, writable=True) as store:
-        ids = [i.id for i in store.instances()]
-        n = first
-        while True:
-            n += 1
-            with store.transaction():
-                write_edit(store, ids, n)
-            sys.stdout.write(f"{n}\n")
-            sys.stdout.flush()
-
-
-def write_edit(store: Store, ids: list[int], n: int) -> None:
-    """One edit in several tables, all of which say `n`."""
-    from dataclasses import replace
-
-    store.set_value("edit", n)
-    store.put_instances([replace(store.instance(k), label=f"edit {n}") for k in ids])
-    store.log_decisions(1, [MergeDecision("edit", f"#{n}", "#0", {"n": n}, "an edit")])
-    pair = [ids[n % len(ids)], ids[(n + 1) % len(ids)]]
-    store.replace_relations([pair[0]], [Relation(pair[0], "near", pair[1], 1.0, float(n))])
-
-
-def edits_in(store: Store) -> set[int]:
-    """Numbers of edits that the tables speak of; one number where none is torn."""
-    logged = [int(d.scores["n"]) for d in store.decisions() if d.kind == "edit"]
-    labels = {i.label for i in store.instances()}
-    if logged != list(range(1, len(logged) + 1)):
-        return {-1}
-    return {int(store.get_value("edit", 0)), len(logged), *(int((x or "edit 0").split()[1]) for x in labels)}
-
-
-def kill_edits(memory: Path, kills: int, seed: int = 0) -> Result:
-    """Kill a process that edits a memory, at random moments."""
-    rng = random.Random(seed)
-    problems: list[str] = []
-    done = 0
-    for _ in range(kills):
-        process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).resolve()), "--edit", str(memory), str(done)],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert process.stdout is not None
-        process.stdout.readline()
-        time.sleep(rng.uniform(0.0, 0.25))
-        process.kill()
-        said = [line for line in process.communicate()[0].splitlines(keepends=True) if line.endswith("\n")]
-        least = int(said[-1]) if said else done + 1
-        problems += _judge(memory, 0)
-        with Store.open(memory) as store:
-            found = edits_in(store)
-        if len(found) != 1 or not least <= max(found) <= least + 1:
-            problems.append(f"edit {least} was committed, the memory speaks of {sorted(found)}")
-        done = max(found)
-    return {"kills": kills, "edits": done, "problems": problems}
 
 
 # ------------------------------------------------------------------------------------------- readers
@@ -406,40 +273,53 @@ def repair_flips(memory: Path, folder: Path, count: int, seed: int = 1) -> Resul
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=200, help="kills in all; a third of them while building")
+    parser.add_argument("--kills", type=int, default=200, help="in all: builds and updates 30 % each, edits the rest")
     parser.add_argument("--minutes", type=float, default=5.0, help="how long eight readers and a writer run")
     parser.add_argument("--flips", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--edit", nargs=2, help=argparse.SUPPRESS)
     words = parser.parse_args()
-    if words.edit:
-        edit_for_ever(words.edit[0], int(words.edit[1]))
     from machine import machine, write_json
-
-    from list3r.simulation.dataset import WalkSettings, write_walk
 
     print(machine())
     result: Result = {}
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        walk = write_walk(folder / "walk", WalkSettings(seed=3, frames=44, size=(160, 120)), workers=1)
-        builds = words.kills // 3
-        result["kills while building"] = kill_builds(walk, folder, builds)
-        memory = folder / "whole.l3r"
-        result["flips"] = flip(memory, folder, words.flips)
-        result["repairs"] = repair_flips(memory, folder, words.flips // 10)
-        result["file_mb"] = round(memory.stat().st_size / 1e6, 2)
-        started = time.process_time()
-        with Store.open(memory) as store:
-            store.verify()
-        result["verify_s"] = round(time.process_time() - started, 3)
-        result["kills while editing"] = kill_edits(memory, words.kills - builds)
-        result["readers"] = write_and_read(folder / "killed.l3r", 60 * words.minutes)
-    for key, value in result.items():
-        print(key, json.dumps(value, indent=2))
-    write_json(words.json, result)
+        for key, value in _parts(Path(name), words):
+            result[key] = value
+            print(key, json.dumps(value, indent=2), flush=True)
+            write_json(words.json, result)
     if any(isinstance(v, dict) and v["problems"] for v in result.values()):
         raise SystemExit(1)
+
+
+def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Any]]:
+    """Name and result of each part, as it is done."""
+    from list3r.simulation.dataset import WalkSettings, write_walk
+
+    seed, runs = words.seed, 3 * words.kills // 10
+    edits, writes = (words.kills - 2 * runs) // 4, (words.kills - 2 * runs) // 4
+    first = write_walk(folder / "first", WalkSettings(seed=3, frames=44, size=(160, 120)), workers=1)
+    second = WalkSettings(seed=3, walk_seed=4, start=6, frames=30, size=(160, 120))
+    yield "kills while building", kill_builds(first, folder, runs, seed)
+    memory = folder / "whole.l3r"
+    again = write_walk(folder / "second", second, workers=1)
+    yield "kills while updating", kill_updates(memory, again, folder, runs, seed + 1)
+    updated = folder / "updated.l3r"
+    for part, kill, count in (
+        ("kills while writing", kill_writes, writes),
+        ("kills while editing", kill_edits, edits),
+        ("kills of commands that edit", kill_commands, words.kills - 2 * runs - edits - writes),
+    ):
+        shutil.copy(updated, folder / "edited.l3r")
+        yield part, kill(folder / "edited.l3r", count, seed + 2)
+    yield "flips", flip(memory, folder, words.flips, seed)
+    yield "repairs", repair_flips(memory, folder, words.flips // 10, seed + 1)
+    yield "file_mb", round(memory.stat().st_size / 1e6, 2)
+    started = time.process_time()
+    with Store.open(memory) as store:
+        store.verify()
+    yield "verify_s", round(time.process_time() - started, 3)
+    yield "readers", write_and_read(folder / "killed.l3r", 60 * words.minutes)
 
 
 if __name__ == "__main__":

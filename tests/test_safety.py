@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -29,9 +29,16 @@ OLD = ["schema1.l3r", "schema2.l3r"]
 
 
 @pytest.fixture(scope="module")
-def safety() -> ModuleType:
+def safety() -> Iterator[ModuleType]:
     """`benchmarks/safety.py`, which does the same at length."""
     path = Path(__file__).resolve().parents[1] / "benchmarks" / "safety.py"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(path.parent)
+        yield _module(path)
+
+
+def _module(path: Path) -> ModuleType:
+    """A program as a module."""
     spec = importlib.util.spec_from_file_location("safety", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -58,15 +65,25 @@ def test_a_killed_build_loses_nothing_and_is_completed(safety: ModuleType, tmp_p
     assert report["problems"] == [] and report["kills"] == 1
 
 
-def test_killed_edits_are_whole_or_not_there(safety: ModuleType, make_memory: Make) -> None:
-    report = safety.kill_edits(make_memory(), 3)
-    assert report["problems"] == [] and report["edits"] >= 3
+def test_killed_transactions_are_whole_or_not_there(safety: ModuleType, make_memory: Make) -> None:
+    report = safety.kill_writes(make_memory(), 3)
+    assert report["problems"] == [] and report["transactions"] >= 3
 
 
-def test_readers_in_other_processes_see_whole_transactions(
-    safety: ModuleType, make_memory: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(Path(safety.__file__).parent)
+def test_a_killed_update_and_killed_edits_lose_nothing(safety: ModuleType, tmp_path: Path) -> None:
+    first = write_walk(tmp_path / "first", WalkSettings(seed=3, frames=20, size=(128, 96)), workers=1)
+    second = WalkSettings(seed=3, walk_seed=4, start=2, frames=14, size=(128, 96))
+    base = tmp_path / "base.l3r"
+    subprocess.run(sys.modules["kills"].build_command(first, base), check=True, capture_output=True)
+    report = safety.kill_updates(base, write_walk(tmp_path / "second", second, workers=1), tmp_path, 1)
+    assert report["problems"] == [] and report["kills"] == 1
+    report = safety.kill_edits(tmp_path / "updated.l3r", 1)
+    assert report["problems"] == [] and report["edits"] >= 1
+    report = safety.kill_commands(tmp_path / "updated.l3r", 1)
+    assert report["problems"] == [] and report["kills"] == 1
+
+
+def test_readers_in_other_processes_see_whole_transactions(safety: ModuleType, make_memory: Make) -> None:
     report = safety.write_and_read(make_memory(), 3.0, readers=3)
     assert report["problems"] == []
     assert report["transactions"] > 0 and report["snapshots"] > 0
