@@ -77,7 +77,9 @@ class SourceInfo:
     missing: tuple[str, ...] = field(default=())
     """What is missing and which option supplies it, one sentence each."""
     image_size: tuple[int, int] | None = None
-    """Height and width of the frames handed out, px, where the camera is unknown."""
+    """Height and width of the frames handed out, px."""
+    camera_guess: Camera | None = None
+    """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 
 
 GUESSED_FOCAL = 1.2
@@ -87,6 +89,8 @@ phone's main camera, 65, and its tele lens)."""
 
 def guessed_camera(info: SourceInfo) -> Camera:
     """A pinhole camera for a source whose intrinsics are unknown, for models that find the focal length themselves."""
+    if info.camera_guess is not None:
+        return info.camera_guess
     assert info.image_size is not None
     height, width = info.image_size
     focal = GUESSED_FOCAL * max(width, height)

@@ -157,6 +157,7 @@ class FolderSource:
             depth_scale=rig.depth_scale if self._has_depth else None,
             notes=(*layout.notes, *notes),
             missing=tuple(missing),
+            image_size=rig.color_size,
         )
 
 

@@ -17,8 +17,9 @@ def describe(info: SourceInfo) -> dict[str, Any]:
         "path": info.path,
         "frames": info.frame_count,
         "fps": round(info.fps, 6),
-        "size": [info.camera.width, info.camera.height] if info.camera else None,
+        "size": None if info.image_size is None else [info.image_size[1], info.image_size[0]],
         "camera": _camera(info.camera),
+        "camera_guess": _camera(info.camera_guess),
         "depth": info.has_depth,
         "depth_units_per_metre": info.depth_scale,
         "depth_registered": info.has_depth and info.depth_camera is None,
@@ -37,7 +38,7 @@ def lines(report: dict[str, Any]) -> list[str]:
     out = [
         f"kind         {report['kind']}",
         f"frames       {report['frames']} at {report['fps']:.4g} a second",
-        f"camera       {_camera_text(report['camera'])}",
+        f"camera       {_seen_text(report)}",
         f"depth        {_depth_text(report)}",
         f"poses        {'given' if report['poses'] else 'none'}",
         f"scale        {report['scale']}",
@@ -69,6 +70,15 @@ def _camera(camera: Camera | None) -> dict[str, float] | None:
     if camera is None:
         return None
     return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+
+
+def _seen_text(report: dict[str, Any]) -> str:
+    """The camera, or what is known of it where it is not."""
+    if report["camera"] is not None or report["size"] is None:
+        return _camera_text(report["camera"])
+    width, height = report["size"]
+    guess = report["camera_guess"]
+    return f"unknown, {width}x{height}" + (f", about fx {guess['fx']:.0f} px by its EXIF" if guess else "")
 
 
 def _camera_text(camera: dict[str, float] | None) -> str:

@@ -120,6 +120,7 @@ class VideoSource:
             fingerprint=fingerprint("video", listing, self._options),
             notes=tuple(notes),
             missing=tuple(missing),
+            image_size=self._rig.color_size,
         )
 
 
