@@ -18,6 +18,7 @@ from list3r.association.joint_window import JointReconstructor
 from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.frames.base import Camera
+from list3r.instances.changed_places import add_changed_places
 from list3r.instances.overlays import write_support
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
@@ -156,6 +157,7 @@ def finish_session(
     with store.transaction():
         place_chunks(store, chosen.graph)
         if library:
+            add_changed_places(store, session_id)
             consolidate(store)
         store.complete_session(session_id)
 

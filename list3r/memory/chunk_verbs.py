@@ -136,7 +136,7 @@ class ChunkVerbs(Connection):
             [keyframe_row(chunk_id, keyframe) for keyframe in result.keyframes],
         )
         for instance in result.library.instances:
-            self._add_local_instance(chunk_id, instance)
+            self.add_local_instance(chunk_id, instance)
         return chunk_id
 
     def _add_frames(self, session_id: int, chunk_id: int, result: ChunkResult) -> None:
@@ -165,7 +165,8 @@ class ChunkVerbs(Connection):
             [(*r[:2], 0.0 if np.isnan(r[2]) else r[2], *r[3:]) for r in rows],
         )
 
-    def _add_local_instance(self, chunk_id: int, instance: LocalInstance) -> None:
+    def add_local_instance(self, chunk_id: int, instance: LocalInstance) -> None:
+        """Store one more local instance of a chunk, under a local id that the chunk does not have yet."""
         track = pack(track_arrays(instance.track))
         feature = instance.feature.astype("<f4").tobytes()
         plane = None if instance.plane is None else f8(instance.plane)

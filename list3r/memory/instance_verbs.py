@@ -212,8 +212,10 @@ class InstanceVerbs(EmbeddingVerbs):
         return {k: unpack_sim3(self._rows(query, (k,))[0][0]) for k in sorted(chunk_ids)}
 
     def node_checksums(self) -> dict[int, int]:
-        """A checksum, by chunk id, of what each chunk measured and of which of its local instances move."""
+        """A checksum, by chunk id, of what each chunk measured, of how many local instances it has and which move."""
         out = self.chunk_checksums()
+        for chunk_id, count in self._rows("SELECT chunk_id, count(*) FROM local_instances GROUP BY chunk_id"):
+            out[chunk_id] = (out[chunk_id] * 31 + 104729 * count) & 0xFFFFFFFF
         query = (
             "SELECT chunk_id, local_id, length(motion) FROM local_instances WHERE dynamic ORDER BY chunk_id, local_id"
         )

@@ -105,22 +105,35 @@ def look(points: Array, views: Iterable[View], settings: VisibilitySettings | No
     return Look(verdict, share, tuple(t[2] for t in best))
 
 
-def _told(points: Array, view: View, s: VisibilitySettings) -> tuple[int, int]:
-    """How many points of a surface one frame sees where they should be, and through how many it sees further."""
+UNTOLD, MET, FREE = 0, 1, 2
+"""What a frame tells about one point: nothing, a surface where it should be, free space through it."""
+
+
+def tell(points: Array, view: View, s: VisibilitySettings) -> NDArray[np.int8]:
+    """What one frame tells about each point of a surface, world coordinates. Shapes (N, 3) -> (N,)."""
+    out = np.zeros(len(points), np.int8)
     p = view.S_cam_world.apply(points)
     fx, fy, cx, cy = view.camera
     height, width = view.depth.shape
     z = p[:, 2] / view.unit
-    p = p[(z > s.nearest_m) & (z < s.most_depth_m)]
+    near = np.flatnonzero((z > s.nearest_m) & (z < s.most_depth_m))
+    p = p[near]
     column, row = np.rint(p[:, 0] / p[:, 2] * fx + cx), np.rint(p[:, 1] / p[:, 2] * fy + cy)
     inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
     p, column, row = p[inside], column[inside].astype(np.int64), row[inside].astype(np.int64)
     if len(p) == 0:
-        return 0, 0
+        return out
     around = np.stack([view.depth[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]) / view.unit
     z = p[:, 2] / view.unit
     slack = s.tolerance_m + s.noise_per_m2 * z**2
     met = (np.abs(around - z) <= slack).any(axis=0)
     known = (around > 0).sum(axis=0) >= 6
     free = known & (np.where(around > 0, around, np.inf) > z + slack).all(axis=0)
-    return int(met.sum()), int(free.sum())
+    out[near[inside]] = np.where(met, MET, np.where(free, FREE, UNTOLD))
+    return out
+
+
+def _told(points: Array, view: View, s: VisibilitySettings) -> tuple[int, int]:
+    """How many points of a surface one frame sees where they should be, and through how many it sees further."""
+    told = tell(points, view, s)
+    return int((told == MET).sum()), int((told == FREE).sum())

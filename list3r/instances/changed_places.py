@@ -1,0 +1,362 @@
+"""What came and went between sessions teaches what was there: surfaces that another session sees through.
+
+A thing that discovery overlooked, or took for part of what it stands on, shows itself when it goes: its surface is in
+the keyframes of one session, and those of the other look through it. Such surfaces, gathered chunk by chunk into
+clusters, become local instances of the chunk that saw them, with masks in its frames, so that merging and the story of
+changes treat them like any other. Only what no instance of the chunk stands for already is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from list3r.instances.cloud import pack
+from list3r.instances.features import object_feature
+from list3r.instances.settings import FEATURE_SPACE
+from list3r.instances.support import thin
+from list3r.memory.chunk_verbs import LocalNode
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.masks import encode_mask
+from list3r.memory.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
+from list3r.memory.store import Store
+from list3r.memory.visibility import FREE, MET, View, VisibilitySettings, tell, views_of
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ChangedPlaceSettings:
+    """When surfaces that another session sees through are a thing."""
+
+    voxel_m: float = 0.02
+    """Edge of the cells in which a chunk's surfaces are asked about."""
+    least_told: int = 2
+    """Frames of the other session that must see through a surface, and of its own that must see it."""
+    free_share: float = 0.7
+    """Share of the other session's frames that tell about a surface and must see through it."""
+    own_free: float = 0.25
+    """Share of its own session's frames up to which they may do so: else it is noise or moves."""
+    link_m: float = 0.045
+    """Surfaces within this distance are one thing."""
+    least_cells: int = 12
+    """Cells of the smallest thing."""
+    least_side_m: float = 0.05
+    """Its second longest side."""
+    largest_m: float = 1.2
+    """Diagonal of the largest; what is larger is a door, a curtain, or an error of placing."""
+    explained: float = 0.5
+    """Share of an instance that must be seen through for it to stand for what is gone there."""
+    scrap: float = 0.35
+    """Share of a cluster up to which what stands for it is a scrap of the thing, which is found anew as a whole."""
+    part: float = 0.3
+    """Share of a cluster that its unexplained rest must have, to be a thing of its own."""
+    least_mask_px: int = 12
+    """Pixels of the small depth image in which a keyframe must see it."""
+    block_m: float = 0.5
+    """Edge of the cells by which a frame is asked only about what it may see."""
+    max_points: int = 2500
+    """Support points of one thing."""
+    visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The surfaces of one chunk, one point for each occupied cell, world coordinates, with what frames tell of them."""
+
+    points: Array
+    """Shape (N, 3)."""
+    free: Ints
+    """Frames of other sessions that see through them. Shape (N,)."""
+    met: Ints
+    """Frames of other sessions that see them. Shape (N,)."""
+    own: Bools
+    """Whether their own session is sure of them. Shape (N,)."""
+
+
+def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSettings | None = None) -> int:
+    """Add local instances for what a session shows to have gone or come and no instance stands for; how many.
+
+    Call inside a transaction, after the chunks are placed. Chunks whose features are not of the space that is computed
+    here are left as they are.
+    """
+    s = settings or ChangedPlaceSettings()
+    chunks = store.chunks()
+    here = {c.component for c in chunks if c.session_id == session_id}
+    near = [c for c in chunks if c.component in here and c.session_id <= session_id]
+    if len({c.session_id for c in near}) < 2:
+        return 0
+    keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
+    upright = store.get_value("gravity", "unknown") != "unknown"
+    added = 0
+    for chunk in near:
+        others = [
+            c for c in near if c.component == chunk.component and (c.session_id == session_id) != _is(chunk, session_id)
+        ]
+        if not others or store.feature_space(chunk.chunk_id) != FEATURE_SPACE:
+            continue
+        unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
+        views = views_of(others, keyframes, unit)
+        own = views_of([chunk], keyframes, unit)
+        seen = _ask(own, views, unit, s)
+        nodes = store.local_nodes([chunk.chunk_id])
+        clusters = _unexplained(_gone(seen, s), nodes, chunk, unit, s)
+        frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
+        maker = _Maker(chunk, keyframes[chunk.chunk_id], own, frames, unit, upright, s)
+        following = 1 + max((n.local_id for n in nodes), default=-1)
+        for cluster in clusters:
+            thing = maker.make(following, cluster)
+            if thing is not None:
+                store.add_local_instance(chunk.chunk_id, thing)
+                following += 1
+                added += 1
+    return added
+
+
+def _is(chunk: ChunkRow, session_id: int) -> bool:
+    return chunk.session_id == session_id
+
+
+# ---------------------------------------------------------------------------------------------- what has changed
+
+
+def lift(view: View) -> tuple[Array, Ints, Ints]:
+    """Points of a keyframe's depth in the world (N, 3), with their rows and columns."""
+    fx, fy, cx, cy = view.camera
+    row, column = np.nonzero(view.depth > 0)
+    z = view.depth[row, column].astype(np.float64)
+    p = np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z], axis=1)
+    return view.S_cam_world.inverse().apply(p), row, column
+
+
+def _ask(own: Sequence[View], others: Sequence[View], unit: float, s: ChangedPlaceSettings) -> _Seen:
+    """The surfaces that a chunk's keyframes see, and what the frames of the other sessions tell of them."""
+    points = _cells([lift(v) for v in own], own, unit, s)
+    blocks = _Blocks(points, s.block_m * unit)
+    counts = {}
+    for name, views in (("own", own), ("others", others)):
+        met, free = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+        for view in views:
+            rows = blocks.seen_by(view, s.visibility.most_depth_m)
+            told = tell(points[rows], view, s.visibility)
+            met[rows[told == MET]] += 1
+            free[rows[told == FREE]] += 1
+        counts[name] = met, free
+    met, free = counts["own"]
+    sure = (met >= s.least_told) & (free <= s.own_free * met)
+    return _Seen(points, counts["others"][1], counts["others"][0], sure)
+
+
+class _Blocks:
+    """Points sorted into large cells, so that a frame is asked only about those that it may see."""
+
+    def __init__(self, points: Array, edge: float) -> None:
+        block = np.floor(points / edge).astype(np.int64)
+        _, first, at = np.unique(pack(block), return_index=True, return_inverse=True)
+        self._order = np.argsort(at, kind="stable")
+        self._bounds = np.searchsorted(at[self._order], np.arange(len(first) + 1))
+        self._centers = (block[first] + 0.5) * edge
+        self._radius = edge * np.sqrt(3.0) / 2
+
+    def seen_by(self, view: View, most_depth_m: float) -> Ints:
+        """Rows of the points in blocks that reach into the frustum of a frame."""
+        p = view.S_cam_world.apply(self._centers)
+        fx, fy, cx, cy = view.camera
+        height, width = view.depth.shape
+        radius = self._radius * float(view.S_cam_world.scale)
+        inside = (p[:, 2] > -radius) & (p[:, 2] < most_depth_m * view.unit + radius)
+        for axis, focal, low, high in ((0, fx, -cx, width - cx), (1, fy, -cy, height - cy)):
+            inside &= (focal * p[:, axis] - low * p[:, 2]) > -radius * np.hypot(focal, low)
+            inside &= (high * p[:, 2] - focal * p[:, axis]) > -radius * np.hypot(focal, high)
+        chosen = np.flatnonzero(inside)
+        parts = [self._order[self._bounds[n] : self._bounds[n + 1]] for n in chosen]
+        return np.concatenate(parts) if parts else np.zeros(0, np.int64)
+
+
+def _cells(
+    lifted: Sequence[tuple[Array, Ints, Ints]], views: Sequence[View], unit: float, s: ChangedPlaceSettings
+) -> Array:
+    """One mean point for each occupied cell, of what lies within reach. Shape (N, 3)."""
+    parts = []
+    for (p, row, column), view in zip(lifted, views, strict=True):
+        parts.append(p[view.depth[row, column] < s.visibility.most_depth_m * view.unit])
+    points = np.concatenate(parts) if parts else np.zeros((0, 3))
+    if len(points) == 0:
+        return points
+    cell = np.floor(points / (s.voxel_m * unit)).astype(np.int64)
+    _, at, count = np.unique(pack(cell), return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(at, points[:, k]) / count for k in range(3)], axis=1)
+
+
+def _gone(seen: _Seen, s: ChangedPlaceSettings) -> Array:
+    """The surfaces that the other sessions see through. Shape (N, 3)."""
+    through = (seen.free >= s.least_told) & (seen.free >= s.free_share * (seen.free + seen.met))
+    return np.asarray(seen.points[seen.own & through])
+
+
+def _clusters(points: Array, unit: float, s: ChangedPlaceSettings) -> list[Ints]:
+    """Rows of connected surfaces that are large enough for a thing, the largest first."""
+    if len(points) < s.least_cells:
+        return []
+    pairs = cKDTree(points).query_pairs(s.link_m * unit, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    _, label = connected_components(graph, directed=False)
+    rows = [np.flatnonzero(label == n) for n in range(int(label.max()) + 1)]
+    kept = [r for r in rows if _is_thing(points[r], unit, s)]
+    return sorted(kept, key=lambda r: (-len(r), int(r[0])))
+
+
+def _is_thing(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
+    sides = np.sort(np.ptp(points, axis=0))
+    large = float(np.linalg.norm(sides)) > s.largest_m * unit
+    return len(points) >= s.least_cells and sides[1] >= s.least_side_m * unit and not large
+
+
+def _unexplained(
+    points: Array, nodes: Sequence[LocalNode], chunk: ChunkRow, unit: float, s: ChangedPlaceSettings
+) -> list[Array]:
+    """Clusters of surfaces that are gone and that no instance of the chunk stands for. Shapes (N, 3)."""
+    if len(points) == 0:
+        return []
+    tree, reach = cKDTree(points), 1.5 * s.voxel_m * unit
+    stood_for = np.zeros(len(points), bool)
+    for node in nodes:
+        support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
+        if len(support) == 0:
+            continue
+        inside = tree.query(support, distance_upper_bound=reach)[0] < np.inf
+        if inside.mean() >= s.explained:
+            stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
+    out = []
+    for rows in _clusters(points, unit, s):
+        left = rows[~stood_for[rows]]
+        share = len(left) / len(rows)
+        if share >= 1.0 - s.scrap:
+            out.append(points[rows])
+        else:
+            out += [points[left[r]] for r in _clusters(points[left], unit, s) if len(r) >= s.part * len(rows)]
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- what becomes of it
+
+
+class _Maker:
+    """Makes local instances of clusters for one chunk."""
+
+    def __init__(
+        self,
+        chunk: ChunkRow,
+        keyframes: Sequence[Keyframe],
+        views: Sequence[View],
+        frames: Sequence[FrameRow],
+        unit: float,
+        upright: bool,
+        settings: ChangedPlaceSettings,
+    ) -> None:
+        self._chunk, self._s, self._unit = chunk, settings, unit
+        kept = [k for k in keyframes if k.depth_small.size]
+        self._pictures = [_picture(k) for k in kept]
+        self._views = list(views)
+        self._frames = list(frames)
+        R = chunk.S_world_chunk.rotation
+        self._up = R.T @ np.array([0.0, 0.0, 1.0]) if upright else np.array([0.0, -1.0, 0.0])
+
+    def make(self, local_id: int, cluster: Array) -> LocalInstance | None:
+        """The local instance of a cluster, or None where its keyframes show too little of it."""
+        tree = cKDTree(cluster)
+        reach = 1.5 * self._s.voxel_m * self._unit
+        points, rgb, masks = [], [], {}
+        for view, picture in zip(self._views, self._pictures, strict=True):
+            lifted, row, column = lift(view)
+            low, high = cluster.min(axis=0) - reach, cluster.max(axis=0) + reach
+            near = np.flatnonzero(((lifted > low) & (lifted < high)).all(axis=1))
+            near = near[tree.query(lifted[near], distance_upper_bound=reach)[0] < np.inf] if len(near) else near
+            if len(near) < self._s.least_mask_px:
+                continue
+            mask = np.zeros(view.depth.shape, bool)
+            mask[row[near], column[near]] = True
+            masks[view.frame_index] = mask
+            points.append(lifted[near])
+            rgb.append(_colors(picture, row[near], column[near], view.depth.shape))
+        if len(masks) < 1:
+            return None
+        S_chunk_world = self._chunk.S_world_chunk.inverse()
+        inside = S_chunk_world.apply(np.concatenate(points)).astype(np.float32)
+        in_chunk = self._unit / float(self._chunk.S_world_chunk.scale)
+        support = thin(inside, np.concatenate(rgb), np.ones(len(inside), np.float32), in_chunk, self._s.max_points)
+        feature = object_feature(support.points, support.rgb, self._up, in_chunk)
+        return LocalInstance(local_id, self._track(masks, support), feature, support, 0.8)
+
+    def _track(self, masks: dict[int, Bools], support: Support) -> MaskTrack:
+        """Masks in the keyframes, and by projection in the frames between two of them."""
+        size = self._chunk.image_size
+        full = {k: _fill(_enlarge(m, size)) for k, m in masks.items()}
+        order = sorted(full)
+        keys = sorted(v.frame_index for v in self._views)
+        for f in self._frames:
+            n = int(np.searchsorted(keys, f.frame_index))
+            around = keys[max(0, n - 1) : n + 1]
+            if f.frame_index not in full and len(around) == 2 and all(k in masks for k in around):
+                mask = self._projected(support.points, f)
+                if mask.any():
+                    full[f.frame_index] = mask
+        order = sorted(full)
+        places = [np.nonzero(full[k]) for k in order]
+        boxes = [[c.min(), r.min(), c.max() + 1, r.max() + 1] for r, c in places]
+        areas = np.array([len(r) for r, _ in places], np.int32)
+        return MaskTrack(
+            frames=np.array(order, np.int64),
+            boxes_xyxy=np.array(boxes, np.float32),
+            centers_xy=np.array([[c.mean(), r.mean()] for r, c in places], np.float32),
+            areas_px=areas,
+            visible_fraction=np.minimum(1.0, areas / max(float(np.quantile(areas, 0.9)), 1.0)).astype(np.float32),
+            masks=tuple(encode_mask(full[k]) for k in order),
+            image_size=size,
+        )
+
+    def _projected(self, points: NDArray[np.float32], frame: FrameRow) -> Bools:
+        """Mask of surface points in a frame between keyframes."""
+        fx, fy, cx, cy = self._chunk.intrinsics
+        height, width = self._chunk.image_size
+        p = Sim3.from_matrix(frame.T_chunk_cam).inverse().apply(points.astype(np.float64))
+        p = p[p[:, 2] > 1e-6]
+        column = np.rint(p[:, 0] / p[:, 2] * fx + cx).astype(np.int64)
+        row = np.rint(p[:, 1] / p[:, 2] * fy + cy).astype(np.int64)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        mask = np.zeros((height, width), bool)
+        mask[row[inside], column[inside]] = True
+        return _fill(mask)
+
+
+def _picture(keyframe: Keyframe) -> NDArray[np.uint8] | None:
+    if not keyframe.jpeg:
+        return None
+    decoded = cv2.imdecode(np.frombuffer(keyframe.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return None if decoded is None else np.asarray(decoded[:, :, ::-1], np.uint8)
+
+
+def _colors(picture: NDArray[np.uint8] | None, row: Ints, column: Ints, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Colours at pixels of the small depth image; grey where no picture was kept. Shape (N, 3)."""
+    if picture is None:
+        return np.full((len(row), 3), 128, np.uint8)
+    r = np.minimum(((row + 0.5) * picture.shape[0] / shape[0]).astype(np.int64), picture.shape[0] - 1)
+    c = np.minimum(((column + 0.5) * picture.shape[1] / shape[1]).astype(np.int64), picture.shape[1] - 1)
+    return np.asarray(picture[r, c])
+
+
+def _enlarge(mask: Bools, size: tuple[int, int]) -> Bools:
+    return np.asarray(cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def _fill(mask: Bools) -> Bools:
+    """Holes of a few pixels closed."""
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0)
