@@ -36,6 +36,8 @@ class Proposals:
     base: NDArray[np.float64] | None = None
     """Plane, in camera coordinates of the anchor, of the wall or floor that a flat candidate lies on, NaN for the
     others, where the discoverer knows. Shape (N, 4)."""
+    names: tuple[str, ...] | None = None
+    """Class name of each candidate, where the discoverer has names. N of them."""
 
 
 class Discoverer(Protocol):

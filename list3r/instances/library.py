@@ -62,4 +62,5 @@ def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposal
         identity=None if proposals.identity is None else proposals.identity[keep],
         structure=None if proposals.structure is None else proposals.structure[keep],
         base=None if proposals.base is None else proposals.base[keep],
+        names=None if proposals.names is None else tuple(proposals.names[k] for k in keep.tolist()),
     )

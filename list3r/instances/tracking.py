@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -57,23 +57,38 @@ class ReprojectionTracker:
         images = [_instance_image(views, p, j) for p, j in zip(proposals, joined, strict=True)]
         bases = _bases(views, proposals, joined, count)
         supports = collect_supports(views, proposals, images, bases, self.settings.track.support_points)
-        tracks = self._follow(views, proposals, images, supports)
-        return self._library(views, proposals, joined, supports, tracks=tracks, feature_space=feature_space)
+        positions = np.array([p.position for p in proposals], np.int64)
 
-    def _follow(
-        self,
-        views: ChunkViews,
-        proposals: Sequence[Proposals],
-        images: Sequence[NDArray[np.int32]],
-        supports: Sequence[Support],
-    ) -> list[_Track]:
+        def labels_of(position: int) -> NDArray[np.int32]:
+            return frame_labels(views, proposals, images, positions, position)
+
+        return LabelledChunk(views, proposals, joined, supports, self.settings).library(labels_of, feature_space)
+
+
+@dataclass(frozen=True)
+class LabelledChunk:
+    """Candidates that were given to instances, and the instances' supports: what any tracker ends in."""
+
+    views: ChunkViews
+    proposals: Sequence[Proposals]
+    joined: Sequence[NDArray[np.int64]]
+    """Instance of each candidate of each anchor, -1 for none."""
+    supports: Sequence[Support]
+    """One for each instance."""
+    settings: InstanceSettings
+
+    def library(self, labels_of: Callable[[int], NDArray[np.int32]], feature_space: str) -> LocalLibrary:
+        """The stable tracks; `labels_of` gives instance + 1 of each pixel of a frame at working size, by position."""
+        return self._library(self._follow(labels_of), feature_space)
+
+    def _follow(self, labels_of: Callable[[int], NDArray[np.int32]]) -> list[_Track]:
+        views, supports = self.views, self.supports
         tracks = [_Track() for _ in supports]
         samples, owner = _sample_supports(supports)
-        positions = np.array([p.position for p in proposals], np.int64)
         settings, camera = self.settings.track, views.reconstruction.camera
         min_area = settings.min_area_px * camera.width * camera.height / (640 * 480)
         for position in np.flatnonzero(views.reconstruction.posed).tolist():
-            labels = frame_labels(views, proposals, images, positions, position)
+            labels = labels_of(position)
             seen, hit = _look_for(views, position, labels, samples, owner=owner, count=len(supports))
             runs = encode_labels(labels, views.stride, (camera.height, camera.width))
             for instance, (mask, area, box, center) in runs.items():
@@ -89,16 +104,8 @@ class ReprojectionTracker:
                 track.masks.append(mask)
         return tracks
 
-    def _library(
-        self,
-        views: ChunkViews,
-        proposals: Sequence[Proposals],
-        joined: Sequence[NDArray[np.int64]],
-        supports: Sequence[Support],
-        *,
-        tracks: Sequence[_Track],
-        feature_space: str,
-    ) -> LocalLibrary:
+    def _library(self, tracks: Sequence[_Track], feature_space: str) -> LocalLibrary:
+        views, proposals, joined, supports = self.views, self.proposals, self.joined, self.supports
         size = (views.reconstruction.camera.height, views.reconstruction.camera.width)
         posed = int(views.reconstruction.posed.sum())
         least = self.settings.track.least_frames(posed)

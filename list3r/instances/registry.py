@@ -1,0 +1,68 @@
+"""Discoverers, trackers and features by name; the neural ones are imported only when they are asked for."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from list3r.instances.base import Discoverer, Tracker
+from list3r.instances.discovery import GeometricDiscoverer
+from list3r.instances.settings import InstanceSettings
+from list3r.instances.tracking import ReprojectionTracker
+from list3r.memory.errors import OptionError
+
+DISCOVERERS = ("geometric", "eomt", "mask2former", "sam2", "sam3")
+TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
+FEATURES = ("geometric", "own", "dinov2", "dinov3")
+"""`own` are those of a neural discoverer; geometric ones belong to the geometric discoverer."""
+
+
+def check_choice(discovery: str, tracking: str, features: str) -> None:
+    """Raises `OptionError` for names that are not known or do not go together."""
+    for option, value, known in (
+        ("discovery", discovery, DISCOVERERS),
+        ("tracking", tracking, TRACKERS),
+        ("features", features, FEATURES),
+    ):
+        if value not in known:
+            raise OptionError(f"--{option} {value} is not known; choose one of {', '.join(known)}")
+    if features == "geometric" and discovery != "geometric":
+        raise OptionError(f"--features geometric needs --discovery geometric; with {discovery} use own or dinov2")
+    if features == "own" and discovery == "geometric":
+        raise OptionError("--features own are those of a neural discoverer; with geometric use geometric or dinov2")
+
+
+@lru_cache(maxsize=2)
+def make_discoverer(
+    discovery: str, features: str, folders: tuple[tuple[str, str], ...], device: str, settings: InstanceSettings
+) -> Discoverer:
+    """The discoverer of that name; `folders` are (part/model, folder of its weights). Raises `OptionError`."""
+    where = {name: Path(folder) for name, folder in folders}
+    found: Discoverer
+    if discovery == "geometric":
+        found = GeometricDiscoverer(settings)
+    elif discovery in ("eomt", "mask2former"):
+        from list3r.instances.query_segmenter import QuerySegmenter
+
+        found = QuerySegmenter(discovery, where[f"discovery/{discovery}"], device, settings)
+    else:
+        from list3r.instances.sam_masks import SamMasks
+
+        found = SamMasks(discovery, where[f"discovery/{discovery}"], device, settings)
+    if features in ("geometric", "own"):
+        return found
+    from list3r.instances.appearance import Appearance, WithAppearance
+
+    return WithAppearance(found, Appearance(features, where[f"features/{features}"], device))
+
+
+@lru_cache(maxsize=2)
+def make_tracker(
+    tracking: str, folders: tuple[tuple[str, str], ...], device: str, settings: InstanceSettings
+) -> Tracker:
+    """The tracker of that name; see `make_discoverer`. Raises `OptionError`."""
+    if tracking == "reprojection":
+        return ReprojectionTracker(settings)
+    from list3r.instances.video_tracker import VideoTracker
+
+    return VideoTracker(tracking, Path(dict(folders)[f"tracking/{tracking}"]), device, settings)

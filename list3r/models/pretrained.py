@@ -1,0 +1,104 @@
+"""Loads a network of the `transformers` package from a folder or from the cache of the hub, onto a device."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from list3r.memory.errors import OptionError
+
+if TYPE_CHECKING:
+    import torch
+
+WEIGHTS = ("model.safetensors", "model.safetensors.index.json", "pytorch_model.bin")
+
+
+def pick_device(name: str) -> torch.device:
+    """`auto` is the first GPU where there is one. Raises `OptionError` for a device that is not there."""
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise OptionError(f"--device {name}: there is no such GPU here; use --device cpu")
+    except RuntimeError:
+        raise OptionError(f"--device {name} is not known; give cpu, cuda or cuda:1") from None
+    return device
+
+
+def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
+    """The network of a folder with `config.json` and weights, in evaluation mode, float32 on a CPU, bfloat16 else.
+
+    Raises `OptionError` when the package is missing, the folder is not such a folder, or the weights are of another
+    network (a missing or an unexpected layer, another shape).
+    """
+    cls = _transformers_class(class_name)
+    check_folder(folder)
+    import torch
+    from transformers.utils import logging
+
+    dtype = torch.float32 if device.type == "cpu" else torch.bfloat16
+    level = logging.get_verbosity()
+    logging.set_verbosity_error()  # type: ignore[no-untyped-call]
+    try:
+        model, report = cls.from_pretrained(folder, dtype=dtype, local_files_only=True, output_loading_info=True)
+    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError) as error:
+        raise OptionError(f"{folder} cannot be loaded as {class_name}: {_first_line(error)}") from None
+    except Exception as error:
+        if type(error).__name__ != "SafetensorError":
+            raise
+        raise OptionError(f"the weights in {folder} are damaged ({_first_line(error)}); fetch them again") from None
+    finally:
+        logging.set_verbosity(level)
+    wrong = sorted(str(k) for k in (*report["missing_keys"], *report["mismatched_keys"]))
+    if wrong:
+        raise OptionError(
+            f"{folder} holds other weights than {class_name} needs: {len(wrong)} of its layers are missing or have "
+            f"another shape, first {wrong[0]}"
+        )
+    return model.to(device).eval()
+
+
+def check_folder(folder: Path) -> None:
+    """Raises `OptionError` unless the folder has a configuration and weights."""
+    if not folder.is_dir():
+        raise OptionError(f"the folder of weights {folder} does not exist; see `list3r models list`")
+    if not (folder / "config.json").is_file():
+        raise OptionError(f"{folder} has no config.json; give the folder that the weights' repository was saved to")
+    if not any((folder / name).is_file() for name in WEIGHTS):
+        raise OptionError(f"{folder} has no weights ({', '.join(WEIGHTS)}); fetch them again")
+
+
+def space_name(model: str, folder: Path, dimensions: int) -> str:
+    """Name of the embedding space of a network's features, `model@revision/dim`.
+
+    The revision is the hub's where the folder is a snapshot of its cache, else a digest of configuration and weights.
+    """
+    if folder.parent.name == "snapshots":
+        return f"{model}@{folder.name[:12]}/{dimensions}"
+    digest = hashlib.sha256((folder / "config.json").read_bytes())
+    for path in sorted(folder.glob("*.safetensors")):
+        with path.open("rb") as file:
+            digest.update(file.read(1 << 20))
+            file.seek(max(0, path.stat().st_size - (1 << 20)))
+            digest.update(file.read())
+    return f"{model}@{digest.hexdigest()[:12]}/{dimensions}"
+
+
+def _transformers_class(name: str) -> Any:
+    try:
+        import transformers
+    except ImportError:
+        raise OptionError(f"{name} needs the package transformers; pip install 'list3r[models]'") from None
+    found = getattr(transformers, name, None)
+    if found is None:
+        raise OptionError(f"this version of transformers ({transformers.__version__}) has no {name}; upgrade it")
+    return found
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0][:200] if lines else type(error).__name__
