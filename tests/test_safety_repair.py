@@ -30,7 +30,7 @@ def spoil(path: Path, *statements: str) -> None:
 
 
 ROWS = {
-    "a place of a chunk": "UPDATE chunks SET S_world_chunk = zeroblob(104)",
+    "a place of a chunk": "UPDATE placements SET S_world_chunk = zeroblob(104)",
     "an edge": "UPDATE edges SET S_v_u = zeroblob(104)",
     "a pose": "UPDATE frames SET T_chunk_cam = zeroblob(128) WHERE frame_index = 7",
     "a time": "UPDATE frames SET time_s = 3.0 WHERE frame_index = 7",
@@ -114,6 +114,20 @@ def test_a_lost_chunk_takes_along_what_hung_on_it(tmp_path: Path) -> None:
     assert report.lost["chunks"] == ["2"] and report.lost["edges"] and report.chunks == 1
     with Store.open(tmp_path / "sound.l3r") as store:
         assert store.verify() == [] and [c.chunk_id for c in store.chunks()] == [1]
+
+
+def test_a_chunk_whose_place_is_lost_is_placed_by_its_relations(tmp_path: Path) -> None:
+    path = tmp_path / "old.l3r"
+    shutil.copy(FIXTURES / "schema2.l3r", path)
+    with Store.open(path, writable=True) as store:
+        (edge,) = [e for e in store.edges() if e.accepted]
+    spoil(path, "UPDATE placements SET S_world_chunk = zeroblob(104) WHERE chunk_id = 2")
+    report = repair(path, tmp_path / "sound.l3r")
+    assert report.lost["placements"] == ["2"] and report.rebuilt and (edge.u, edge.v) == (1, 2)
+    with Store.open(tmp_path / "sound.l3r") as store:
+        assert store.verify() == []
+        S_v_u = store.chunk(2).S_world_chunk.inverse() @ store.chunk(1).S_world_chunk
+        assert np.allclose(S_v_u.as_matrix(), edge.S_v_u.as_matrix())
 
 
 def test_a_broken_page_costs_only_what_lay_on_it(make_memory: Make) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,6 +51,7 @@ from list3r.memory.rows import (
     sample_arrays,
     track_arrays,
 )
+from list3r.memory.writer_lock import WriterLock
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,12 @@ class LocalNode:
 class ChunkVerbs(Connection):
     """Writing and reading what the chunks measured. Writing verbs are called inside `transaction()`."""
 
+    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
+        super().__init__(path, database, lock)
+        self._chunk_rows: dict[int, ChunkRow] | None = None
+        self._chunk_version = self._edge_version = -1
+        self._edge_rows: dict[tuple[int, int, str, int, int], Edge] | None = None
+
     # ------------------------------------------------------------------ sessions
 
     def add_session(self, source: str, fingerprint: str, settings: Mapping[str, object], frame_count: int) -> int:
@@ -109,15 +118,14 @@ class ChunkVerbs(Connection):
         overlap = pack(sample_arrays(result.samples))
         links = result.library.cannot_link.astype("<i4").tobytes()
         cursor = self._database.execute(
-            "INSERT INTO chunks (session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy,"
-            " cx, cy, height, width, scale_kind, feature_space, cannot_link, overlap, seconds, crc)"
-            " VALUES (?, ?, ?, ?, 0, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO chunks (session_id, chunk_index, first_frame, last_frame, fx, fy, cx, cy, height, width,"
+            " scale_kind, feature_space, cannot_link, overlap, seconds, crc)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
                 session_id,
                 result.index,
                 int(result.frame_indices[0]),
                 int(result.frame_indices[-1]),
-                pack_sim3(Sim3.identity()),
                 *result.intrinsics,
                 *result.image_size,
                 result.scale_kind,
@@ -129,7 +137,10 @@ class ChunkVerbs(Connection):
             ),
         )
         chunk_id = int(cursor.lastrowid or 0)
-        self._database.execute("UPDATE chunks SET component = chunk_id WHERE chunk_id = ?", (chunk_id,))
+        self._database.execute(
+            "INSERT INTO placements VALUES (?, ?, ?, NULL)", (chunk_id, chunk_id, pack_sim3(Sim3.identity()))
+        )
+        self._chunk_rows = None if self._chunk_rows is None else {**self._chunk_rows, **self._read_chunks([chunk_id])}
         self._add_frames(session_id, chunk_id, result)
         self._database.executemany(
             "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)",
@@ -206,12 +217,31 @@ class ChunkVerbs(Connection):
 
     def chunks(self, session_id: int | None = None) -> list[ChunkRow]:
         """The chunks in order, of one session or of all."""
-        where, arguments = ("", ()) if session_id is None else ("WHERE session_id = ?", (session_id,))
+        rows = self._placed().values()
+        return [c for c in rows if session_id is None or c.session_id == session_id]
+
+    def chunk(self, chunk_id: int) -> ChunkRow:
+        """One chunk. Raises `MemoryFileError` when the memory has none of that id."""
+        found = self._placed().get(chunk_id)
+        if found is None:
+            raise MemoryFileError(f"{self.path} has no chunk {chunk_id}")
+        return found
+
+    def _placed(self) -> dict[int, ChunkRow]:
+        """All chunks by id, read again only when another process or a rollback may have changed them."""
+        version = int(self._rows("PRAGMA data_version")[0][0])
+        if self._chunk_rows is None or self._chunk_version != version:
+            self._chunk_rows, self._chunk_version = self._read_chunks(), version
+        return self._chunk_rows
+
+    def _read_chunks(self, chunk_ids: Sequence[int] = ()) -> dict[int, ChunkRow]:
+        where = f"WHERE c.chunk_id IN ({','.join('?' * len(chunk_ids))})" if chunk_ids else ""
         query = (
-            "SELECT chunk_id, session_id, chunk_index, first_frame, last_frame, component, S_world_chunk, fx, fy, cx,"
-            f" cy, height, width, scale_kind, covariance FROM chunks {where} ORDER BY chunk_id"
+            "SELECT c.chunk_id, c.session_id, c.chunk_index, c.first_frame, c.last_frame, p.component,"
+            " p.S_world_chunk, c.fx, c.fy, c.cx, c.cy, c.height, c.width, c.scale_kind, p.covariance"
+            f" FROM chunks c JOIN placements p USING (chunk_id) {where} ORDER BY c.chunk_id"
         )
-        return [read_chunk_row(row) for row in self._rows(query, arguments)]
+        return {row[0]: read_chunk_row(row) for row in self._rows(query, tuple(chunk_ids))}
 
     def place_chunks(
         self,
@@ -219,12 +249,39 @@ class ChunkVerbs(Connection):
         components: Mapping[int, int],
         covariances: Mapping[int, NDArray[np.float64]] | None = None,
     ) -> None:
-        """Rewrite `S_world_chunk`, component and uncertainty of chunks: all that a loop closure moves."""
+        """Rewrite `S_world_chunk`, component and uncertainty of chunks: all that a loop closure moves.
+
+        Chunks that are not named stay as they are, and so do the rows of those that lie there already.
+        """
         known = covariances or {}
+        rows = dict(self._placed())
+        fresh = []
+        for k, S in poses.items():
+            after = replace(rows[k], S_world_chunk=S, component=int(components[k]), covariance=known.get(k))
+            if not _same_place(rows[k], after):
+                fresh.append(k)
+                rows[k] = after
         self._database.executemany(
-            "UPDATE chunks SET S_world_chunk = ?, component = ?, covariance = ? WHERE chunk_id = ?",
-            [(pack_sim3(S), components[k], f8(known[k]) if k in known else None, k) for k, S in poses.items()],
+            "UPDATE placements SET component = ?, S_world_chunk = ?, covariance = ? WHERE chunk_id = ?",
+            [
+                (
+                    rows[k].component,
+                    pack_sim3(rows[k].S_world_chunk),
+                    None if rows[k].covariance is None else f8(known[k]),
+                    k,
+                )
+                for k in fresh
+            ],
         )
+        self._chunk_rows = rows
+
+    def forget_rows(self) -> None:
+        """Read chunks and edges again when they are next asked for."""
+        self._chunk_rows = self._edge_rows = None
+
+    def _roll_back(self) -> None:
+        super()._roll_back()
+        self.forget_rows()
 
     def flag_dynamic(self, chunk_id: int, motions: Mapping[int, MotionTrack | None]) -> None:
         """Say of local instances, by local id, that they move, and where they were."""
@@ -274,6 +331,8 @@ class ChunkVerbs(Connection):
 
     def add_edges(self, edges: Iterable[Edge]) -> None:
         """Store measured relations of chunks; one measured again replaces the old one."""
+        known = self._known_edges()
+        fresh = list(edges)
         self._database.executemany(
             "INSERT OR REPLACE INTO edges (u, v, kind, frame_u, frame_v, S_v_u, confidence, weight, inliers,"
             " residual_m, accepted, reason, scores, covariance) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -293,17 +352,31 @@ class ChunkVerbs(Connection):
                     to_json(e.scores),
                     None if e.covariance is None else f8(e.covariance),
                 )
-                for e in edges
+                for e in fresh
             ],
         )
+        for e in fresh:
+            key = (e.u, e.v, e.kind, *(e.frames or (-1, -1)))
+            known |= self._read_edges("WHERE u = ? AND v = ? AND kind = ? AND frame_u = ? AND frame_v = ?", key)
+        self._edge_rows = dict(sorted(known.items()))
 
     def edges(self) -> list[Edge]:
         """All measured relations of chunks, accepted or not."""
+        return list(self._known_edges().values())
+
+    def _known_edges(self) -> dict[tuple[int, int, str, int, int], Edge]:
+        """All edges by key and in order, read again only when another process or a rollback may have changed them."""
+        version = int(self._rows("PRAGMA data_version")[0][0])
+        if self._edge_rows is None or self._edge_version != version:
+            self._edge_rows, self._edge_version = self._read_edges(), version
+        return self._edge_rows
+
+    def _read_edges(self, where: str = "", key: tuple[Any, ...] = ()) -> dict[tuple[int, int, str, int, int], Edge]:
         query = (
             "SELECT u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u,"
-            " frame_v, covariance FROM edges ORDER BY u, v, kind, frame_u, frame_v"
+            f" frame_v, covariance FROM edges {where} ORDER BY u, v, kind, frame_u, frame_v"
         )
-        return [read_edge(row) for row in self._rows(query)]
+        return {(r[0], r[1], r[2], r[11], r[12]): read_edge(r) for r in self._rows(query, key)}
 
     # ------------------------------------------------------------------ frames and keyframes
 
@@ -383,6 +456,16 @@ class ChunkVerbs(Connection):
         if not rows:
             raise MemoryFileError(f"{self.path} has no local instance {local_id} in chunk {chunk_id}")
         return read_track(unpack(rows[0][0], f"the masks of local instance {chunk_id}:{local_id}"))
+
+
+def _same_place(a: ChunkRow, b: ChunkRow) -> bool:
+    """Whether two rows of one chunk say the same of where it lies."""
+    if a.component != b.component or (a.covariance is None) != (b.covariance is None):
+        return False
+    S, T = a.S_world_chunk, b.S_world_chunk
+    same = np.array_equal(S.scale, T.scale) and np.array_equal(S.translation, T.translation)
+    same = same and np.array_equal(S.rotation, T.rotation)
+    return bool(same and (a.covariance is None or np.array_equal(a.covariance, np.asarray(b.covariance))))
 
 
 def _local_node(row: tuple[Any, ...]) -> LocalNode:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.codec import dequantise, raw_array, to_json, unpack_sim3
+from list3r.memory.codec import dequantise, raw_array, to_json
 from list3r.memory.embedding_verbs import EmbeddingVerbs
 from list3r.memory.errors import UnknownIdError
 from list3r.memory.geometry import OrientedBox, Sim3
@@ -208,8 +208,7 @@ class InstanceVerbs(EmbeddingVerbs):
 
     def _poses(self, chunk_ids: Iterable[int]) -> dict[int, Sim3]:
         """S_world_chunk of some chunks."""
-        query = "SELECT S_world_chunk FROM chunks WHERE chunk_id = ?"
-        return {k: unpack_sim3(self._rows(query, (k,))[0][0]) for k in sorted(chunk_ids)}
+        return {k: self.chunk(k).S_world_chunk for k in sorted(chunk_ids)}
 
     def node_checksums(self) -> dict[int, int]:
         """A checksum, by chunk id, of what each chunk measured, of how many local instances it has and which move."""

@@ -11,10 +11,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from list3r.memory.codec import checksum, unpack
+from list3r.memory.codec import checksum, pack_sim3, unpack
 from list3r.memory.connection import FAILURES, check_schema, protect
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import MemoryFileError
+from list3r.memory.geometry import Sim3
 from list3r.memory.schema import SCHEMA_VERSION
 from list3r.memory.store import GEOMETRY_BYTES, Store
 from list3r.memory.sums import OWN_CRC, SummedTable, row_crc, stored_sums, summed_tables
@@ -22,7 +23,9 @@ from list3r.memory.writer_lock import WriterLock
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events")
 """Tables that consolidation writes; a row lost there is written anew."""
-_OF_A_CHUNK = ("frames", "keyframes", "local_instances", "supports", "observations")
+_PASSING = ("settled", "overlaps", "members", "anchors")
+"""Tables that consolidation goes on with; without them it derives the library as a whole."""
+_OF_A_CHUNK = ("placements", "frames", "keyframes", "local_instances", "supports", "observations")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""
 
@@ -151,7 +154,8 @@ class _Lost:
 def _salvage(damaged: sqlite3.Connection, store: Store) -> _Lost:
     """Write all rows that are as they were written, and what hangs together with them, into an empty store."""
     lost = _Lost()
-    kept = {name: _sound_rows(damaged, table, lost) for name, table in summed_tables().items()}
+    tables = {name: table for name, table in summed_tables().items() if name not in _PASSING}
+    kept = {name: _sound_rows(damaged, table, lost) for name, table in tables.items()}
     lost.instances = {key[0] for key in (*kept["instances"], *lost.keys.get("instances", ()))}
     _drop_unreadable(kept, lost)
     _drop_orphans(kept, lost)
@@ -274,6 +278,7 @@ def _name_missing(lost: _Lost, table: str, key: Row) -> None:
 
 def _stand_in_for_lost(store: Store, lost: _Lost) -> None:
     """What the rest cannot do without: a session of which only chunks are left, the kind of scale."""
+    _place_lost(store, lost)
     held = {s.session_id for s in store.sessions()}
     frames: dict[int, int] = {}
     for f in store.frames():
@@ -291,9 +296,31 @@ def _stand_in_for_lost(store: Store, lost: _Lost) -> None:
     store.set_value("last_id", max([store.next_id() - 1, *ids]))
 
 
+def _place_lost(store: Store, lost: _Lost) -> None:
+    """Chunks whose place is lost are put where a relation to a chunk that has one puts them, or apart."""
+    rows = store._database.execute("SELECT chunk_id FROM chunks ORDER BY chunk_id").fetchall()
+    there = {c.chunk_id for c in store.chunks()}
+    missing = [k for (k,) in rows if k not in there]
+    if not missing:
+        return
+    own = pack_sim3(Sim3.identity())
+    store._database.executemany("INSERT INTO placements VALUES (?, ?, ?, NULL)", [(k, k, own) for k in missing])
+    store.forget_rows()
+    left = dict.fromkeys(missing)
+    edges = [e for e in store.edges() if e.accepted]
+    while ties := [e for e in edges if (e.u in left) != (e.v in left)]:
+        u, v, S_v_u = ties[0].u, ties[0].v, ties[0].S_v_u
+        here, lost_one, S_here_lost = (u, v, S_v_u.inverse()) if v in left else (v, u, S_v_u)
+        row = store.chunk(here)
+        store.place_chunks({lost_one: row.S_world_chunk @ S_here_lost}, {lost_one: row.component})
+        del left[lost_one]
+    for k in missing:
+        _name_missing(lost, "placements", (k,))
+
+
 def _needs_deriving(lost: _Lost) -> bool:
     touched = {*lost.keys, *lost.unnamed}
-    return bool(touched & {"chunks", "frames", "local_instances", "supports", *_DERIVED, "memory"})
+    return bool(touched & {"chunks", "placements", "frames", "local_instances", "supports", *_DERIVED, "memory"})
 
 
 def _derive(store: Store) -> None:

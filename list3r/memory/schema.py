@@ -89,6 +89,31 @@ MIGRATIONS: tuple[str, ...] = (
         kind TEXT NOT NULL, from_box BLOB, to_box BLOB, frames TEXT NOT NULL, confidence REAL NOT NULL,
         reason TEXT NOT NULL, PRIMARY KEY (session_id, instance)) WITHOUT ROWID;
     """,
+    # 4: where chunks lie in small rows of their own; what consolidation goes on with when the next chunk comes
+    """
+    CREATE TABLE placements (
+        chunk_id INTEGER PRIMARY KEY REFERENCES chunks, component INTEGER NOT NULL, S_world_chunk BLOB NOT NULL,
+        covariance BLOB);
+    INSERT INTO placements SELECT chunk_id, component, S_world_chunk, covariance FROM chunks;
+    ALTER TABLE chunks DROP COLUMN component;
+    ALTER TABLE chunks DROP COLUMN S_world_chunk;
+    ALTER TABLE chunks DROP COLUMN covariance;
+    CREATE TABLE settled (
+        chunk_id INTEGER PRIMARY KEY REFERENCES chunks, component INTEGER NOT NULL, S_graph_chunk BLOB NOT NULL,
+        extent BLOB NOT NULL, dropped BLOB NOT NULL);
+    CREATE TABLE overlaps (
+        u INTEGER NOT NULL REFERENCES chunks, v INTEGER NOT NULL REFERENCES chunks, scores BLOB NOT NULL,
+        PRIMARY KEY (u, v)) WITHOUT ROWID;
+    CREATE INDEX overlaps_by_second ON overlaps (v);
+    CREATE TABLE members (
+        chunk_id INTEGER NOT NULL, local_id INTEGER NOT NULL, first_chunk INTEGER NOT NULL,
+        first_local INTEGER NOT NULL, shown INTEGER NOT NULL, PRIMARY KEY (chunk_id, local_id)) WITHOUT ROWID;
+    CREATE INDEX members_by_group ON members (first_chunk, first_local);
+    CREATE TABLE anchors (
+        instance INTEGER PRIMARY KEY REFERENCES instances, chunk_id INTEGER NOT NULL, S_exact_settled BLOB NOT NULL);
+    CREATE INDEX merges_by_names ON merges (a, b);
+    DELETE FROM memory WHERE key = 'settled_poses';
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)
