@@ -36,6 +36,10 @@ DIMENSION = 256
 ROOM_M = np.array([5.0, 5.0, 3.0])
 THINGS = 30
 BATCH = 20_000
+COLORS = "white black grey red orange yellow green teal blue purple brown pink".split()
+SHAPES = "box cylinder sheet slab panel object table sphere".split()
+NOUNS = 200
+"""Labels that one thing in fifty has."""
 Floats = NDArray[np.float64]
 
 
@@ -135,14 +139,15 @@ def things(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Itera
     size = 0.05 * 40.0 ** (rng.uniform(size=(len(ids), 3)) ** 2)
     center = corner + rng.uniform(0.0, 1.0, size.shape) * (ROOM_M - np.minimum(size, ROOM_M)) + size / 2
     angle = rng.uniform(0.0, np.pi, len(ids))
+    color, shape, noun = (rng.integers(0, n, len(ids)) for n in (len(COLORS), len(SHAPES), 50 * NOUNS))
     for n, instance_id in enumerate(ids.tolist()):
         c, s = np.cos(angle[n]), np.sin(angle[n])
         box = OrientedBox(center[n], size[n], np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
         corners = box.corners()
         yield Instance(
             id=instance_id,
-            label=None,
-            description=f"white box, {100 * size[n].max():.0f} cm",
+            label=f"noun{noun[n]}" if noun[n] < NOUNS else None,
+            description=_described(size[n].max(), COLORS[color[n]], SHAPES[shape[n]]),
             center=center[n],
             aabb=np.stack([corners.min(axis=0), corners.max(axis=0)]),
             box=box,
@@ -153,10 +158,15 @@ def things(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Itera
             state="present",
             structure=None,
             color_rgb=(240, 240, 240),
-            color_name="white",
+            color_name=COLORS[color[n]],
             component=1,
             best_view=None,
         )
+
+
+def _described(edge_m: float, color: str, shape: str) -> str:
+    size = "small" if edge_m < 0.3 else "medium" if edge_m < 1.0 else "large"
+    return f"{size} {color} {shape}, {100 * edge_m:.0f} cm"
 
 
 def features(count: int, seed: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -119,7 +119,7 @@ def brute(store: Store, query: np.ndarray, k: int) -> list[int]:
 @pytest.mark.parametrize("exact", [100_000, 50])
 def test_similar_follows_what_is_written(store: Store, exact: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vectors, "_EXACT", exact)
-    monkeypatch.setattr(vectors, "_PROBED", 40)
+    monkeypatch.setattr(vectors, "_PROBED", 1000)
     rng = np.random.default_rng(3)
     asked = rng.normal(size=(10, 32)).astype(np.float32)
 
@@ -163,3 +163,28 @@ def test_filters_that_few_pass_are_served_in_full(store: Store, monkeypatch: pyt
     known = cosine(store, query)
     removed = [i.id for i in store.instances() if i.state == "removed"]
     assert [m.instance.id for m in found] == sorted(removed, key=lambda n: -known[n])[:6]
+
+
+def test_cells_are_kept_and_followed_by_what_changes(
+    store: Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(vectors, "_EXACT", 50)
+    monkeypatch.setattr(vectors, "_PROBED", 1000)
+    monkeypatch.setenv("LIST3R_CACHE", str(tmp_path / "cache"))
+    query = np.random.default_rng(5).normal(size=32).astype(np.float32)
+    similar(store, vector=query, space=SPACE, k=1)
+    (kept,) = (tmp_path / "cache" / "cells").iterdir()
+    first = kept.read_bytes()
+
+    def answers() -> list[int]:
+        with Store.open(store.path) as again:
+            return [m.instance.id for m in similar(again, vector=query, space=SPACE, k=9, structure=True)]
+
+    assert answers() == brute(store, query, 9)
+    assert kept.read_bytes() == first, "nothing new, nothing kept anew"
+    with store.transaction():
+        store.put_embeddings(SPACE, [7, 8], np.stack([query, -query]))
+    assert answers()[0] == 7 and answers() == brute(store, query, 9)
+    for spoiled in (b"", first[:-100], first[: len(first) // 2] + bytes([1, 2, 3]) + first[len(first) // 2 + 3 :]):
+        kept.write_bytes(spoiled)
+        assert answers() == brute(store, query, 9), "what is kept cannot change an answer"

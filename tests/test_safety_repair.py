@@ -12,6 +12,7 @@ import pytest
 
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict
+from list3r.memory.connection import PAGE_BYTES
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance
 from list3r.memory.repair import repair
@@ -135,7 +136,7 @@ def test_a_broken_page_costs_only_what_lay_on_it(make_memory: Make) -> None:
     with sqlite3.connect(path) as database:
         (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'relations'").fetchone()
     data = bytearray(path.read_bytes())
-    data[(root - 1) * 4096 : root * 4096] = bytes(4096)
+    data[(root - 1) * PAGE_BYTES : root * PAGE_BYTES] = bytes(PAGE_BYTES)
     path.write_bytes(data)
     report = repair(path)
     assert report.rebuilt and not report.lost and report.instances == len(SMALL_ROOM)

@@ -83,7 +83,12 @@ class EmbeddingVerbs(ChunkVerbs):
 
     def embedding_spaces(self) -> list[str]:
         """The named spaces that hold vectors."""
-        return [r[0] for r in self._rows("SELECT DISTINCT space FROM embeddings ORDER BY space")]
+        query = (
+            "WITH RECURSIVE held (space) AS (SELECT min(space) FROM embeddings UNION ALL"
+            " SELECT (SELECT min(e.space) FROM embeddings e WHERE e.space > held.space) FROM held"
+            " WHERE held.space IS NOT NULL) SELECT space FROM held WHERE space IS NOT NULL"
+        )
+        return [r[0] for r in self._rows(query)]
 
 
 def _vectors(rows: Sequence[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -91,8 +96,10 @@ def _vectors(rows: Sequence[tuple[Any, ...]], space: str) -> tuple[NDArray[np.in
     if not rows:
         return np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
     length = len(rows[0][1])
-    for instance, vector in rows:
-        if len(vector) != length or length % 4:
-            raise MemoryFileError(f"the vector of instance {instance} in the space {space} is damaged")
-    ids = np.array([row[0] for row in rows], dtype=np.int64)
-    return ids, np.frombuffer(b"".join(row[1] for row in rows), "<f4").reshape(len(rows), -1).astype(np.float32)
+    if length % 4 or any(len(row[1]) != length for row in rows):
+        bad = next(instance for instance, vector in rows if len(vector) != length or length % 4)
+        raise MemoryFileError(f"the vector of instance {bad} in the space {space} is damaged")
+    ids = np.fromiter((row[0] for row in rows), np.int64, len(rows))
+    return ids, np.frombuffer(b"".join(row[1] for row in rows), "<f4").reshape(len(rows), -1).astype(
+        np.float32, copy=False
+    )

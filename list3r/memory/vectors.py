@@ -12,15 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.store import Store
+from list3r.memory.vector_cells import Cells, cache_file, sample_size
 
 if TYPE_CHECKING:
     import faiss
 
 _EXACT = 30_000
 """Up to so many vectors all are compared; more are looked up in an inverted file."""
-_TRAINING = 40
-"""Vectors for each cell of the inverted file, on which the cells are learned."""
-_PROBED = 32
+_PROBED = 128
 """Cells looked into for a question; twice as many whenever too few of what they hold passes the filters."""
 _RANKED = 64
 """Candidates of the inverted file, at least, that are compared exactly with what the store holds."""
@@ -173,33 +172,62 @@ def _build(store: Store, space: str, stamp: tuple[int, int, bool]) -> VectorInde
     import faiss
 
     count = store.embedding_count(space)
-    index: Any = None
-    total = 0
-    for ids, vectors in store.embedding_batches(space):
-        if index is None:
-            index = _empty_index(store, space, count, vectors.shape[1])
-        index.add_with_ids(_unit(vectors), ids)
-        total += len(ids)
+    index, total = _flat(store, space) if count <= _EXACT else _inverted(store, space, count)
     if index is None:
         index = faiss.IndexIDMap(faiss.IndexFlatIP(1))
     return VectorIndex(space, int(index.d), total, index, stamp[0], len(store.vectors_touched), stamp)
 
 
-def _empty_index(store: Store, space: str, count: int, dimension: int) -> Any:
-    """A flat index for a small memory; for a large one an inverted file whose cells are learned on a sample."""
+def _flat(store: Store, space: str) -> tuple[Any, int]:
+    """All vectors as they are, and how many; no index where there are none."""
     import faiss
 
-    if count <= _EXACT:
-        return faiss.IndexIDMap(faiss.IndexFlatIP(dimension))
-    cells = int(2.0 * np.sqrt(count))
+    index: Any = None
+    total = 0
+    for ids, vectors in store.embedding_batches(space):
+        if index is None:
+            index = faiss.IndexIDMap(faiss.IndexFlatIP(vectors.shape[1]))
+        index.add_with_ids(_unit(vectors), ids)
+        total += len(ids)
+    return index, total
+
+
+def _inverted(store: Store, space: str, count: int) -> tuple[Any, int]:
+    """All vectors in half precision, in cells that are learned on a sample or were kept since they were."""
+    import faiss
+
+    pointer: Any = faiss.swig_ptr
+    place = cache_file(store.path, space)
+    dimension = next(store.embedding_batches(space, 1))[1].shape[1]
+    cells = Cells.load(place, dimension, count)
+    while True:
+        if cells is None:
+            cells = Cells.learned(_unit(store.embedding_sample(space, sample_size(count))), count)
+        index, quantizer = _empty(cells, dimension)
+        total = 0
+        for ids, vectors in store.embedding_batches(space):
+            unit = _unit(vectors)
+            placed = cells.of(quantizer, ids, unit)
+            index.add_core(len(ids), pointer(unit), pointer(ids), pointer(placed))
+            total += len(ids)
+        if not cells.outdated:
+            cells.save(place)
+            return index, total
+        cells = None
+
+
+def _empty(cells: Cells, dimension: int) -> tuple[Any, Any]:
+    """An inverted file without vectors, and the index of its cells."""
+    import faiss
+
     quantizer = faiss.IndexFlatIP(dimension)
+    quantizer.add(cells.centroids)
     index = faiss.IndexIVFScalarQuantizer(
-        quantizer, dimension, cells, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT
+        quantizer, dimension, len(cells.centroids), faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT
     )
     index.by_residual = False
-    index.cp.niter, index.cp.seed, index.cp.spherical = 8, 1, True
-    index.train(_unit(store.embedding_sample(space, _TRAINING * cells)))
-    return index
+    index.train(cells.centroids)  # half precision needs no training; this says that the cells are there
+    return index, quantizer
 
 
 def _ask(
