@@ -112,6 +112,7 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE TABLE anchors (
         instance INTEGER PRIMARY KEY REFERENCES instances, chunk_id INTEGER NOT NULL, S_exact_settled BLOB NOT NULL);
     CREATE INDEX merges_by_names ON merges (a, b);
+    CREATE INDEX local_instances_moving ON local_instances (chunk_id, local_id) WHERE dynamic;
     DELETE FROM memory WHERE key = 'settled_poses';
     """,
 )

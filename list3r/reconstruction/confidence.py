@@ -35,7 +35,7 @@ def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings
     sigma = settings.noise.sigma(depth) * np.float32(1.0 / settings.half_sigma_m)
     confidence = np.where(known, 1.0 / (1.0 + sigma * sigma), np.float32(0))
     confidence *= _facing(depth, camera, settings)
-    confidence[_beside_edge(depth, known, settings.edge_step)] *= np.float32(settings.edge_confidence)
+    confidence[beside_edge(depth, known, settings.edge_step)] *= np.float32(settings.edge_confidence)
     return confidence.astype(np.float16)
 
 
@@ -49,7 +49,8 @@ def _facing(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> Floa
     return np.asarray(cv2.resize(factor, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _beside_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
+def beside_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
+    """Pixels next to a jump of depth by more than a share `step` of it. Shape (H, W)."""
     window = np.ones((3, 3), np.uint8)
     highest = cv2.dilate(depth, window)
     lowest = cv2.erode(np.where(known, depth, np.float32(1e6)), window)

@@ -39,6 +39,11 @@ class ModelEntry:
 
 MODELS: dict[str, ModelEntry] = {
     "rgbd": ModelEntry("rgbd", needs_depth=True, needs_camera=True),
+    "pi3": ModelEntry("pi3"),
+    "pi3x": ModelEntry("pi3x"),
+    "vggt": ModelEntry("vggt"),
+    "mapanything": ModelEntry("mapanything"),
+    "da3": ModelEntry("da3"),
 }
 """All that `--reconstruction` knows."""
 

@@ -1,0 +1,186 @@
+"""The cache of the Hugging Face hub: what is in it, how large, at which commit, and how weights come into it.
+
+The cache's own layout is read as it lies on the disk (`models--owner--name/refs|snapshots`), so that looking needs
+neither network nor package. What was fetched once is used from then on: the name of a branch stands for the commit
+that the cache holds of it, and nothing asks the network again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from list3r.memory.errors import OptionError
+from list3r.models.cards import UNPINNED, Weights
+
+CONFIG = "config.json"
+SINGLE_FILES = (".safetensors", ".pt", ".pth", ".bin")
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_MAX_HEADER = 100 * 2**20
+
+NO_NETWORK = (
+    "the hub cannot be reached, and the cache has no copy; run `list3r models fetch NAME` where there is a network, "
+    "or give --weights DIR"
+)
+
+
+@dataclass(frozen=True)
+class Cached:
+    """One commit of a repository in the cache."""
+
+    repository: str
+    commit: str
+    folder: Path
+    size_bytes: int
+
+    @property
+    def name(self) -> str:
+        """`owner/name@commit`, which names these weights for ever."""
+        return f"{self.repository}@{self.commit}"
+
+
+def cache_folder() -> Path:
+    """Where the hub keeps what was fetched, by the environment variables that its own package obeys."""
+    if "HF_HUB_CACHE" in os.environ:
+        return Path(os.environ["HF_HUB_CACHE"]).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    return Path(os.environ.get("HF_HOME", f"{base}/huggingface")).expanduser() / "hub"
+
+
+def find_cached(repository: str, revision: str = UNPINNED) -> Cached | None:
+    """What the cache holds of a repository at a revision; None where nothing, or no weights, are there."""
+    base = cache_folder() / f"models--{repository.replace('/', '--')}"
+    commit = revision
+    if not _COMMIT.fullmatch(revision):
+        reference = base / "refs" / revision
+        if not reference.is_file():
+            return None
+        commit = reference.read_text().strip()
+    folder = base / "snapshots" / commit
+    files = [p for p in folder.rglob("*") if p.is_file()] if _COMMIT.fullmatch(commit) and folder.is_dir() else []
+    if not any(p.suffix in SINGLE_FILES for p in files):
+        return None
+    return Cached(repository, commit, folder, sum(p.stat().st_size for p in files))
+
+
+def split_name(name: str) -> tuple[str, str] | None:
+    """`owner/name` or `owner/name@revision` as (repository, revision); None where it is no such name."""
+    repository, _, revision = name.partition("@")
+    return (repository, revision or UNPINNED) if _REPOSITORY.fullmatch(repository) else None
+
+
+def resolve(asked: str | None, weights: Weights | None, option: str) -> str:
+    """The weights that a run will use, fetched where they are not in the cache: a path, or `owner/name@commit`.
+
+    `asked` is what the user gave (a path, a repository, a repository at a revision), `weights` what the card names.
+    Raises `OptionError` when there is nothing to use, or it can be had neither from the disk nor from the hub.
+    """
+    if asked is not None and (Path(asked).expanduser().exists() or split_name(asked) is None):
+        return str(_own(Path(asked).expanduser(), option).resolve())
+    if asked is not None:
+        repository, revision = split_name(asked) or (asked, UNPINNED)
+        known = weights if weights is not None and weights.repository == repository else Weights(repository, _unknown())
+        wanted = revision if "@" in asked else known.revision
+    elif weights is not None:
+        known, wanted = weights, weights.revision
+    else:
+        raise OptionError(f"{option} has no weights of its own; give them with --weights")
+    return (find_cached(known.repository, wanted) or fetch(known, wanted)).name
+
+
+def locate(name: str) -> Path:
+    """The file or folder of weights that `resolve` named. Raises `OptionError` when it is no longer there."""
+    if Path(name).exists():
+        return Path(name)
+    parts = split_name(name)
+    cached = find_cached(*parts) if parts is not None else None
+    if cached is None:
+        raise OptionError(f"the weights {name} are not there any more; see `list3r models list`")
+    return cached.folder
+
+
+def fetch(weights: Weights, revision: str | None = None) -> Cached:
+    """Bring weights into the cache, with progress on standard error; what is there already is not loaded again.
+
+    Raises `OptionError` when the hub cannot be reached, does not know them, or wants the user to be granted access.
+    """
+    try:
+        from huggingface_hub import snapshot_download
+        from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+    except ImportError:
+        raise OptionError("fetching weights needs a package: pip install 'list3r[models]'") from None
+    name, wanted = weights.repository, revision or weights.revision
+    why = ""
+    try:
+        folder = Path(snapshot_download(name, revision=wanted, allow_patterns=list(weights.files)))
+    except GatedRepoError:
+        why = f"its owner must grant access first: ask on its page ({name}), then `hf auth login`"
+    except (LocalEntryNotFoundError, OfflineModeIsEnabled, ConnectionError, TimeoutError):
+        why = NO_NETWORK
+    except HfHubHTTPError as error:
+        code = getattr(error.response, "status_code", "?")
+        why = f"the hub does not hand it out (status {code}); check the name and the revision"
+    except Exception as error:  # what the hub's transport raises without a network is not a closed list
+        if not _is_transport(error):
+            raise
+        why = NO_NETWORK
+    if why:
+        raise OptionError(f"{name}@{wanted} cannot be fetched: {why}")
+    cached = find_cached(name, wanted) or find_cached(name, folder.name)
+    if cached is None:
+        raise OptionError(f"{name}@{wanted} has no weights in a form that is read here ({', '.join(SINGLE_FILES)})")
+    return cached
+
+
+def check_weights(path: Path) -> None:
+    """Raise `OptionError` for a file or folder of weights that is absent, truncated or of another format."""
+    files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.suffix in SINGLE_FILES)
+    if not files:
+        raise OptionError(f"{path} holds no weights ({', '.join(SINGLE_FILES)})")
+    for file in files:
+        if file.suffix == ".safetensors":
+            read_header(file)
+        elif file.stat().st_size < 1024:
+            raise OptionError(f"{file} is {file.stat().st_size} bytes long and no checkpoint; fetch it again")
+
+
+def read_header(file: Path) -> dict[str, Any]:
+    """The table of contents of a `.safetensors` file. Raises `OptionError` when the file is not as long as it says."""
+    size = file.stat().st_size
+    with file.open("rb") as stream:
+        length = int.from_bytes(stream.read(8), "little")
+        if size < 8 or length > min(size - 8, _MAX_HEADER):
+            raise OptionError(f"{file} is no .safetensors file, or is cut off; fetch it again")
+        try:
+            header: dict[str, Any] = json.loads(stream.read(length))
+            ends = [int(entry["data_offsets"][1]) for key, entry in header.items() if key != "__metadata__"]
+        except (ValueError, TypeError, KeyError, IndexError):
+            raise OptionError(f"{file} has a damaged table of contents; fetch it again") from None
+    expected = 8 + length + max(ends, default=0)
+    if size != expected:
+        raise OptionError(f"{file} is {size} bytes long instead of {expected}: it is cut off; fetch it again")
+    return {k: v for k, v in header.items() if k != "__metadata__"}
+
+
+def _own(path: Path, option: str) -> Path:
+    if not path.exists():
+        raise OptionError(
+            f"--weights {path}: no such file or folder, and not a repository such as owner/name; {option} needs one"
+        )
+    return path
+
+
+def _unknown() -> Any:
+    from list3r.models.cards import OTHER
+
+    return OTHER
+
+
+def _is_transport(error: Exception) -> bool:
+    """Whether an error comes from the network's side, by the packages that speak to it."""
+    return type(error).__module__.split(".")[0] in ("httpx", "httpcore", "requests", "urllib3", "huggingface_hub")

@@ -1,0 +1,213 @@
+"""What every neural model is: its licence, where its weights lie, what it needs, how much memory it is said to take.
+
+A card names facts that others published; nothing here loads a model. Code and weights have licences of their own, and
+both count. A revision that no public page states is not made up: such weights are `unpinned`, and what was fetched is
+used from then on (`cache`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from list3r.memory.errors import OptionError
+
+PARTS = ("geometry", "discovery", "tracking", "features", "text", "detector", "local features", "descriptor")
+"""What a model can be in a pipeline."""
+
+UNPINNED = "main"
+"""Name of the branch that stands where no revision is known."""
+
+
+@dataclass(frozen=True)
+class Licence:
+    """Terms under which code or weights may be used."""
+
+    name: str
+    """SPDX identifier, or the owner's own name for it."""
+    kind: str
+    """permissive, noncommercial, copyleft, custom (its own terms), or none (no licence was given)."""
+
+    def __post_init__(self) -> None:
+        assert self.kind in ("permissive", "noncommercial", "copyleft", "custom", "none")
+
+
+APACHE = Licence("Apache-2.0", "permissive")
+MIT = Licence("MIT", "permissive")
+BSD3 = Licence("BSD-3-Clause", "permissive")
+CC_BY_NC = Licence("CC-BY-NC-4.0", "noncommercial")
+VGGT_LICENCE = Licence("VGGT License v1", "custom")
+SAM_LICENCE = Licence("SAM License", "custom")
+DINOV3_LICENCE = Licence("DINOv3 License", "custom")
+OTHER = Licence("other (see its repository)", "custom")
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of a model on the hub."""
+
+    repository: str
+    """`owner/name`."""
+    licence: Licence
+    gated: bool = False
+    """Its owner must first grant access, with an account."""
+    revision: str = UNPINNED
+    """Commit of the repository, or `main` where none is known."""
+    files: tuple[str, ...] = ("*.json", "*.safetensors", "*.txt", "*.model")
+    """Patterns of the files that are needed."""
+
+    @property
+    def pinned(self) -> bool:
+        """Whether the revision is one commit."""
+        return self.revision != UNPINNED
+
+
+@dataclass(frozen=True)
+class MemoryFigures:
+    """Published GPU memory: fixed + per_megapixel for each million pixels of all pictures at the network's size."""
+
+    fixed_mb: float
+    per_megapixel_mb: float
+    source: str
+    """Who measured it, on what."""
+
+    def needed_mb(self, pictures: int, pixels: int) -> float:
+        """Memory of one pass over so many pictures of `pixels` pixels."""
+        return self.fixed_mb + self.per_megapixel_mb * pictures * pixels / 1e6
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """One model that an option can name."""
+
+    name: str
+    part: str
+    code: Licence
+    """Licence of the package that runs it."""
+    weights: tuple[Weights, ...]
+    """Published weights; the first are used unless others are asked for. Empty where the user brings weights."""
+    packages: tuple[str, ...]
+    """Modules that must be importable."""
+    install: str
+    """What installs them."""
+    memory: MemoryFigures | None = None
+    about: str = ""
+    """One line on what it is good for."""
+
+    def __post_init__(self) -> None:
+        assert self.part in PARTS
+
+    @property
+    def commercial(self) -> bool:
+        """Whether code and default weights allow commercial use without asking anyone."""
+        terms = (self.code, *(w.licence for w in self.weights[:1]))
+        return all(t.kind == "permissive" for t in terms) and not any(w.gated for w in self.weights[:1])
+
+
+_TRANSFORMERS = ("transformers",)
+_MODELS_EXTRA = "pip install 'list3r[models]'"
+_GIT = "pip install git+https://github.com"
+
+
+def _hub(name: str, part: str, repository: str, licence: Licence, about: str, *, gated: bool = False) -> ModelCard:
+    """A model that the package transformers runs."""
+    return ModelCard(
+        name, part, APACHE, (Weights(repository, licence, gated),), _TRANSFORMERS, _MODELS_EXTRA, None, about
+    )
+
+
+CARDS: tuple[ModelCard, ...] = (
+    ModelCard(
+        "pi3",
+        "geometry",
+        BSD3,
+        (Weights("yyfz233/Pi3", CC_BY_NC),),
+        ("pi3",),
+        f"{_GIT}/yyfz/Pi3",
+        MemoryFigures(3658, 212, "its authors' capacity table, A800, bfloat16"),
+        "the paper's model",
+    ),
+    ModelCard(
+        "pi3x",
+        "geometry",
+        BSD3,
+        (Weights("yyfz233/Pi3X", CC_BY_NC),),
+        ("pi3",),
+        f"{_GIT}/yyfz/Pi3",
+        MemoryFigures(3658, 212, "taken from pi3"),
+        "smoother than pi3, takes known intrinsics and poses",
+    ),
+    ModelCard(
+        "vggt",
+        "geometry",
+        VGGT_LICENCE,
+        (
+            Weights("facebook/VGGT-1B", CC_BY_NC),
+            Weights("facebook/VGGT-1B-Commercial", VGGT_LICENCE, gated=True),
+        ),
+        ("vggt",),
+        f"{_GIT}/facebookresearch/vggt",
+        MemoryFigures(1690, 1075, "its README, H100: 1.9 GB at 1 frame, 40.6 GB at 200"),
+        "first frame is the frame of reference",
+    ),
+    ModelCard(
+        "mapanything",
+        "geometry",
+        APACHE,
+        (Weights("facebook/map-anything-apache", APACHE), Weights("facebook/map-anything", CC_BY_NC)),
+        ("mapanything",),
+        f"{_GIT}/facebookresearch/map-anything",
+        MemoryFigures(3000, 345, "its README: 2,000 views in 140 GB, memory-efficient mode"),
+        "takes known intrinsics",
+    ),
+    ModelCard(
+        "da3",
+        "geometry",
+        APACHE,
+        (
+            Weights("depth-anything/DA3-BASE", APACHE),
+            Weights("depth-anything/DA3-SMALL", APACHE),
+            Weights("depth-anything/DA3-LARGE-1.1", CC_BY_NC),
+            Weights("depth-anything/DA3-GIANT-1.1", CC_BY_NC),
+            Weights("depth-anything/DA3NESTED-GIANT-LARGE-1.1", CC_BY_NC),
+        ),
+        ("depth_anything_3",),
+        "pip install depth-anything-3",
+        MemoryFigures(10000, 600, "DA3-Streaming's table, giant weights: 28.3 GB at 120 frames of 504x378"),
+        "base and small weights are free for any use",
+    ),
+    _hub("eomt", "discovery", "tue-mps/coco_panoptic_eomt_large_640", MIT, "masks, query embeddings and labels"),
+    _hub("mask2former", "discovery", "facebook/mask2former-swin-tiny-coco-panoptic", OTHER, "masks and labels"),
+    _hub("sam2", "discovery", "facebook/sam2.1-hiera-tiny", APACHE, "masks of everything, no labels"),
+    _hub("sam3", "discovery", "facebook/sam3", SAM_LICENCE, "masks of everything, no labels", gated=True),
+    _hub("sam2", "tracking", "facebook/sam2.1-hiera-tiny", APACHE, "video tracker"),
+    _hub("sam3", "tracking", "facebook/sam3", SAM_LICENCE, "video tracker", gated=True),
+    _hub("edgetam", "tracking", "yonigozlan/EdgeTAM-hf", APACHE, "small video tracker"),
+    _hub("dinov2", "features", "facebook/dinov2-small", APACHE, "appearance"),
+    _hub("dinov3", "features", "facebook/dinov3-vits16-pretrain-lvd1689m", DINOV3_LICENCE, "appearance", gated=True),
+    _hub("siglip2", "text", "google/siglip2-base-patch16-224", APACHE, "free words in find and nearest"),
+    _hub("clip", "text", "openai/clip-vit-base-patch32", MIT, "free words in find and nearest"),
+    ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", None, "labels of 80 kinds of things"),
+    ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", None, "learned local features"),
+    ModelCard(
+        "xfeat", "local features", APACHE, (), ("onnxruntime",), "pip install onnxruntime", None, "small and fast"
+    ),
+)
+"""Every model that has an adapter here. Weights that a card does not name are the user's own (`--weights`)."""
+
+
+def find_card(name: str, part: str) -> ModelCard | None:
+    """The card of a model, None for one that needs no weights (rgbd, sfm, geometric, ...)."""
+    return next((c for c in CARDS if c.name == name and c.part == part), None)
+
+
+def cards_named(name: str) -> list[ModelCard]:
+    """All cards of a name: one network can serve several parts. Raises `OptionError` for a name that has none."""
+    found = [c for c in CARDS if c.name == name]
+    if not found:
+        raise OptionError(f"{name} is not a known model; choose one of {', '.join(sorted({c.name for c in CARDS}))}")
+    return found
+
+
+def find_weights(card: ModelCard, repository: str) -> Weights | None:
+    """What is known of a repository of weights, None for one that the card does not name."""
+    return next((w for w in card.weights if w.repository.lower() == repository.lower()), None)

@@ -1,0 +1,78 @@
+"""Reconstruction `pi3` and `pi3x`: the paper's model (Wang et al., "Permutation-Equivariant Visual Geometry Learning").
+
+Pictures (1, n, 3, h, w) in [0, 1], sides multiples of 14, at most 255,000 pixels, aspect ratio kept: a square picture
+changes the camera that the network sees. Out come `local_points` (1, n, h, w, 3) in each camera, `conf` as logits and
+`camera_poses`, camera to world with OpenCV axes. There is no frame of reference (the first pose is not the identity),
+no scale (pi3x: about metres, which is not relied on), and no intrinsics: the focal length follows from the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from list3r.models.cards import ModelCard
+from list3r.models.upstream import load_upstream, upstream_class
+from list3r.reconstruction.feedforward import FeedforwardReconstructor, PictureSize, card_of, numpy
+from list3r.reconstruction.feedforward_output import WindowOutput, focal_from_points
+from list3r.reconstruction.registry import ModelOptions
+
+if TYPE_CHECKING:
+    import torch
+
+PIXEL_LIMIT = 255_000
+"""Most pixels of a picture, as its authors' loader has it."""
+
+
+def make(options: ModelOptions) -> FeedforwardReconstructor:
+    """The model with the weights that the options name."""
+    return FeedforwardReconstructor(Pi3(), options)
+
+
+@dataclass(frozen=True)
+class Pi3:
+    """The network pi3, or its successor pi3x, which can be told the intrinsics."""
+
+    conditional: bool = False
+
+    @property
+    def card(self) -> ModelCard:
+        """What it is."""
+        return card_of("pi3x" if self.conditional else "pi3")
+
+    @property
+    def size(self) -> PictureSize:
+        """How large its pictures are."""
+        return PictureSize(max_pixels=PIXEL_LIMIT)
+
+    def load(self, path: Path, device: torch.device) -> Any:
+        """The network of the package `pi3`."""
+        module, name = ("pi3.models.pi3x", "Pi3X") if self.conditional else ("pi3.models.pi3", "Pi3")
+        return load_upstream(upstream_class(self.card, module, name), path, device)
+
+    def answer(self, model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
+        """See `feedforward.Network`."""
+        if not self.conditional:
+            return read(model(pictures[None]))
+        if K is None:
+            return read(model(imgs=pictures[None], with_prior=False))
+        told = K.expand(1, len(pictures), 3, 3)
+        everywhere = pictures.new_ones((1, len(pictures))).bool()
+        return read(model(imgs=pictures[None], intrinsics=told, mask_add_ray=everywhere))
+
+
+def read(output: dict[str, torch.Tensor]) -> WindowOutput:
+    """The network's outputs in our terms."""
+    import torch
+
+    points = numpy(output["local_points"][0])
+    confidence = numpy(torch.sigmoid(output["conf"][0, ..., 0].float()))
+    return WindowOutput(
+        T_window_cam=numpy(output["camera_poses"][0]).astype(np.float64),
+        depth=points[..., 2].astype(np.float32),
+        confidence=confidence.astype(np.float32),
+        focal=np.stack([focal_from_points(p, c) for p, c in zip(points, confidence, strict=True)]),
+    )
