@@ -78,8 +78,9 @@ def build(
     force: bool = False,
     debug_dir: str | Path | None = None,
     progress: Progress | None = None,
+    scan: Progress | None = None,
 ) -> BuildReport:
-    """Build the memory of one video; see `list3r.build` for the arguments.
+    """Build the memory of one video; see `list3r.build` for the arguments. `scan` hears of the look for jumps before.
 
     Raises `SourceError`, `MemoryFileError`, `OptionError`, `TrackingError`; then nothing half-written is left, except a
     memory with the chunks that were finished, which `resume` goes on with.
@@ -95,7 +96,7 @@ def build(
         _make_folder(Path(debug_dir))
     with _open_target(Path(memory), info, settings, resume=resume, force=force) as target:
         session = _session(target.store, info, settings)
-        spans = plan_chunks(info.frame_count, settings.chunks, _cuts(target.store, source, options, settings))
+        spans = plan_chunks(info.frame_count, settings.chunks, _cuts(target.store, source, options, settings, scan))
         done = {c.index for c in target.store.chunks(session)}
         tasks = [
             ChunkTask(str(source), options, span, settings, None if debug_dir is None else str(debug_dir))
@@ -112,13 +113,15 @@ def build(
         return _finish(target.store, session, info, spans, done, started)
 
 
-def _cuts(store: Store, source: str | Path, options: SourceOptions, settings: BuildSettings) -> tuple[int, ...]:
+def _cuts(
+    store: Store, source: str | Path, options: SourceOptions, settings: BuildSettings, scan: Progress | None
+) -> tuple[int, ...]:
     """Where the video jumps, found once; given poses know where the camera is on either side."""
     if settings.poses == "given":
         return ()
     known = store.get_value("cuts")
     if known is None:
-        known = [] if store.chunks() else list(find_cuts(open_source(source, options)))
+        known = [] if store.chunks() else list(find_cuts(open_source(source, options), progress=scan))
         with store.transaction():
             store.set_value("cuts", known)
     return tuple(known)

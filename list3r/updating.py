@@ -66,6 +66,7 @@ def update(
     workers: int | None = None,
     resume: bool = False,
     progress: Progress | None = None,
+    scan: Progress | None = None,
 ) -> UpdateReport:
     """Add one more video to an existing memory.
 
@@ -81,7 +82,7 @@ def update(
         raise OptionError(f"--workers {workers}: at least 1 process is needed")
     with Store.open(memory, writable=True) as store:
         session = _session(store, info, settings, resume=resume)
-        spans = plan_chunks(info.frame_count, settings.chunks, _cuts(store, session, source, options, settings))
+        spans = plan_chunks(info.frame_count, settings.chunks, _cuts(store, session, source, options, settings, scan))
         done = {c.index for c in store.chunks(session)}
         tasks = [ChunkTask(str(source), options, span, settings) for span in spans if span.index not in done]
         with threadpool_limits(1):
@@ -118,7 +119,12 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume:
 
 
 def _cuts(
-    store: Store, session: int, source: str | Path, options: SourceOptions, settings: BuildSettings
+    store: Store,
+    session: int,
+    source: str | Path,
+    options: SourceOptions,
+    settings: BuildSettings,
+    scan: Progress | None,
 ) -> tuple[int, ...]:
     """Where the video jumps, found once; given poses know where the camera is on either side."""
     if settings.poses == "given":
@@ -126,7 +132,7 @@ def _cuts(
     name = f"cuts {session}"
     known = store.get_value(name)
     if known is None:
-        known = list(find_cuts(open_source(source, options)))
+        known = list(find_cuts(open_source(source, options), progress=scan))
         with store.transaction():
             store.set_value(name, known)
     return tuple(known)

@@ -68,11 +68,11 @@ class RgbdJointReconstructor:
         return self._sources[session_id]
 
     def _read(self, session_id: int, indices: Sequence[int]) -> list[Frame]:
-        source, chosen = self._source(session_id), self._options.get(session_id, SourceOptions())
-        wanted = sorted({(int(i) - (chosen.start or 0)) // chosen.every for i in indices})
+        source = self._source(session_id)
+        wanted = sorted({source.position(int(i)) for i in indices})
         if not wanted:
             return []
-        read = source.read(max(wanted[0], 0), wanted[-1] + 1)
+        read = source.read(wanted[0], wanted[-1] + 1)
         return [f for f in read if isinstance(f, Frame) and f.index in set(indices)]
 
 

@@ -31,6 +31,10 @@ def inspect(
     registered: src.Registered = False,
     depth_scale: src.DepthScale = None,
     fps: src.Fps = None,
+    start: src.Start = None,
+    end: src.End = None,
+    sharpest: src.Sharpest = None,
+    max_side: src.MaxSide = None,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the colour camera and the depth-to-colour transform.")
     ] = False,
@@ -79,6 +83,10 @@ def build(
     registered: src.Registered = False,
     depth_scale: src.DepthScale = None,
     fps: src.Fps = None,
+    start: src.Start = None,
+    end: src.End = None,
+    sharpest: src.Sharpest = None,
+    max_side: src.MaxSide = None,
     chunk: Annotated[int, typer.Option("--chunk", help="Frames in a chunk.")] = 100,
     overlap: Annotated[int, typer.Option("--overlap", help="Frames that neighbouring chunks share.")] = 30,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
@@ -151,5 +159,9 @@ def _source_words(words: dict[str, Any]) -> dict[str, Any]:
         "registered",
         "depth_scale",
         "fps",
+        "start",
+        "end",
+        "sharpest",
+        "max_side",
     )
     return {name: words[name] for name in names}

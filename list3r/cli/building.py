@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
             bar.refresh()
 
         try:
-            return build_memory(source, memory, progress=progress, **arguments)
+            return build_memory(source, memory, progress=progress, scan=looking(bar, "building"), **arguments)
         except KeyboardInterrupt:
             bar.close()
             if kept and memory.exists():
@@ -40,6 +41,20 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
             else:
                 note("\ninterrupted before the first chunk was finished; nothing was changed")
             raise typer.Exit(1) from None
+
+
+def looking(bar: Any, then: str) -> Callable[[int, int], None]:
+    """What moves a progress bar during the look for jumps; afterwards it begins anew under its name."""
+
+    def scan(done: int, total: int) -> None:
+        bar.total = total
+        bar.set_description("looking for cuts", refresh=False)
+        bar.update(done - bar.n)
+        if done == total:
+            bar.set_description(then, refresh=False)
+            bar.reset(total)
+
+    return scan
 
 
 def report_lines(memory: Path, report: BuildReport) -> list[str]:

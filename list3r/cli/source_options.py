@@ -38,7 +38,29 @@ Registered = Annotated[bool, typer.Option("--registered", help="Depth already li
 DepthScale = Annotated[
     float | None, typer.Option("--depth-scale", metavar="UNITS", help="Stored depth units per metre.")
 ]
-Fps = Annotated[float | None, typer.Option("--fps", help="Frames a second of a source without a clock.")]
+Fps = Annotated[
+    float | None,
+    typer.Option("--fps", help="Take so many frames a second; of a source without a clock, the rate it was filmed at."),
+]
+Start = Annotated[float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the first frame.")]
+End = Annotated[float | None, typer.Option("--end", metavar="SECONDS", help="Stop so long after the first frame.")]
+Sharpest = Annotated[
+    bool | None,
+    typer.Option(
+        "--sharpest/--no-sharpest",
+        help="With --every or --fps, take the sharpest of each so many frames; default: of videos.",
+        show_default=False,
+    ),
+]
+MaxSide = Annotated[
+    int | None,
+    typer.Option(
+        "--max-side",
+        metavar="PX",
+        help="Reduce larger pictures to this (0: never); default: 960, with depth 1280.",
+        show_default=False,
+    ),
+]
 
 
 def source_options(
@@ -53,15 +75,19 @@ def source_options(
     registered: bool,
     depth_scale: float | None,
     fps: float | None,
+    start: float | None = None,
+    end: float | None = None,
+    sharpest: bool | None = None,
+    max_side: int | None = None,
 ) -> SourceOptions:
     """The words of the command line as options. Raises `OptionError` naming the option."""
     from list3r.frames import options as words
 
-    start, stop = words.parse_range(frames) if frames else (None, None)
+    first, stop = words.parse_range(frames) if frames else (None, None)
     return words.SourceOptions(
         kind=kind,
         every=every,
-        start=start,
+        start=first,
         stop=stop,
         intrinsics=words.parse_intrinsics(intrinsics, "--intrinsics") if intrinsics else None,
         distortion=words.parse_distortion(distortion) if distortion else None,
@@ -70,4 +96,8 @@ def source_options(
         registered=registered,
         depth_scale=depth_scale,
         fps=fps,
+        start_s=start,
+        end_s=end,
+        sharpest=sharpest,
+        max_side=max_side,
     )

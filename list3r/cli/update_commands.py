@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli import source_options as src
+from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
 from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
 
@@ -41,6 +42,10 @@ def update(
     registered: src.Registered = False,
     depth_scale: src.DepthScale = None,
     fps: src.Fps = None,
+    start: src.Start = None,
+    end: src.End = None,
+    sharpest: src.Sharpest = None,
+    max_side: src.MaxSide = None,
     chunk: Annotated[int, typer.Option("--chunk", help="Frames in a chunk.")] = 100,
     overlap: Annotated[int, typer.Option("--overlap", help="Frames that neighbouring chunks share.")] = 30,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
@@ -96,6 +101,10 @@ _SOURCE_WORDS = (
     "registered",
     "depth_scale",
     "fps",
+    "start",
+    "end",
+    "sharpest",
+    "max_side",
 )
 
 
@@ -114,7 +123,7 @@ def _run(memory: Path, source: str, *, quiet: bool, **arguments: Any) -> UpdateR
             bar.refresh()
 
         try:
-            return update_memory(memory, source, progress=progress, **arguments)
+            return update_memory(memory, source, progress=progress, scan=looking(bar, "updating"), **arguments)
         except KeyboardInterrupt:
             bar.close()
             note(f"\ninterrupted; {memory} keeps what it knew and the finished chunks: go on with --resume")

@@ -116,3 +116,7 @@ class FrameSource(Protocol):
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
         ...
+
+    def position(self, index: int) -> int:
+        """Where a frame (Frame.index) is among those handed out."""
+        ...

@@ -135,7 +135,7 @@ def calibrate(
     Raises `SourceError` when the source has no depth or no first guess of a camera.
     """
     options, settings = options or SourceOptions(), settings or CalibrateSettings()
-    source = open_source(source_path, options)
+    source = open_source(source_path, replace(options or SourceOptions(), max_side=0))
     if not isinstance(source, FolderSource) or not source.info.has_depth:
         raise SourceError(f"{source_path} has no depth images: there is nothing to calibrate")
     if source.info.camera is None:

@@ -8,9 +8,9 @@ One spoilt frame (black, flash, blur) is looked past.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Protocol
 
 import cv2
@@ -54,36 +54,71 @@ class CutSettings:
 
 
 class ThumbnailSource(FrameSource, Protocol):
-    """A source that can decode small grey pictures for less than whole frames."""
+    """A source that can decode small grey pictures for less than whole frames: by `read_gray` or by `thumbnails`."""
 
     def read_gray(self, position: int, reduction: int) -> Gray | None:
         """The colour image in grey, each side reduced by about `reduction` (1, 2, 4 or 8); None where it is bad."""
         ...
 
+    def thumbnails(self) -> Iterator[Gray | None]:
+        """Small grey pictures of all frames in order, in one pass; None where a frame is bad."""
+        ...
 
-def find_cuts(source: FrameSource, settings: CutSettings | None = None) -> tuple[int, ...]:
+
+Progress = Callable[[int, int], None]
+"""Called with (frames looked at, frames in all)."""
+
+
+def find_cuts(
+    source: FrameSource, settings: CutSettings | None = None, progress: Progress | None = None
+) -> tuple[int, ...]:
     """Positions of `source` before which the video jumps, ascending.
 
     Reads every frame once, small where the source can (a `ThumbnailSource`: 0.6 ms a JPEG of 640 x 480), and the few
-    around a suspect again. The same source gives the same cuts.
+    around a suspect again; what it keeps does not grow with the video but by some bytes a frame. The same source gives
+    the same cuts.
     """
     chosen = settings or CutSettings()
     count = source.info.frame_count
-    thumbnails = _thumbnails(source, count)
-    likeness = np.ones(count)
-    known = [k for k in range(count) if thumbnails[k] is not None]
-    for a, b in pairwise(known):
-        likeness[b] = _thumbnail_likeness(thumbnails[a], thumbnails[b])
+    likeness, around = _first_look(source, count, chosen, progress)
     looks = _Looks(source, chosen)
 
     def alike(a: int, b: int) -> bool:
-        one, two = thumbnails[a], thumbnails[b]
+        one, two = around.get(a), around.get(b)
         if one is None or two is None:
             return False
         return _thumbnail_likeness(one, two) >= chosen.thumbnail_likeness or looks.same_place(a, b)
 
     suspects = _suspects(likeness, chosen.thumbnail_likeness, chosen)
     return _spaced([k for k in suspects if _jumps(k, count, alike, chosen)], alike, chosen)
+
+
+def _first_look(
+    source: FrameSource, count: int, settings: CutSettings, progress: Progress | None
+) -> tuple[NDArray[np.float64], dict[int, Gray]]:
+    """Likeness of every frame to the one before it, shape (F,), and the thumbnails about frames that are unlike it.
+
+    A frame that is bad is passed over: the next is compared with the last good one.
+    """
+    likeness = np.ones(count)
+    reach = max(settings.look_past, settings.least_shot) + 1
+    recent: deque[tuple[int, Gray]] = deque(maxlen=reach + 1)
+    around: dict[int, Gray] = {}
+    keep_to = -1
+    for k, thumbnail in enumerate(_thumbnails(source, count)):
+        if progress is not None:
+            progress(k + 1, count)
+        if thumbnail is None:
+            continue
+        if recent:
+            likeness[k] = _thumbnail_likeness(recent[-1][1], thumbnail)
+        recent.append((k, thumbnail))
+        if likeness[k] < settings.thumbnail_likeness:
+            around.update(recent)
+            keep_to = k + reach
+        elif k <= keep_to:
+            around[k] = thumbnail
+    return likeness, around
 
 
 def cuts_by_descriptor(descriptors: Floats, settings: CutSettings | None = None) -> tuple[int, ...]:
@@ -137,12 +172,16 @@ def _spaced(cuts: Sequence[int], alike: Alike, settings: CutSettings) -> tuple[i
 # ---------------------------------------------------------------------------------------------- pictures
 
 
-def _thumbnails(source: FrameSource, count: int) -> list[Gray | None]:
+def _thumbnails(source: FrameSource, count: int) -> Iterator[Gray | None]:
     """Small grey pictures of all frames, 48 wide; None where a frame is bad."""
+    thumbnails = getattr(source, "thumbnails", None)
     read_gray = getattr(source, "read_gray", None)
-    if read_gray is not None:
-        return [_small(read_gray(k, 8)) for k in range(count)]
-    return [_small(_grey(f)) if isinstance(f, Frame) else None for f in source.read(0, count)]
+    if thumbnails is not None:
+        yield from map(_small, thumbnails())
+    elif read_gray is not None:
+        yield from (_small(read_gray(k, 8)) for k in range(count))
+    else:
+        yield from (_small(_grey(f)) if isinstance(f, Frame) else None for f in source.read(0, count))
 
 
 def _grey(frame: Frame) -> Gray:

@@ -12,14 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_depth
+from list3r.frames.exif import exif_focal
 from list3r.frames.layout import FrameFile, Layout, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
-from list3r.frames.rig import build_rig, merge_optics
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.frames.rig import Rig, build_rig, merge_optics, resized
+from list3r.frames.selection import select, sharpness
+from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
+_LATER = ("start_s", "end_s", "sharpest", "max_side")
+"""Options that came later: unsaid, they leave the fingerprints of older memories as they were."""
 _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
 
@@ -30,8 +34,12 @@ class FolderSource:
     def __init__(self, root: Path, layout: Layout, options: SourceOptions) -> None:
         """Raises `SourceError` and `OptionError` where the first images and the cameras do not fit together."""
         self._layout, self._options = layout, options
-        self._numbers = selected_frames(len(layout.files), options, root)
-        self._fps = options.fps or _rate(layout.files) or DEFAULT_FPS
+        rate = _rate(layout.files)
+        self._clock = rate is not None
+        self._fps = rate or options.fps or DEFAULT_FPS
+        times_s = np.array([self._time_s(k, file) for k, file in enumerate(layout.files)])
+        self._chosen = select(times_s, options, root, clock=self._clock, video=False)
+        self._sharpest: dict[int, int] = {}
         self.optics, notes = merge_optics(layout, options)
         optics = self.optics
         self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files)
@@ -41,7 +49,7 @@ class FolderSource:
         if self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0):
             self.optics = optics = replace(optics, depth_scale=1.0)
             notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale says otherwise")
-        self._rig = build_rig(optics, *sizes, options.max_depth_m)
+        self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side)
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
@@ -54,15 +62,20 @@ class FolderSource:
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        for number in self._numbers[start:stop]:
+        for position in range(len(self._chosen))[start:stop]:
+            number = self._number(position)
             try:
                 yield self._frame(number)
             except FrameError as error:
                 yield BadFrame(number, str(error))
 
+    def position(self, index: int) -> int:
+        """Where a frame (Frame.index) is among those handed out."""
+        return self._chosen.position(index)
+
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
         """Frame.index, seconds and pose of the colour camera of every frame that has one; no picture is decoded."""
-        found = [(k, self._layout.files[k]) for k in self._numbers]
+        found = [(k, self._layout.files[k]) for k in map(self._number, range(len(self._chosen)))]
         poses = [(k, self._time_s(k, file), self._pose(file)) for k, file in found]
         return [(k, time_s, T) for k, time_s, T in poses if T is not None]
 
@@ -71,7 +84,7 @@ class FolderSource:
 
         Raises `FrameError` when one of them is missing or cannot be decoded.
         """
-        file = self._layout.files[self._numbers[position]]
+        file = self._layout.files[self._number(position)]
         if file.depth is None:
             raise FrameError(f"{file.color.name} has no depth image")
         raw = read_raw_depth(file.depth)
@@ -80,9 +93,23 @@ class FolderSource:
     def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
         """The colour image in grey as stored, each side reduced by 1, 2, 4 or 8; None where it cannot be decoded."""
         try:
-            return read_gray(self._layout.files[self._numbers[position]].color, reduction)
+            return read_gray(self._layout.files[self._number(position)].color, reduction)
         except FrameError:
             return None
+
+    def _number(self, position: int) -> int:
+        """The frame number handed out at a position."""
+        first, stop = int(self._chosen.starts[position]), int(self._chosen.stops[position])
+        if stop - first > 1 and position not in self._sharpest:
+            scores = [self._sharpness(k) for k in range(first, stop)]
+            self._sharpest[position] = first + int(np.argmax(scores))
+        return self._sharpest.get(position, first)
+
+    def _sharpness(self, number: int) -> float:
+        try:
+            return sharpness(read_gray(self._layout.files[number].color, 2))
+        except FrameError:
+            return -1.0
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]
@@ -95,7 +122,7 @@ class FolderSource:
         return Frame(number, self._time_s(number, file), color, depth, self._pose(file))
 
     def _time_s(self, number: int, file: FrameFile) -> float:
-        return number / self._fps if file.time_s is None or self._options.fps else file.time_s
+        return file.time_s if self._clock and file.time_s is not None else number / self._fps
 
     def _pose(self, file: FrameFile) -> NDArray[np.float64] | None:
         """The colour camera's pose, None where the file has none or an invalid one."""
@@ -109,13 +136,15 @@ class FolderSource:
 
     def _probe(self, root: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
         """Image sizes of the first frame that decodes, among the first and some spread over the source."""
-        spread = np.linspace(0, len(self._numbers) - 1, _PROBES).astype(int).tolist()
-        tried = dict.fromkeys([*range(min(3, len(self._numbers))), *spread])
+        count = len(self._chosen)
+        spread = np.linspace(0, count - 1, _PROBES).astype(int).tolist()
+        tried = dict.fromkeys([*range(min(3, count)), *spread])
         reason = ""
         for position in tried:
-            file = self._layout.files[self._numbers[position]]
+            file = self._layout.files[int(self._chosen.starts[position])]
             try:
                 color = read_color(file.color)
+                self._first_picture = file.color
                 if not self._has_depth:
                     return color.shape[:2], None
                 if file.depth is not None:
@@ -135,17 +164,20 @@ class FolderSource:
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
+        guess = self._camera_guess()
         missing = list(layout.missing)
         if not self._has_depth:
             missing.append("there is no depth: --reconstruction with a model for colour images")
         if rig.camera is None:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
+        if rig.color_size != rig.stored_size:
+            notes = (*notes, reduced_note(rig))
         has_poses = any(f.pose is not None or f.T_source_camera is not None for f in layout.files)
         separate = rig.registration
         return SourceInfo(
             kind=layout.kind,
             path=str(root),
-            frame_count=len(self._numbers),
+            frame_count=len(self._chosen),
             fps=self._fps,
             camera=rig.camera,
             has_depth=self._has_depth,
@@ -158,21 +190,32 @@ class FolderSource:
             notes=(*layout.notes, *notes),
             missing=tuple(missing),
             image_size=rig.color_size,
+            camera_guess=guess,
         )
 
+    def _camera_guess(self) -> Camera | None:
+        """What the first picture's EXIF says of a camera that is unknown."""
+        focal = exif_focal(self._first_picture) if self._rig.camera is None else None
+        return None if focal is None else centred_camera(focal, self._rig)
 
-def selected_frames(count: int, options: SourceOptions, root: Path) -> range:
-    """Frame numbers that the options leave of `count`. Raises `OptionError` when none is left."""
-    chosen = range(count)[options.start : options.stop : options.every]
-    if not chosen:
-        raise OptionError(f"frames {options.start}:{options.stop} leave nothing of {root}, which has {count} frames")
-    return chosen
+
+def centred_camera(focal: float, rig: Rig) -> Camera | None:
+    """A camera with its centre in the middle, for a focal length in px of the pictures as stored."""
+    height, width = rig.stored_size
+    stored = Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
+    return resized(stored, rig.color_size)
+
+
+def reduced_note(rig: Rig) -> str:
+    """That frames are smaller than stored, for people."""
+    (h, w), (height, width) = rig.stored_size, rig.color_size
+    return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side says otherwise (0: never)"
 
 
 def fingerprint(kind: str, listing: list[tuple[str, int]], options: SourceOptions) -> str:
     """Hash of the files' names and sizes and of every option that shapes frames. 32 hexadecimal digits."""
-    said = replace(options, kind="auto")
-    text = repr((kind, listing, sorted(asdict(said).items())))
+    said = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
+    text = repr((kind, listing, sorted(said.items())))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

@@ -47,9 +47,18 @@ class SourceOptions:
     depth_scale: float | None = None
     """Stored depth units per metre."""
     fps: float | None = None
-    """Frames per second of a source without a clock."""
+    """Frames per second: of a source with a clock so many are handed out, of one without this is the rate."""
     max_depth_m: float | None = None
     """Depth beyond this counts as unknown, metres."""
+    start_s: float | None = None
+    """Hand out frames from this time on, seconds after the source's first frame."""
+    end_s: float | None = None
+    """Hand out frames before this time, seconds after the source's first frame."""
+    sharpest: bool | None = None
+    """Of each so many frames hand out the sharpest instead of the first; None: for videos only."""
+    max_side: int | None = None
+    """Longest side of the frames handed out, px; larger pictures are reduced. 0 for as stored; None: 960, 1280 with
+    depth. Intrinsics are given for pictures as stored."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -62,6 +71,9 @@ class SourceOptions:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise OptionError(f"{name.replace('_', ' ')} {value}: a positive number is needed")
+        _check_seconds(self.start_s, self.end_s)
+        if self.max_side is not None and self.max_side != 0 and self.max_side < _LEAST_SIDE:
+            raise OptionError(f"max side {self.max_side}: at least {_LEAST_SIDE} px, or 0 for pictures as they are")
         for name in ("intrinsics", "depth_intrinsics"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, check_intrinsics(getattr(self, name), name.replace("_", " ")))
@@ -74,6 +86,16 @@ class SourceOptions:
             raise OptionError(
                 "registered depth has no camera of its own: leave out --depth-intrinsics and --depth-to-color"
             )
+
+
+_LEAST_SIDE = 32
+
+
+def _check_seconds(start: float | None, end: float | None) -> None:
+    """Raises `OptionError` for seconds that leave nothing of any source."""
+    given = [v for v in (start, end) if v is not None]
+    if not all(math.isfinite(v) for v in given) or (start or 0.0) < 0 or (end is not None and end <= (start or 0.0)):
+        raise OptionError(f"seconds {start or 0:g} to {end}: start must be 0 or more and end greater than it")
 
 
 def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intrinsics:

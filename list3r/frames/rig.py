@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,7 @@ from list3r.frames.decode import clean_depth
 from list3r.frames.layout import Layout, Optics
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.registration import Registration, Undistortion
+from list3r.frames.selection import working_size
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
 
@@ -46,8 +48,10 @@ class Rig:
 
     camera: Camera | None
     """Pinhole camera of the frames handed out, None where intrinsics are unknown."""
+    stored_size: tuple[int, int]
+    """(height, width) of the colour pictures as stored, upright, px."""
     color_size: tuple[int, int]
-    """(height, width) of the colour files, px."""
+    """(height, width) of the frames handed out, px."""
     depth_size: tuple[int, int] | None
     """(height, width) of the depth files, px."""
     depth_scale: float
@@ -57,8 +61,14 @@ class Rig:
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorted colour. Shape (H, W, 3). Raises `FrameError` for another size than the first frame's."""
-        if image.shape[:2] != self.color_size:
-            raise FrameError(f"colour is {_size(image.shape)}, the first frame {_size(self.color_size)}")
+        if image.shape[:2] != self.stored_size:
+            raise FrameError(f"colour is {_size(image.shape)}, the first frame {_size(self.stored_size)}")
+        if self.color_size != self.stored_size:
+            image = np.asarray(cv2.resize(image, self.color_size[::-1], interpolation=cv2.INTER_AREA))
+        return self.straight(image)
+
+    def straight(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Undistorted colour of a picture that has the size of the frames handed out. Shape (H, W, 3)."""
         return image if self.undistortion is None else self.undistortion.color(image)
 
     def depth(self, raw: NDArray[Any]) -> NDArray[np.float32]:
@@ -69,25 +79,49 @@ class Rig:
         if self.registration is not None:
             depth = self.registration(depth)
             return depth if self.undistortion is None else depth * self.undistortion.seen
+        if depth.shape != self.color_size:
+            depth = np.asarray(cv2.resize(depth, self.color_size[::-1], interpolation=cv2.INTER_NEAREST_EXACT))
         return depth if self.undistortion is None else self.undistortion.depth(depth)
 
 
+WORKING_SIDES = (960, 1280)
+"""Longest side of the frames handed out unless said otherwise, px: without depth, with depth."""
+
+
+def resized(camera: Camera | None, size: tuple[int, int]) -> Camera | None:
+    """The camera of its pictures at another (height, width); pixel (0, 0) is the centre of the upper left pixel."""
+    if camera is None or (camera.height, camera.width) == size:
+        return camera
+    x, y = size[1] / camera.width, size[0] / camera.height
+    cx, cy = (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5
+    return Camera(size[1], size[0], camera.fx * x, camera.fy * y, cx, cy, camera.distortion)
+
+
 def build_rig(
-    optics: Optics, color_size: tuple[int, int], depth_size: tuple[int, int] | None, max_depth_m: float | None
+    optics: Optics,
+    stored_size: tuple[int, int],
+    depth_size: tuple[int, int] | None,
+    max_depth_m: float | None,
+    max_side: int | None = None,
 ) -> Rig:
-    """Check the cameras against the first images and tabulate. Raises `SourceError` and `OptionError`."""
+    """Check the cameras against the first images and tabulate. Raises `SourceError` and `OptionError`.
+
+    Frames larger than `max_side` are reduced, and the camera with them; see `SourceOptions.max_side`.
+    """
     if optics.distortion and optics.intrinsics is None:
         raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
-    lens = _camera(optics.intrinsics, color_size, "intrinsics", optics.distortion)
+    limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
+    color_size = working_size(stored_size, limit)
+    lens = resized(_camera(optics.intrinsics, stored_size, "intrinsics", optics.distortion), color_size)
     camera = lens.pinhole() if lens else None
     undistortion = Undistortion(lens) if lens and lens.distortion else None
     registration = None
     if depth_size is not None:
         if optics.depth_scale is None:
             raise SourceError("the units of the depth images are unknown; give --depth-scale UNITS_PER_METRE")
-        registration = _registration(optics, camera, depth_size, color_size)
+        registration = _registration(optics, camera, depth_size, stored_size)
     scale = optics.depth_scale or 1.0
-    return Rig(camera, color_size, depth_size, scale, max_depth_m, undistortion, registration)
+    return Rig(camera, stored_size, color_size, depth_size, scale, max_depth_m, undistortion, registration)
 
 
 def _registration(

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from fractions import Fraction
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.folder import DEFAULT_FPS, fingerprint, selected_frames
+from list3r.frames.exif import believable, film_focal
+from list3r.frames.folder import centred_camera, fingerprint, reduced_note
 from list3r.frames.layout import Optics
 from list3r.frames.options import SourceOptions
+from list3r.frames.picture import Upright, small_gray
 from list3r.frames.rig import Rig, build_rig
+from list3r.frames.selection import select, sharpness
+from list3r.frames.stamps import list_stamps, packets, picture_stream
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
-_NOT_VIDEO = ("tty", "image2", "_pipe", "gif_pipe")
+_MEASURED_PX, _THUMBNAIL_PX = 320, 160
+_EARLIER = 4
+"""Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
 
 class VideoSource:
@@ -29,13 +34,12 @@ class VideoSource:
         if options.depth_intrinsics or options.T_color_depth:
             raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
         self._path, self._options = path, options
-        self._stamps, self._time_base, rate = _list_stamps(path)
-        self._clock = _has_clock(self._stamps)
-        self._numbers = selected_frames(len(self._stamps), options, path)
-        self._fps = options.fps or rate
-        self._number_of = {stamp: k for k, stamp in enumerate(self._stamps)} if self._clock else {}
-        self._rig, rotation = self._first()
-        self._info = self._describe(rotation)
+        self._stamps = list_stamps(path)
+        self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
+        times_s = np.array([self._time_s(k) for k in range(len(self._stamps))])
+        self._chosen = select(times_s, options, path, clock=self._stamps.clock, video=True)
+        self._upright, self._rig = self._first()
+        self._info = self._describe()
 
     @property
     def info(self) -> SourceInfo:
@@ -44,136 +48,131 @@ class VideoSource:
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        wanted = iter(self._numbers[start:stop])
-        number = next(wanted, None)
-        if number is None:
-            return
-        for found, image in self._decode(number):
-            while number is not None and number < found:
+        for number, image in self._pictures(start, stop, threads=False):
+            if image is None:
                 yield BadFrame(number, "the video is damaged here")
-                number = next(wanted, None)
-            if number is None:
-                return
-            if found == number:
-                yield self._frame(number, image)
-                number = next(wanted, None)
-                if number is None:
-                    return
-        while number is not None:
-            yield BadFrame(number, "the video is damaged here")
-            number = next(wanted, None)
+                continue
+            try:
+                color = self._rig.straight(self._upright.color(image, self._rig.color_size))
+            except FrameError as error:
+                yield BadFrame(number, str(error))
+            else:
+                yield Frame(number, self._time_s(number), color, None, None)
 
-    def _frame(self, number: int, image: av.VideoFrame) -> Frame | BadFrame:
-        if image.is_corrupt:
-            return BadFrame(number, "the video is damaged here")
-        try:
-            color = self._rig.color(upright(image))
-        except FrameError as error:
-            return BadFrame(number, str(error))
-        return Frame(number, self._time_s(number), color, None, None)
+    def position(self, index: int) -> int:
+        """Where a frame (Frame.index) is among those handed out."""
+        return self._chosen.position(index)
+
+    def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
+        """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""
+        for _, image in self._pictures(0, len(self._chosen), threads=True):
+            yield None if image is None else small_gray(image, _THUMBNAIL_PX)
+
+    def _pictures(self, start: int, stop: int, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame | None]]:
+        """Number and picture of the frame handed out of each window at positions [start, stop); None where damaged."""
+        windows = range(len(self._chosen))[start:stop]
+        starts, stops = self._chosen.starts[windows.start :], self._chosen.stops[windows.start :]
+        at, best, score = 0, _nothing(starts), -1.0
+        decoded = self._decode(int(starts[0]), threads=threads) if windows else iter(())
+        for number, image in decoded:
+            while at < len(windows) and number >= stops[at]:
+                yield best
+                at, best, score = at + 1, _nothing(starts[at + 1 :]), -1.0
+            if at == len(windows):
+                return
+            if number < starts[at] or image.is_corrupt:
+                continue
+            found = sharpness(small_gray(image, _MEASURED_PX)) if self._chosen.sharpest else 0.0
+            if found > score:
+                best, score = (number, image), found
+            if number == stops[at] - 1:
+                yield best
+                at, best, score = at + 1, _nothing(starts[at + 1 :]), -1.0
+                if at == len(windows):
+                    return
+        while at < len(windows):
+            yield best
+            at, best = at + 1, _nothing(starts[at + 1 :])
+
+    def _decode(self, first: int, *, threads: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Frame numbers and pictures from `first` on, in order; what cannot be decoded is left out.
+
+        Decoding begins at the key frame before it. A container may land later than asked, or begin with pictures
+        that lean on what lies before: then it is sent to the key frame before that one.
+        """
+        keys: list[int | None] = [*self._stamps.key_stamps_to(first, _EARLIER)] if first > 0 else []
+        tries = keys if len(keys) == _EARLIER else [*keys, None]
+        for stamp in tries:
+            pictures = self._decode_from(stamp, threads=threads)
+            opening = next(pictures, None)
+            if opening is None or (opening[0] > first and stamp != tries[-1]):
+                continue
+            yield from (found for found in chain([opening], pictures) if found[0] >= first)
+            return
+
+    def _decode_from(self, stamp: int | None, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Frame numbers and pictures from the key frame at a stamp, or from the beginning."""
+        with av.open(str(self._path)) as container:
+            stream = picture_stream(container)
+            assert stream is not None
+            if threads:
+                stream.thread_type = "AUTO"
+            if stamp is not None:
+                container.seek(stamp, stream=stream, backward=True)
+            count = 0
+            for packet in packets(container, stream):
+                try:
+                    images = packet.decode()
+                except av.FFmpegError:
+                    continue
+                for image in images:
+                    number = self._stamps.number(image, count)
+                    count += 1
+                    if number is not None:
+                        yield number, image
 
     def _time_s(self, number: int) -> float:
-        if self._options.fps or not self._clock:
-            return number / self._fps
-        return float((self._stamps[number] - self._stamps[0]) * self._time_base)
+        return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
 
-    def _decode(self, first: int) -> Iterator[tuple[int, av.VideoFrame]]:
-        """Frame numbers and pictures from `first` on, in order; what cannot be decoded is left out."""
-        with av.open(str(self._path)) as container:
-            stream = container.streams.video[0]
-            if self._clock and first > 0:
-                container.seek(self._stamps[first], stream=stream, backward=True)
-            count = 0
-            for image in _pictures(container, stream):
-                number = self._number_of.get(image.pts or 0, -1) if self._clock else count
-                count += 1
-                if number >= first:
-                    yield number, image
-
-    def _first(self) -> tuple[Rig, int]:
+    def _first(self) -> tuple[Upright, Rig]:
         optics = Optics(self._options.intrinsics, self._options.distortion or ())
-        for _, image in self._decode(self._numbers[0]):
-            color = upright(image)
-            rig = build_rig(optics, (color.shape[0], color.shape[1]), None, None)
-            return rig, _quarter_turns(image) * 90
+        for _, image in self._decode(int(self._chosen.starts[0])):
+            turned = Upright.of(image, self._stamps.aspect)
+            return turned, build_rig(optics, turned.size, None, None, self._options.max_side)
         raise SourceError(f"{self._path}: no frame of it can be decoded; is the copy complete?")
 
-    def _describe(self, rotation: int) -> SourceInfo:
-        notes = []
-        if rotation:
-            notes.append(f"frames are turned by {rotation} degrees counter-clockwise, as the file says")
-        if not self._clock:
+    def _describe(self) -> SourceInfo:
+        rig, notes = self._rig, [*self._upright.notes(), *self._stamps.notes]
+        if rig.color_size != rig.stored_size:
+            notes.append(reduced_note(rig))
+        if not self._stamps.clock:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
-        missing = ["depth: this version builds from RGB-D folders (7-Scenes, TUM, Replica) only"]
-        if self._rig.camera is None:
+        if self._chosen.sharpest:
+            notes.append("of each so many frames the sharpest is taken; --no-sharpest takes the first")
+        missing = ["there is no depth: --reconstruction with a model for colour images"]
+        if rig.camera is None:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
+        focal = None if rig.camera is not None else self._stamps.focal_35mm
+        height, width = rig.stored_size
+        guess = believable(None if focal is None else film_focal(focal, width, height), width, height)
         listing = [(self._path.name, self._path.stat().st_size)]
         return SourceInfo(
             kind="video",
             path=str(self._path),
-            frame_count=len(self._numbers),
+            frame_count=len(self._chosen),
             fps=self._fps,
-            camera=self._rig.camera,
+            camera=rig.camera,
             has_depth=False,
             has_poses=False,
             scale_kind="relative",
             fingerprint=fingerprint("video", listing, self._options),
             notes=tuple(notes),
             missing=tuple(missing),
-            image_size=self._rig.color_size,
+            image_size=rig.color_size,
+            camera_guess=None if guess is None else centred_camera(guess, rig),
         )
 
 
-def upright(image: av.VideoFrame) -> NDArray[np.uint8]:
-    """RGB, turned as the file's display matrix says. Shape (H, W, 3)."""
-    return np.ascontiguousarray(np.rot90(image.to_ndarray(format="rgb24"), _quarter_turns(image)))
-
-
-def _quarter_turns(image: av.VideoFrame) -> int:
-    """Counter-clockwise quarter turns that put the picture upright."""
-    return round(getattr(image, "rotation", 0) / 90) % 4
-
-
-def _list_stamps(path: Path) -> tuple[list[int], Fraction, float]:
-    """Presentation stamps of every picture, ascending, their unit in seconds, and the mean frame rate.
-
-    Where stamps are missing or doubled they are 0, 1, 2, ... twice over, see `_has_clock`.
-    """
-    try:
-        with av.open(str(path)) as container:
-            if not container.streams.video or any(sign in container.format.name for sign in _NOT_VIDEO):
-                raise SourceError(f"{path} is not a video ({container.format.name}); give a video file or a folder")
-            stream = container.streams.video[0]
-            packets = (p for p in _packets(container, stream) if p.size and not p.is_discard)
-            stamps = [p.pts for p in packets]
-            time_base = stream.time_base or Fraction(1, 1)
-            rate = float(stream.average_rate or stream.base_rate or 0) or DEFAULT_FPS
-    except av.FFmpegError as error:
-        raise SourceError(f"{path} is not a video that can be read ({error.strerror})") from None
-    if not stamps:
-        raise SourceError(f"{path} holds no frames; is the copy complete?")
-    known = [s for s in stamps if s is not None]
-    if len(known) < len(stamps) or len(set(known)) < len(known):
-        return [0] * len(stamps), time_base, rate
-    return sorted(known), time_base, rate
-
-
-def _has_clock(stamps: list[int]) -> bool:
-    return len(stamps) == 1 or stamps[-1] > stamps[0]
-
-
-def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """Packets up to the end, or to where the file breaks off."""
-    try:
-        yield from container.demux(stream)
-    except av.FFmpegError:
-        return
-
-
-def _pictures(container: Any, stream: Any) -> Iterator[av.VideoFrame]:
-    """Decoded pictures in display order; packets that cannot be decoded are passed over."""
-    for packet in _packets(container, stream):
-        try:
-            yield from packet.decode()
-        except av.FFmpegError:
-            continue
+def _nothing(starts: NDArray[np.int64]) -> tuple[int, av.VideoFrame | None]:
+    """A window, the first of these, of which nothing was decoded."""
+    return (int(starts[0]) if len(starts) else 0, None)
