@@ -12,14 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from list3r.association.chunk_nodes import NodeSettings
 from list3r.association.edges import EdgeSettings, measure_edge
 from list3r.association.graph_growth import extend
 from list3r.association.joint_window import JointReconstructor
+from list3r.association.node_graph import bend_chunks
 from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.frames.base import Camera
 from list3r.instances.changed_places import add_changed_places
 from list3r.instances.overlays import write_support
+from list3r.memory.bends import Bend
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
@@ -35,6 +38,7 @@ class AssociationSettings:
     revisits: RevisitSettings = field(default_factory=RevisitSettings)
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     graph: GraphSettings = field(default_factory=GraphSettings)
+    nodes: NodeSettings = field(default_factory=NodeSettings)
 
 
 def add_chunk(
@@ -125,10 +129,16 @@ SOLVED_WHOLE = 60
 """Chunks up to which every new one solves the whole graph again (some milliseconds); beyond, it is fitted in."""
 
 
-def place_chunks(store: Store, settings: GraphSettings | None = None, new: int | None = None) -> None:
+def place_chunks(
+    store: Store,
+    settings: GraphSettings | None = None,
+    new: int | None = None,
+    nodes: NodeSettings | None = None,
+) -> None:
     """Optimise the graph, find which way is up, and write where every chunk lies.
 
     With the id of a `new` chunk in a long video only what that chunk touches is solved; `finish_session` solves all.
+    With `nodes` it is also found how each chunk bends.
     """
     chunks = store.chunks()
     edges = store.edges()
@@ -139,6 +149,8 @@ def place_chunks(store: Store, settings: GraphSettings | None = None, new: int |
     else:
         graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=settings)
     store.add_edges(after for before, after in zip(edges, graph.edges, strict=True) if after is not before)
+    if nodes is not None:
+        graph = _straightened(store, graph, chunks, metric, settings, nodes)
     known = {} if store.get_value("poses") == "given" else graph.covariances
     store.place_chunks(graph.S_graph_chunk, graph.components, known)
     store.set_value("T_world_graph", np.eye(4).tolist())
@@ -149,13 +161,31 @@ def place_chunks(store: Store, settings: GraphSettings | None = None, new: int |
     store.place_chunks({k: T_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
 
 
+def _straightened(
+    store: Store,
+    graph: GraphResult,
+    chunks: Sequence[ChunkRow],
+    metric: bool,
+    settings: GraphSettings | None,
+    nodes: NodeSettings,
+) -> GraphResult:
+    """The graph with the bending of chunks undone; chunks whose poses were given do not bend."""
+    given = {s.session_id for s in store.sessions() if _poses_given(store, s.session_id)}
+    rigid = {c.chunk_id for c in chunks if c.session_id in given}
+    bends: dict[int, Bend] = {}
+    if len(rigid) < len(chunks):
+        graph, bends = bend_chunks(store.frame_samples, graph, rigid, metric, nodes, settings)
+    store.set_bends(bends)
+    return graph
+
+
 def finish_session(
     store: Store, session_id: int, settings: AssociationSettings | None = None, *, library: bool = True
 ) -> None:
     """Place all chunks once more by all edges, derive the library from that, and mark the session as complete."""
     chosen = settings or AssociationSettings()
     with store.transaction():
-        place_chunks(store, chosen.graph)
+        place_chunks(store, chosen.graph, nodes=chosen.nodes)
         if library:
             add_changed_places(store, session_id)
             consolidate(store)

@@ -118,12 +118,12 @@ def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
 def _bent(covariance: Array, settings: WeightSettings) -> Array:
     """Covariances with bending about the middle of each edge's support. Shape (E, 7, 7)."""
     center, radius = support_of(covariance)
-    shape = _about(center)
+    shape = about(center)
     shape[:, :, :3] *= radius[:, None, None]
     return np.asarray(covariance + settings.bend**2 * shape @ np.swapaxes(shape, 1, 2))
 
 
-def _about(center: Array) -> Array:
+def about(center: Array) -> Array:
     """Matrices that take tangents about centres to tangents about the origin. Shape (E, 3) -> (E, 7, 7)."""
     out = np.tile(np.eye(7), (len(center), 1, 1))
     out[:, :3, 3:6], out[:, :3, 6] = skew(center), -center
@@ -145,6 +145,6 @@ def support_of(covariance: Array) -> tuple[Array, Array]:
         [cross[:, 2, 1] - cross[:, 1, 2], cross[:, 0, 2] - cross[:, 2, 0], cross[:, 1, 0] - cross[:, 0, 1]], axis=1
     )
     center[exact] = 0.0
-    back = _about(-center)
+    back = about(-center)
     shift = np.trace((back @ covariance @ np.swapaxes(back, 1, 2))[:, :3, :3], axis1=1, axis2=2)
     return center, np.where(exact, 1.0, np.sqrt(np.maximum(shift, 1e-18) / np.where(exact, 1.0, size)))

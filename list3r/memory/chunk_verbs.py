@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.bend_verbs import BendVerbs
 from list3r.memory.codec import (
     checksum,
     dequantise,
@@ -22,7 +23,6 @@ from list3r.memory.codec import (
     to_json,
     unpack,
 )
-from list3r.memory.connection import Connection
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import (
@@ -80,7 +80,7 @@ class LocalNode:
     """Shape (V,)."""
 
 
-class ChunkVerbs(Connection):
+class ChunkVerbs(BendVerbs):
     """Writing and reading what the chunks measured. Writing verbs are called inside `transaction()`."""
 
     def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
@@ -399,12 +399,21 @@ class ChunkVerbs(Connection):
         return [(r[0], r[1], r[2]) for r in self._rows(query)]
 
     def camera_poses(self, session_id: int | None = None) -> list[tuple[FrameRow, Sim3]]:
-        """Every posed frame with its `S_world_cam`; the scale is the chunk's."""
+        """Every posed frame with its `S_world_cam`, the bending of its chunk undone."""
         chunks = {c.chunk_id: c.S_world_chunk for c in self.chunks()}
+        posed = [f for f in self.frames(session_id) if f.state == "posed"]
+        of_chunk: dict[int, list[int]] = {}
+        for f in posed:
+            of_chunk.setdefault(f.chunk_id, []).append(f.frame_index)
+        straight: dict[tuple[int, int], Sim3] = {}
+        for k, bend in self.bends().items():
+            frames = of_chunk.get(k, [])
+            x = bend.at(np.array(frames, np.int64))
+            straight |= {(k, f): Sim3(x.scale[n], x.rotation[n], x.translation[n]) for n, f in enumerate(frames)}
+        none = Sim3.identity()
         return [
-            (f, chunks[f.chunk_id] @ Sim3.from_matrix(f.T_chunk_cam))
-            for f in self.frames(session_id)
-            if f.state == "posed"
+            (f, chunks[f.chunk_id] @ straight.get((f.chunk_id, f.frame_index), none) @ Sim3.from_matrix(f.T_chunk_cam))
+            for f in posed
         ]
 
     def keyframes(self, chunk_id: int) -> list[Keyframe]:

@@ -25,7 +25,7 @@ _DERIVED = ("instances", "observations", "embeddings", "relations", "events")
 """Tables that consolidation writes; a row lost there is written anew."""
 _PASSING = ("settled", "overlaps", "members", "anchors")
 """Tables that consolidation goes on with; without them it derives the library as a whole."""
-_OF_A_CHUNK = ("placements", "frames", "keyframes", "local_instances", "supports", "observations")
+_OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""
 

@@ -115,6 +115,10 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE INDEX local_instances_moving ON local_instances (chunk_id, local_id) WHERE dynamic;
     DELETE FROM memory WHERE key = 'settled_poses';
     """,
+    # 5: how chunks bend beside the one similarity that places them
+    """
+    CREATE TABLE bends (chunk_id INTEGER PRIMARY KEY REFERENCES chunks, frames BLOB NOT NULL, twists BLOB NOT NULL);
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -1,0 +1,46 @@
+"""How a chunk's frames lie beside the one similarity that places the chunk: a reconstruction bends slowly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.geometry import Sim3
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Bend:
+    """The bending of one chunk, undone: S_world_frame = S_world_chunk exp(x(frame)) takes what a frame saw, in chunk
+    coordinates, to the world. Instances keep the chunk's one similarity, so that nothing of them tears."""
+
+    frames: Array
+    """Frame.index at which x is known, ascending; fractions are between frames. Shape (N,)."""
+    twists: Array
+    """x = (rho, omega, sigma) there, chunk units; linear between and constant beyond. Shape (N, 7)."""
+
+    @staticmethod
+    def none() -> Bend:
+        """A chunk that does not bend."""
+        return Bend(np.zeros(1), np.zeros((1, 7)))
+
+    @staticmethod
+    def of_bytes(frames: bytes, twists: bytes, where: str) -> Bend:
+        """From the columns of a row. Raises `MemoryFileError`, naming `where`, for bytes that are none."""
+        try:
+            at, x = np.frombuffer(frames, "<f8"), np.frombuffer(twists, "<f8").reshape(-1, 7)
+        except ValueError as error:
+            raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error
+        if len(at) != len(x) or not len(at) or not np.isfinite(at).all() or not np.isfinite(x).all():
+            raise MemoryFileError(f"{where} is damaged; run `list3r verify` on the file")
+        return Bend(at, x)
+
+    def at(self, frames: Ints) -> Sim3:
+        """exp(x) at frames (Frame.index). Batched (F,)."""
+        x = np.stack([np.interp(frames, self.frames, self.twists[:, k]) for k in range(7)], axis=-1)
+        return Sim3.exp(x)
