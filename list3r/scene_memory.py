@@ -20,7 +20,8 @@ from list3r.memory.store import Store
 from list3r.memory_edits import MemoryEdits
 from list3r.queries.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame
 from list3r.queries.changes import Changed, changes
-from list3r.queries.find import Found, TextEncoder, find
+from list3r.queries.find import Found, find
+from list3r.queries.free_words import WordEncoder
 from list3r.queries.match import FilterOptions, Match
 from list3r.queries.nearest import nearest
 from list3r.queries.path import path
@@ -177,7 +178,8 @@ class SceneMemory(MemoryEdits):
             >>> memory.nearest((0.5, 1.2, 0.8), k=3, color="red", max_distance=1.0)
         """
         if isinstance(target, str):
-            return nearest(self.store, words=target, k=k, max_distance=max_distance, **filters)
+            encoder = self._words()
+            return nearest(self.store, words=target, k=k, max_distance=max_distance, encoder=encoder, **filters)
         if isinstance(target, int | np.integer):
             return nearest(self.store, instance_id=int(target), k=k, max_distance=max_distance, **filters)
         return nearest(self.store, point=target, k=k, max_distance=max_distance, **filters)
@@ -229,18 +231,25 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def find(
-        self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: TextEncoder | None = None
+        self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
     ) -> Found:
         """The things that a text describes, the best first; nothing where nothing fits, with `notes` that say why.
 
         Words are matched with labels, descriptions, colours and sizes; an id may stand for a thing. Left, right, front
         and behind are told from `viewpoint`, else as in the picture that shows the other thing best. An `encoder` of
-        an embedding space that the memory holds stands in where no thing bears a word.
+        an embedding space that the memory holds stands in where no thing bears a word; without one, the model that
+        `list3r embed` used.
 
             >>> memory.find("white mug on table")
             >>> memory.find("the biggest red thing near the door", k=1)
         """
-        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder)
+        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self._words())
+
+    def _words(self) -> WordEncoder | None:
+        """What compares free words, where the memory was embedded by a text and image model."""
+        from list3r.embedding import stored_words
+
+        return stored_words(self.store)
 
     @_alone
     def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:

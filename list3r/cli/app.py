@@ -16,6 +16,7 @@ import typer
 from list3r.cli import (
     build_commands,
     edit_commands,
+    embed_commands,
     evaluation_commands,
     file_commands,
     memory_commands,
@@ -38,6 +39,7 @@ for module in (
     memory_commands,
     query_commands,
     edit_commands,
+    embed_commands,
     file_commands,
     evaluation_commands,
     update_commands,

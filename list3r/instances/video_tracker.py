@@ -176,7 +176,7 @@ class _State:
 
     def forget(self, position: int) -> None:
         """Drop the frame and the memories that no later frame reads."""
-        self._session.processed_frames.clear()
+        self._session.processed_frames[position] = None  # its number still counts as a frame of the video
         self._session.cache.clear_all()
         for number in range(len(self.objects)):
             kept = self._session.output_dict_per_obj[number]["non_cond_frame_outputs"]

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.camera import camera_of_frame
+from list3r.queries.free_words import WordEncoder
 from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
 from list3r.queries.match import Match, checked_count, checked_instance
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
@@ -27,19 +26,6 @@ _MOST_OBJECTS = 40
 """So many things that others are left of, or between, are looked at."""
 _ALIKE = 0.1
 """Sizes that differ by less than this share are equally the biggest."""
-
-
-class TextEncoder(Protocol):
-    """A model whose vectors of text and of pictures can be compared, such as CLIP or SigLIP."""
-
-    space: str
-    """The embedding space of the memory that it belongs to, `model@revision/dim`."""
-    min_cosine: float
-    """From here a thing is said to be what a text says."""
-
-    def encode(self, text: str) -> NDArray[np.float32]:
-        """The vector of a text. Shape (D,)."""
-        ...
 
 
 class Found(list[Match]):
@@ -74,14 +60,14 @@ class _Search:
     store: Store
     things: dict[int, Instance]
     vocabulary: dict[int, dict[str, float]]
-    encoder: TextEncoder | None
+    encoder: WordEncoder | None
     viewpoint: Place | None
     notes: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
 
 
 def find(
-    store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: TextEncoder | None = None
+    store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> Found:
     """The things that a text describes, the best first: "white mug on table", "chair next to 12".
 

@@ -12,6 +12,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.best_first import box_gaps, nearest_first
+from list3r.queries.free_words import WordEncoder, named_by_vectors
 from list3r.queries.match import (
     FilterOptions,
     Filters,
@@ -33,13 +34,15 @@ def nearest(
     words: str | None = None,
     k: int = 5,
     max_distance: float | None = None,
+    encoder: WordEncoder | None = None,
     **options: Unpack[FilterOptions],
 ) -> list[Match]:
     """The k things nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
     With `words` only things whose label or description bears one of them; with words alone those that they name best
     (most words, then confidence), without distances. The words must all be found where any thing bears them all. Words
-    that name a kind of structure ("floor", "wall") ask for structure too. `max_distance` bounds the distance between
+    that name a kind of structure ("floor", "wall") ask for structure too. Words that nothing bears are compared by the
+    vectors of an `encoder` whose space the memory holds. `max_distance` bounds the distance between
     surfaces. What moves is taken where it was last seen; near an instance only what shares its component answers. For
     the filters see `Filters`. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that
     was never given.
@@ -60,7 +63,8 @@ def nearest(
     if words is None:
         near = _near(store, origin, place, k, max_distance, filters)
         return [_match(i, distance, "", origin, place) for distance, i in near]
-    named = _named([i for i in filters.select(store.instances()) if origin is None or i.id != origin.id], words)
+    others = [i for i in filters.select(store.instances()) if origin is None or i.id != origin.id]
+    named = _named(others, words) or _alike(store, others, words, encoder)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         return [Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]]
@@ -68,6 +72,16 @@ def nearest(
     reasons = {i.id: reason for i, _, reason in named}
     found = _by_distance(bearing, _measure(store, origin, place), _aabb(origin, place), k, max_distance)
     return [_match(i, distance, reasons[i.id], origin, place) for distance, i in found]
+
+
+def _alike(
+    store: Store, instances: Sequence[Instance], words: str, encoder: WordEncoder | None
+) -> list[tuple[Instance, float, str]]:
+    """Things whose vectors fit words that nothing bears."""
+    cosine = {} if encoder is None else named_by_vectors(store, encoder, words)
+    return [
+        (i, round(cosine[i.id], 4), f"like {words!r}: cosine {cosine[i.id]:.2f}") for i in instances if i.id in cosine
+    ]
 
 
 def _near(

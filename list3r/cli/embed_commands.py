@@ -1,0 +1,54 @@
+"""embed: vectors of a text and image model, so that free words find things."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from list3r.cli.common import JsonOption, MemoryArgument, print_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("embed")(embed)
+
+
+def embed(
+    memory: MemoryArgument,
+    model: Annotated[str, typer.Option("--model", help="siglip2 or clip.")] = "siglip2",
+    weights: Annotated[
+        str | None,
+        typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
+    ] = None,
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto.")] = "auto",
+    json: JsonOption = False,
+) -> None:
+    """Look at the stored pictures of every thing with a text and image model; then free words find things.
+
+    Example: list3r embed house.l3r --model siglip2
+    """
+    from tqdm import tqdm
+
+    from list3r.embedding import embed_memory
+    from list3r.memory.errors import OptionError
+    from list3r.models.cache import resolve
+    from list3r.models.cards import find_card
+
+    card = find_card(model, "text")
+    if card is None:
+        raise OptionError(f"--model {model} compares no words with pictures; choose siglip2 or clip")
+    name = resolve(weights, card.weights[0], f"--model {model}")
+    with tqdm(total=1, desc="embed", unit="chunk", disable=None if not json else True) as bar:
+
+        def shown(done: int, total: int) -> None:
+            bar.total, bar.n = total, done
+            bar.refresh()
+
+        report = embed_memory(memory, name, device, shown)
+    if json:
+        print_json(vars(report))
+        return
+    print(f"{report.instances} things have a vector in {report.space}")
+    if report.without_picture:
+        print(f"{report.without_picture} are shown by no stored picture")
