@@ -1,0 +1,110 @@
+"""Poses of the frames between the keyframes, from the points of the map that their corners belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.reconstruction.sfm_mapping import MappingSettings, Poses, SparseMap, pose_of
+from list3r.reconstruction.sfm_tracks import Gray, Tracks
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FillSettings:
+    """How the frames between keyframes are posed."""
+
+    bridge: int = 4
+    """Frames without corners in a row, between two that are posed, that are looked for by the structure known there."""
+    bridge_window_px: int = 31
+    """Window by which its points are looked for."""
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+
+
+@dataclass
+class Segment:
+    """Frames posed in one map."""
+
+    found: SparseMap
+    T_map_cam: dict[int, Poses]
+    """By position in the chunk."""
+    seen: dict[int, tuple[Floats, NDArray[np.float64]]]
+    """Where points of the map are seen in each frame, (N, 2) px, and the points, (N, 3) map coordinates."""
+
+    def depths(self, position: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places (N, 2), px, and depths (N,), map units, of the points seen in a frame."""
+        xy, points = self.seen[position]
+        T_cam_map = np.linalg.inv(self.T_map_cam[position])
+        z = points @ T_cam_map[2, :3] + T_cam_map[2, 3]
+        return xy[z > 0].astype(np.float64), z[z > 0]
+
+
+def fill_segments(
+    maps: Sequence[SparseMap], tracks: Tracks, grays: Sequence[Gray], settings: FillSettings | None = None
+) -> list[Segment]:
+    """Pose all frames that can be posed in one of the maps, each in the first that holds it; largest segment first."""
+    chosen = settings or FillSettings()
+    left = set(range(len(grays)))
+    segments = []
+    for found in maps:
+        segment = _fill(found, tracks, sorted(left), chosen)
+        _bridge(segment, grays, sorted(left), chosen)
+        left -= set(segment.T_map_cam)
+        segments.append(segment)
+    segments = [s for s in segments if len(s.T_map_cam) >= 2]
+    return sorted(segments, key=lambda s: (-len(s.T_map_cam), min(s.T_map_cam)))
+
+
+def _fill(found: SparseMap, tracks: Tracks, positions: Iterable[int], settings: FillSettings) -> Segment:
+    numbers = np.array(sorted(found.points), np.int64)
+    places = np.array([found.points[int(n)] for n in numbers]).reshape(-1, 3)
+    segment = Segment(found, {}, {})
+    registered = sorted(found.T_map_cam)
+    for position in positions:
+        known = np.isin(tracks.ids[position], numbers)
+        xy = tracks.xy[position][known]
+        points = places[np.searchsorted(numbers, tracks.ids[position][known])]
+        start = segment.T_map_cam.get(position - 1)
+        if position in found.T_map_cam or start is None:
+            start = found.T_map_cam[min(registered, key=lambda k: (abs(k - position), k))]
+        posed = pose_of(xy, points, found.camera, start, settings.mapping)
+        if posed is not None:
+            segment.T_map_cam[position] = posed[0]
+            segment.seen[position] = xy[posed[1]], points[posed[1]]
+        elif position in found.T_map_cam and len(xy) == 0:
+            segment.T_map_cam[position] = found.T_map_cam[position]
+            segment.seen[position] = xy, points
+    return segment
+
+
+def _bridge(segment: Segment, grays: Sequence[Gray], positions: Sequence[int], settings: FillSettings) -> None:
+    """Pose frames that lost their corners, in place, by looking for the structure that the neighbours see."""
+    posed = sorted(segment.T_map_cam)
+    for before, behind in pairwise(posed):
+        gap = range(before + 1, behind)
+        if not 0 < len(gap) <= settings.bridge:
+            continue
+        for position in gap:
+            near = before if position - before <= behind - position else behind
+            if position in positions:
+                _look_for(segment, grays, near, position, settings)
+
+
+def _look_for(segment: Segment, grays: Sequence[Gray], near: int, position: int, settings: FillSettings) -> None:
+    xy, points = segment.seen[near]
+    if len(xy) < settings.mapping.least_matches:
+        return
+    size = (settings.bridge_window_px, settings.bridge_window_px)
+    place, found, _ = cv2.calcOpticalFlowPyrLK(grays[near], grays[position], xy, None, winSize=size, maxLevel=5)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(grays[position], grays[near], place, None, winSize=size, maxLevel=5)
+    good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - xy, axis=1) < 2.0)
+    made = pose_of(place[good], points[good], segment.found.camera, segment.T_map_cam[near], settings.mapping)
+    if made is not None and made[1].mean() > 0.5:
+        segment.T_map_cam[position] = made[0]
+        segment.seen[position] = place[good][made[1]], points[good][made[1]]

@@ -1,0 +1,304 @@
+"""Structure from motion of keyframes by pycolmap: two-view geometry, incremental mapping, bundle adjustment.
+
+Nothing touches the disk: the correspondences lie in a database in memory. pycolmap's pixels have their origin at the
+corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
+correspondences give the same structure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+
+Poses = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How keyframes become a map. Errors in px of a picture 640 wide."""
+
+    least_matches: int = 20
+    """Fewest correspondences of two keyframes that count."""
+    pair_error_px: float = 2.0
+    """Largest epipolar error of a match."""
+    pose_error_px: float = 4.0
+    """Largest error of a correspondence of structure and picture when a keyframe is added."""
+    point_error_px: float = 2.0
+    """Largest error of an observation that stays."""
+    first_angle_deg: float = 3.0
+    """Least angle between the rays of the first two keyframes."""
+    point_angle_deg: float = 1.0
+    """Least angle between the rays to a point."""
+    least_points: int = 40
+    """Fewest points of a map that is believed."""
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class View:
+    """Correspondences seen in a keyframe."""
+
+    ids: Ints
+    """Track numbers. Shape (N,)."""
+    xy: Floats
+    """px. Shape (N, 2)."""
+
+
+@dataclass(frozen=True)
+class SparseMap:
+    """Poses of some keyframes and points, in one frame of reference and scale of their own."""
+
+    T_map_cam: dict[int, Poses]
+    """By key of the view. Shape (4, 4)."""
+    points: dict[int, NDArray[np.float64]]
+    """Map coordinates, by track number. Shape (3,)."""
+    camera: Camera
+    k1: float = 0.0
+    """Radial distortion left in the pictures, where it was free."""
+    error_px: float = 0.0
+    """Mean reprojection error."""
+
+
+Matches = Mapping[tuple[int, int], NDArray[np.int64]]
+"""Rows of two views that show the same, by the two views' keys. Shape (M, 2)."""
+
+
+@dataclass(frozen=True)
+class MapProblem:
+    """Keyframes and what they see in common."""
+
+    views: dict[int, View]
+    pairs: dict[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
+    """Rows of the views that show the same point, by keys, the smaller first. Shape (M, 2)."""
+
+
+def shared_rows(a: View, b: View) -> NDArray[np.int64]:
+    """Rows of the tracks that two views share. Shape (M, 2)."""
+    _, at_a, at_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    return np.stack([at_a, at_b], axis=1).astype(np.int64)
+
+
+def build_maps(
+    problem: MapProblem, camera: Camera, *, free_camera: str = "", settings: MappingSettings | None = None
+) -> list[SparseMap]:
+    """Maps of the keyframes, the largest first; several where they cannot be joined, none where nothing has depth.
+
+    `free_camera` names what of the camera is estimated as well: "" nothing, "k1" the distortion, "focal" the focal
+    length and the distortion.
+    """
+    chosen = settings or MappingSettings()
+    cache = _cache(problem, camera, free_camera, chosen)
+    if cache is None:
+        return []
+    manager = pycolmap.ReconstructionManager()
+    pycolmap.IncrementalPipeline(_options(camera, free_camera, chosen), cache, manager).run()
+    maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
+    maps = [m for m in maps if len(m.points) >= chosen.least_points and len(m.T_map_cam) >= 2]
+    return sorted(maps, key=lambda m: (-len(m.T_map_cam), min(m.T_map_cam)))
+
+
+def triangulate(
+    problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], settings: MappingSettings | None = None
+) -> SparseMap | None:
+    """Points of views whose poses are known; None when there are too few."""
+    chosen = settings or MappingSettings()
+    known = {key: view for key, view in problem.views.items() if key in T_map_cam}
+    pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
+    cache = _cache(MapProblem(known, pairs), camera, "", chosen)
+    if cache is None:
+        return None
+    mapper = pycolmap.IncrementalMapper(cache)
+    made = pycolmap.Reconstruction()
+    mapper.begin_reconstruction(made)
+    for image_id, image in sorted(made.images.items()):
+        image.frame.set_cam_from_world(image.camera_id, _rigid(np.linalg.inv(T_map_cam[image_id - 1])))
+        made.register_frame(image.frame_id)
+    options = _options(camera, "", chosen)
+    for image_id in sorted(made.images):
+        mapper.triangulate_image(options.triangulation, image_id)
+    mapper.complete_and_merge_tracks(options.triangulation)
+    mapper.filter_points(options.mapper)
+    found = _sparse_map(made, problem, camera)
+    return found if len(found.points) >= chosen.least_points else None
+
+
+def pose_of(
+    xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: MappingSettings
+) -> tuple[Poses, NDArray[np.bool_]] | None:
+    """T_map_cam from points (N, 3) and where they are seen (N, 2), and which agree; None when too few do.
+
+    From `start` by robust refinement; where that fails, or without one, by sampling.
+    """
+    if len(xy) < settings.least_matches:
+        return None
+    lens, px = _lens(camera, ""), xy.astype(np.float64) + 0.5
+    gate = settings.pose_error_px * _unit(camera)
+    if start is not None:
+        found = _refined(px, points, lens, camera, start, np.ones(len(px), bool), gate)
+        if found is not None and found[1].mean() > 0.6:
+            return found
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, settings.seed, 1
+    guess = pycolmap.estimate_and_refine_absolute_pose(px, points, lens, options)
+    if guess is None or guess["num_inliers"] < settings.least_matches:
+        return None
+    T = np.linalg.inv(_matrix(guess["cam_from_world"]))
+    found = _refined(px, points, lens, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
+    return found if found is not None and found[1].mean() > 0.3 else None
+
+
+def _refined(
+    px: NDArray[np.float64],
+    points: NDArray[np.float64],
+    lens: Any,
+    camera: Camera,
+    start: Poses,
+    rows: NDArray[np.bool_],
+    gate: float,
+) -> tuple[Poses, NDArray[np.bool_]] | None:
+    T_cam_map = np.linalg.inv(start)
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.loss_function_scale, options.gradient_tolerance = 0.5 * _unit(camera), 1e-3
+    for _ in range(2):
+        found = pycolmap.refine_absolute_pose(_rigid(T_cam_map), px, points, rows, lens, options)
+        if found is None:
+            return None
+        T_cam_map = _matrix(found["cam_from_world"])
+        seen = points @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
+        z = np.maximum(seen[:, 2], 1e-9)
+        at = seen[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx + 0.5, camera.cy + 0.5)
+        rows = (seen[:, 2] > 0) & (np.linalg.norm(at - px, axis=1) < gate)
+        if rows.sum() < 12:
+            return None
+    return np.linalg.inv(T_cam_map), rows
+
+
+def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
+    """pycolmap's correspondence graph; None when no two views have anything in common."""
+    database = pycolmap.Database.open(":memory:")
+    lens = _lens(camera, free_camera)
+    lens.camera_id = 1
+    database.write_camera(lens, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=1)
+    sensor = pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=1)
+    rig.add_ref_sensor(sensor)
+    database.write_rig(rig, use_rig_id=True)
+    for key, view in sorted(problem.views.items()):
+        frame = pycolmap.Frame(frame_id=key + 1, rig_id=1)
+        frame.add_data_id(pycolmap.data_t(sensor_id=sensor, id=key + 1))
+        database.write_frame(frame, use_frame_id=True)
+        image = pycolmap.Image(name=f"{key:06d}", camera_id=1, image_id=key + 1)
+        image.frame_id = key + 1
+        database.write_image(image, use_image_id=True)
+        database.write_keypoints(key + 1, (view.xy + np.float32(0.5)).astype(np.float32))
+    count = 0
+    for (a, b), rows in sorted(problem.pairs.items()):
+        found = _two_view(problem.views[a], problem.views[b], rows, lens, camera, free_camera, settings)
+        if found is not None and len(found.inlier_matches) >= settings.least_matches:
+            database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
+            database.write_two_view_geometry(a + 1, b + 1, found)
+            count += 1
+    if not count:
+        return None
+    options = pycolmap.DatabaseCacheOptions()
+    options.min_num_matches = settings.least_matches
+    return pycolmap.DatabaseCache.create(database, options)
+
+
+def _two_view(
+    a: View, b: View, rows: NDArray[np.int64], lens: Any, camera: Camera, free_camera: str, settings: MappingSettings
+) -> Any:
+    if len(rows) < settings.least_matches:
+        return None
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers, options.detect_watermark = settings.least_matches, False
+    options.ransac.max_error = settings.pair_error_px * _unit(camera) * (2.0 if free_camera else 1.0)
+    options.ransac.random_seed, options.ransac.num_threads = settings.seed, 1
+    calibrated, free = pycolmap.estimate_calibrated_two_view_geometry, pycolmap.estimate_two_view_geometry
+    estimate = free if free_camera == "focal" else calibrated
+    one, two = (view.xy.astype(np.float64) + 0.5 for view in (a, b))
+    return estimate(lens, one, lens, two, rows.astype(np.uint32), options)
+
+
+def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.extract_colors = 1, settings.seed, False
+    options.min_num_matches, options.min_model_size = settings.least_matches, 2
+    options.init_num_trials, options.max_num_models = 50, 10
+    options.ba_refine_focal_length = free_camera == "focal"
+    options.ba_refine_extra_params = bool(free_camera)
+    options.ba_refine_principal_point = False
+    options.ba_local_max_num_iterations, options.ba_global_max_num_iterations = 10, 25
+    options.ba_global_max_refinements = 3
+    mapper, unit = options.mapper, _unit(camera)
+    mapper.num_threads, mapper.random_seed = 1, settings.seed
+    mapper.init_min_num_inliers, mapper.init_min_tri_angle = 2 * settings.least_matches, settings.first_angle_deg
+    mapper.init_max_error = settings.pair_error_px * unit * (2.0 if free_camera else 1.0)
+    mapper.abs_pose_min_num_inliers = settings.least_matches
+    mapper.abs_pose_max_error = settings.pose_error_px * unit
+    mapper.abs_pose_refine_focal_length = free_camera == "focal"
+    mapper.abs_pose_refine_extra_params = bool(free_camera)
+    mapper.filter_max_reproj_error = settings.point_error_px * unit
+    mapper.filter_min_tri_angle = settings.point_angle_deg
+    mapper.ba_local_min_tri_angle = 2.0
+    options.triangulation.min_angle = settings.point_angle_deg
+    options.triangulation.ignore_two_view_tracks = False
+    options.triangulation.random_seed = settings.seed
+    return options
+
+
+def _sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
+    poses: dict[int, Poses] = {}
+    for image_id in sorted(made.reg_image_ids()):
+        poses[image_id - 1] = np.linalg.inv(_matrix(made.images[image_id].cam_from_world()))
+    points: dict[int, NDArray[np.float64]] = {}
+    best: dict[int, int] = {}
+    for _, point in sorted(made.points3D.items()):
+        elements = point.track.elements
+        for element in elements:
+            track = int(problem.views[element.image_id - 1].ids[element.point2D_idx])
+            if best.get(track, 0) < len(elements):
+                best[track], points[track] = len(elements), np.asarray(point.xyz, np.float64)
+    params = next(iter(made.cameras.values())).params
+    if len(params) == 4 and camera.fx == camera.fy and next(iter(made.cameras.values())).model_name == "SIMPLE_RADIAL":
+        camera = Camera(camera.width, camera.height, params[0], params[0], params[1] - 0.5, params[2] - 0.5)
+        k1 = float(params[3])
+    else:
+        k1 = 0.0
+    error = float(made.compute_mean_reprojection_error()) if made.num_points3D() else 0.0
+    return SparseMap(poses, points, camera, k1, error)
+
+
+def _lens(camera: Camera, free_camera: str) -> Any:
+    c = camera
+    if free_camera:
+        model, params = "SIMPLE_RADIAL", [0.5 * (c.fx + c.fy), c.cx + 0.5, c.cy + 0.5, 0.0]
+    else:
+        model, params = "PINHOLE", [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5]
+    lens = pycolmap.Camera(model=model, width=c.width, height=c.height, params=params)
+    lens.has_prior_focal_length = free_camera != "focal"
+    return lens
+
+
+def _unit(camera: Camera) -> float:
+    """Px of this camera that are one px of a picture 640 wide."""
+    return max(camera.width, camera.height) / 640.0
+
+
+def _matrix(rigid: Any) -> Poses:
+    T = np.eye(4)
+    T[:3] = rigid.matrix()
+    return T
+
+
+def _rigid(T: Poses) -> Any:
+    return pycolmap.Rigid3d(T[:3].copy())

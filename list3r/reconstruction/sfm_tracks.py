@@ -1,0 +1,252 @@
+"""Corners followed through a chunk: pyramidal Lucas-Kanade from frame to frame, each position then refined against the
+frame where the corner was first seen, so that a track does not creep.
+
+On the way frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where
+nearly all corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in
+those too (a jerk) all tracks end and a new run of tracks begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Gray = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """How corners are found and followed."""
+
+    width: int = 1024
+    """Pictures are shrunk to at most this many px on their longer side."""
+    corners: int = 600
+    """Corners followed at a time."""
+    quality: float = 0.003
+    """Least strength of a corner by that of the strongest."""
+    least_strength: float = 2e-4
+    """Least smaller eigenvalue of a corner's gradients; below is sensor noise (black frames, bare walls)."""
+    spacing: float = 0.0125
+    """Corners are no nearer to each other, by the longer side (8 px of 640)."""
+    window_px: int = 21
+    levels: int = 4
+    most_creep_px: float = 2.0
+    """Farthest that the refined position may lie from where the corner was followed to."""
+    most_back_px: float = 1.0
+    """Farthest from its start that a corner may come out when it is followed back."""
+    most_difference: float = 22.0
+    """Largest mean difference of grey values between a corner and where it was first seen."""
+    keyframe_flow: float = 0.05
+    """A frame is a keyframe when half of the corners of the last one have moved so far, by the longer side."""
+    keyframe_survival: float = 0.55
+    """... or when no more than this share of them is left."""
+    least_survival: float = 0.25
+    """Less than this share left from one frame to the next means that the corners were lost."""
+    look_past: int = 3
+    """Frames in which corners are lost and found again behind."""
+    least_corners: int = 30
+    """Fewer corners than this are not followed."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of corners in F frames."""
+
+    ids: tuple[Ints, ...]
+    """Track numbers seen in each frame, ascending. F arrays of shape (N,)."""
+    xy: tuple[Floats, ...]
+    """Where, px of the full picture. F arrays of shape (N, 2)."""
+    keyframes: tuple[int, ...]
+    """Positions of the keyframes, ascending."""
+    run: NDArray[np.int64]
+    """Number of the run of tracks that each frame belongs to, -1 for a frame without corners. Shape (F,)."""
+    flow: Floats
+    """Median motion of the corners since the frame before, by the longer side; NaN where unknown. Shape (F,)."""
+
+
+def follow_corners(grays: Sequence[Gray], settings: TrackSettings | None = None) -> Tracks:
+    """Follow corners through grey pictures of one size."""
+    chosen = settings or TrackSettings()
+    follower = _Follower(chosen, grays[0].shape)
+    while (at := len(follower.ids)) < len(grays):
+        ahead = grays[at : at + 1 + chosen.look_past]
+        skipped = next((n for n, gray in enumerate(ahead) if follower.follow(gray)), None)
+        if skipped is None:
+            follower.start(grays[at])
+        else:
+            follower.note(skipped, ahead[skipped])
+    return follower.tracks()
+
+
+@dataclass
+class _Alive:
+    """Corners being followed."""
+
+    ids: Ints
+    xy: Floats
+    origin: Ints
+    """Position of the frame where each was first seen."""
+    origin_xy: Floats
+
+    @staticmethod
+    def none() -> _Alive:
+        empty = np.zeros((0, 2), np.float32)
+        return _Alive(np.zeros(0, np.int64), empty, np.zeros(0, np.int64), empty)
+
+    def where(self, keep: NDArray[np.bool_]) -> _Alive:
+        return _Alive(self.ids[keep], self.xy[keep], self.origin[keep], self.origin_xy[keep])
+
+
+@dataclass
+class _Follower:
+    settings: TrackSettings
+    shape: tuple[int, ...]
+    alive: _Alive = field(default_factory=_Alive.none)
+    pictures: dict[int, Gray] = field(default_factory=dict)
+    """Pictures that corners alive were first seen in, and the last one that was followed."""
+    last: int = -1
+    """Position of the last frame that was followed."""
+    ids: list[Ints] = field(default_factory=list)
+    xy: list[Floats] = field(default_factory=list)
+    keyframes: list[int] = field(default_factory=list)
+    runs: list[int] = field(default_factory=list)
+    flows: list[float] = field(default_factory=list)
+    at_keyframe: dict[int, Floats] = field(default_factory=dict)
+    next_id: int = 0
+    run: int = -1
+    _moved: float = float("nan")
+
+    def __post_init__(self) -> None:
+        self.shrink = min(1.0, self.settings.width / max(self.shape))
+        self.longer = max(self.shape) * self.shrink
+
+    def follow(self, gray: Gray) -> bool:
+        """Look for the corners in a frame; False, and nothing changed, when nearly all of them are lost."""
+        before = len(self.alive.ids)
+        if not before:
+            return False
+        found = self._followed(self._small(gray))
+        if len(found.ids) < max(self.settings.least_survival * before, self.settings.least_corners / 2):
+            return False
+        moved = found.xy - self.alive.xy[np.searchsorted(self.alive.ids, found.ids)]
+        self._moved = float(np.median(np.linalg.norm(moved, axis=1))) / self.longer
+        self.alive = found
+        return True
+
+    def note(self, skipped: int, gray: Gray) -> None:
+        """Take down the frame in which the corners were found, and those skipped before it."""
+        for _ in range(skipped):
+            self._append(_Alive.none(), float("nan"))
+        position = len(self.ids)
+        self._keep(self._small(gray), position)
+        if self._moved_enough():
+            self._take_up(self.pictures[position], position)
+        self._append(self.alive, self._moved)
+
+    def start(self, gray: Gray) -> None:
+        """Begin a new run of tracks in a frame; it stays without corners where there are too few."""
+        position = len(self.ids)
+        if len(self.alive.ids) and self.last not in self.keyframes:
+            self.keyframes.append(self.last)
+        self.alive, self.at_keyframe = _Alive.none(), {}
+        self._keep(self._small(gray), position)
+        self._take_up(self.pictures[position], position)
+        self._append(self.alive, float("nan"))
+
+    def _small(self, gray: Gray) -> Gray:
+        if self.shrink == 1.0:
+            return gray
+        size = (round(gray.shape[1] * self.shrink), round(gray.shape[0] * self.shrink))
+        return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def _keep(self, gray: Gray, position: int) -> None:
+        wanted = set(np.unique(self.alive.origin).tolist())
+        self.pictures = {k: picture for k, picture in self.pictures.items() if k in wanted}
+        self.pictures[position], self.last = gray, position
+
+    def _append(self, seen: _Alive, flow: float) -> None:
+        self.ids.append(seen.ids)
+        self.xy.append(((seen.xy + 0.5) / self.shrink - 0.5).astype(np.float32))
+        self.runs.append(self.run if len(seen.ids) else -1)
+        self.flows.append(flow)
+
+    def tracks(self) -> Tracks:
+        """All that was followed. The last frame of each run is a keyframe."""
+        run = np.array(self.runs, np.int64)
+        ends = {int(np.flatnonzero(run == r)[-1]) for r in np.unique(run[run >= 0])}
+        keyframes = tuple(sorted(ends | set(self.keyframes)))
+        return Tracks(tuple(self.ids), tuple(self.xy), keyframes, run, np.array(self.flows, np.float32))
+
+    def _followed(self, gray: Gray) -> _Alive:
+        s, alive, before = self.settings, self.alive, self.pictures[self.last]
+        size, criteria = (s.window_px, s.window_px), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+        xy, found, _ = cv2.calcOpticalFlowPyrLK(
+            before, gray, alive.xy, None, winSize=size, maxLevel=s.levels, criteria=criteria
+        )
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+            gray, before, xy, alive.xy.copy(), winSize=size, maxLevel=1, criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
+        good = (found.ravel() > 0) & (returned.ravel() > 0)
+        good &= np.linalg.norm(back - alive.xy, axis=1) < s.most_back_px
+        refined = xy.copy()
+        for origin in np.unique(alive.origin[good]).tolist():
+            mine = np.flatnonzero(good & (alive.origin == origin))
+            if origin == self.last:
+                continue
+            place, found, difference = cv2.calcOpticalFlowPyrLK(
+                self.pictures[origin], gray, alive.origin_xy[mine], xy[mine].copy(), winSize=size, maxLevel=0,
+                criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            )  # fmt: skip
+            near = np.linalg.norm(place - xy[mine], axis=1) < s.most_creep_px
+            kept = (found.ravel() > 0) & near & (difference.ravel() < s.most_difference)
+            refined[mine], good[mine] = place, kept
+        height, width = gray.shape
+        inside = (refined >= 1).all(axis=1) & (refined[:, 0] < width - 2) & (refined[:, 1] < height - 2)
+        return _Alive(alive.ids, refined, alive.origin, alive.origin_xy).where(good & inside)
+
+    def _moved_enough(self) -> bool:
+        now = {int(i): p for i, p in zip(self.alive.ids, self.alive.xy, strict=True) if int(i) in self.at_keyframe}
+        if len(now) < self.settings.keyframe_survival * len(self.at_keyframe):
+            return True
+        moved = np.array([np.hypot(*(p - self.at_keyframe[i])) for i, p in now.items()])
+        return bool(np.median(moved) > self.settings.keyframe_flow * self.longer)
+
+    def _take_up(self, gray: Gray, position: int) -> None:
+        """Make the frame a keyframe: fill up with corners where none are followed."""
+        s, alive = self.settings, self.alive
+        gap = max(3.0, s.spacing * self.longer)
+        strength = cv2.cornerMinEigenVal(gray, 3, ksize=3)
+        free = np.full(gray.shape, 255, np.uint8)
+        rim = s.window_px // 2
+        free[:rim], free[-rim:], free[:, :rim], free[:, -rim:] = 0, 0, 0, 0
+        for x, y in alive.xy:
+            cv2.circle(free, (round(float(x)), round(float(y))), round(gap), 0, -1)
+        free[strength < s.least_strength] = 0
+        wanted = s.corners - len(alive.ids)
+        found = cv2.goodFeaturesToTrack(gray, wanted, s.quality, gap, mask=free) if wanted > 0 else None
+        if found is not None:
+            fresh = found.reshape(-1, 2).astype(np.float32)
+            fresh = cv2.cornerSubPix(gray, fresh, (3, 3), (-1, -1), (3, 10, 0.03)).reshape(-1, 2)
+            ids = np.arange(self.next_id, self.next_id + len(fresh))
+            self.next_id += len(fresh)
+            origin = np.full(len(fresh), position, np.int64)
+            self.alive = _Alive(
+                np.concatenate([alive.ids, ids]),
+                np.concatenate([alive.xy, fresh]),
+                np.concatenate([alive.origin, origin]),
+                np.concatenate([alive.origin_xy, fresh]),
+            )
+        if len(self.alive.ids) < s.least_corners:
+            self.alive, self.at_keyframe = _Alive.none(), {}
+            return
+        if not len(alive.ids):
+            self.run += 1
+        self.keyframes.append(position)
+        self.at_keyframe = {int(i): p for i, p in zip(self.alive.ids, self.alive.xy, strict=True)}
