@@ -310,8 +310,8 @@ def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Any]]
         ("kills while editing", kill_edits, edits),
         ("kills of commands that edit", kill_commands, words.kills - 2 * runs - edits - writes),
     ):
-        shutil.copy(updated, folder / "edited.l3r")
-        yield part, kill(folder / "edited.l3r", count, seed + 2)
+        # A file of its own for each: what a killed writer left beside one belongs to no other.
+        yield part, kill(Path(shutil.copy(updated, folder / f"{kill.__name__}.l3r")), count, seed + 2)
     yield "flips", flip(memory, folder, words.flips, seed)
     yield "repairs", repair_flips(memory, folder, words.flips // 10, seed + 1)
     yield "file_mb", round(memory.stat().st_size / 1e6, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -167,3 +168,42 @@ def test_a_second_writer_is_refused_and_a_reader_sees_whole_transactions(make_me
                 writer.drop_instance(3, None)
                 assert len(reader.instances()) == len(SMALL_ROOM)
             assert len(reader.instances()) == len(SMALL_ROOM) - 1
+
+
+def test_the_index_of_words_follows_labels_and_descriptions(make_memory: Make) -> None:
+    path = make_memory()
+
+    def bearing(word: str) -> set[int]:
+        with sqlite3.connect(path) as database:
+            return {n for (n,) in database.execute("SELECT instance FROM words WHERE word = ?", (word,))}
+
+    with Store.open(path, writable=True) as store:
+        first = store.instances()[2]
+        with store.transaction():
+            store.set_labels({first.id: "teapot"})
+        assert bearing("teapot") == {first.id}
+        with store.transaction():
+            store.put_instances([replace(first, label="kettle", description="green sphere, 9 cm")])
+        assert (bearing("teapot"), bearing("kettle"), bearing("sphere")) == (set(), {first.id}, {first.id})
+        with pytest.raises(RuntimeError), store.transaction():
+            store.set_labels({first.id: "teapot"})
+            raise RuntimeError
+        with store.transaction():
+            store.drop_instance(first.id, None)
+        assert bearing("kettle") == bearing("sphere") == bearing("teapot") == set()
+        assert not any("words" in text for text in store.verify())
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM words WHERE word = (SELECT max(word) FROM words)")
+    with Store.open(path) as store:
+        assert any("words" in text for text in store.verify())
+
+
+def test_words_of_another_program_are_written_anew(make_memory: Make) -> None:
+    path = make_memory()
+    with sqlite3.connect(path) as database:
+        held = database.execute("SELECT * FROM words ORDER BY 1, 2").fetchall()
+        database.execute("DELETE FROM words")
+        database.execute("INSERT INTO words VALUES ('', 0, 0), ('old', 1, 100)")
+    Store.open(path, writable=True).close()
+    with sqlite3.connect(path) as database:
+        assert database.execute("SELECT * FROM words ORDER BY 1, 2").fetchall() == held

@@ -17,6 +17,7 @@ from list3r.memory.codec import MAX_BLOB_BYTES, from_json, to_json
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
 from list3r.memory.sums import Sums, write_all
+from list3r.memory.word_index import WordIndex, up_to_date, write_words
 from list3r.memory.writer_lock import WriterLock, lock_path
 
 FAILURES = (sqlite3.Error, UnicodeError)
@@ -41,7 +42,8 @@ class Connection:
         self.path = path
         self._database = database
         self._lock = lock
-        self._sums = None if lock is None else Sums(database)
+        self._followers = () if lock is None else (WordIndex(database), Sums(database))
+        """What follows the rows that a transaction changes; in this order as it commits."""
         self._guard = threading.RLock()
 
     @classmethod
@@ -122,6 +124,9 @@ class Connection:
                 _migrate(database, version)
             _use_write_ahead_log(database)
             opened = cls(path, database, lock)
+            if not up_to_date(database):
+                with opened.transaction():
+                    write_words(database)
             opened._rows("SELECT 1 FROM memory LIMIT 1")  # the first read of a new log ends what holds off checkpoints
             return opened
         except BaseException as error:
@@ -136,7 +141,7 @@ class Connection:
         """Fold the write-ahead log into the one file, release the lock. A second call does nothing."""
         if self._lock is not None:
             with contextlib.suppress(sqlite3.Error):
-                if self._sums is not None and self._sums.pending:
+                if any(follower.pending for follower in self._followers):
                     with self.transaction():
                         pass
             for statement in ("wal_checkpoint(TRUNCATE)", "journal_mode=DELETE"):
@@ -172,8 +177,8 @@ class Connection:
                 self._database.execute("BEGIN IMMEDIATE")
                 try:
                     yield
-                    if self._sums is not None:
-                        self._sums.write()
+                    for follower in self._followers:
+                        follower.write()
                 except BaseException:
                     self._roll_back()
                     raise
@@ -183,8 +188,8 @@ class Connection:
                 raise MemoryFileError(_explain(self.path, error)) from error
 
     def _roll_back(self) -> None:
-        if self._sums is not None:
-            self._sums.forget()
+        for follower in self._followers:
+            follower.forget()
         if self._database.in_transaction:
             self._database.execute("ROLLBACK")
 
@@ -360,6 +365,7 @@ def _migrate(database: sqlite3.Connection, version: int) -> None:
         for migration in MIGRATIONS[version:]:
             for statement in migration.split(";"):
                 database.execute(statement)
+        write_words(database)
         write_all(database)
         database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         database.execute("COMMIT")

@@ -119,6 +119,13 @@ MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE bends (chunk_id INTEGER PRIMARY KEY REFERENCES chunks, frames BLOB NOT NULL, twists BLOB NOT NULL);
     """,
+    # 6: which instances bear a word, and how well it names them, in hundredths; the vectors of one space without others
+    """
+    CREATE TABLE words (
+        word TEXT NOT NULL, instance INTEGER NOT NULL REFERENCES instances, weight INTEGER NOT NULL,
+        PRIMARY KEY (word, instance)) WITHOUT ROWID;
+    CREATE INDEX embeddings_by_space ON embeddings (space);
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

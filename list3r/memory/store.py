@@ -11,6 +11,7 @@ from list3r.memory.connection import FAILURES
 from list3r.memory.edit_verbs import EditVerbs
 from list3r.memory.event_verbs import EventVerbs
 from list3r.memory.sums import OWN_CRC, bad_rows_of, own_crc_wrong, summed_tables
+from list3r.memory.word_index import expected_words, up_to_date
 
 _REFERENCES = (
     ("observations", "instance", "instances", "id"),
@@ -74,6 +75,18 @@ class Store(EditVerbs, EventVerbs):
         for row in self._asked(query):
             if len(row) == 1 or not _holds(row[1], row[2:]):
                 yield f"instance_boxes {row[0]}: the box is not that of the instance"
+
+        yield from self._bad_words()
+
+    def _bad_words(self) -> Iterator[str]:
+        """Where the table of words is not what the instances are called."""
+        try:
+            if up_to_date(self._database):
+                held = set(self._database.execute("SELECT word, instance, weight FROM words WHERE word != ''"))
+                wrong = sorted({row[1] for row in held ^ set(expected_words(self._database))}, key=str)
+                yield from (f"words: those of instance {instance} are not what it is called" for instance in wrong)
+        except FAILURES as error:
+            yield f"words: {error}"
 
     def _asked(self, query: str) -> Iterator[tuple[Any, ...]]:
         """Rows of a query; what SQLite says where it fails, as one row."""

@@ -94,11 +94,11 @@ class BadRow:
 
 @cache
 def summed_tables() -> dict[str, SummedTable]:
-    """Every table of the schema but `sums` and the R*Tree, by name."""
+    """Every table of the schema by name, but `sums` and what is derived from the instances: the R*Tree and `words`."""
     with scratch_database(SCHEMA_VERSION) as database:
         names = database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'instance_boxes%' AND name != 'sums'"
-            " AND name NOT LIKE 'sqlite_%' ORDER BY name"
+            " AND name != 'words' AND name NOT LIKE 'sqlite_%' ORDER BY name"
         ).fetchall()
         return {name: _table(name, database.execute(f"PRAGMA table_info({name})").fetchall()) for (name,) in names}
 

@@ -11,6 +11,7 @@ import numpy as np
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
+from list3r.memory.words import split_words, vocabulary
 from list3r.queries.camera import camera_of_frame
 from list3r.queries.free_words import WordEncoder
 from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
@@ -18,7 +19,7 @@ from list3r.queries.match import Match, checked_count, checked_instance
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
 from list3r.queries.surfaces import distance_between
 from list3r.queries.viewpoint import VIEWPOINT, between
-from list3r.queries.words import STRUCTURE, split_words
+from list3r.queries.words import STRUCTURE
 
 _BY_STRUCTURE_M = 0.4
 """What is nearer than this to a wall is near it: the memory stores that of things only."""
@@ -122,18 +123,7 @@ def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
 
 def _vocabulary(i: Instance) -> dict[str, float]:
     """Words that an instance bears, with how well each names it."""
-    out: dict[str, float] = {}
-    color = split_words(i.color_name)
-    fields = ((1.0, i.label), (0.9, i.structure), (0.8, i.description.split(",")[0]))
-    for score, text in fields:
-        for word in split_words(text or ""):
-            out[word] = max(out.get(word, 0.0), score)
-    for word in color:
-        out[word] = 1.0 if len(color) == 1 else 0.9
-    if i.label is None:
-        for word in split_words(i.description.split(",")[0])[-1:]:
-            out[word] = max(out[word], 0.9)
-    return out
+    return vocabulary(i.label, i.structure, i.description, i.color_name)
 
 
 def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:

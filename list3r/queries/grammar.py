@@ -14,7 +14,7 @@ import re
 from dataclasses import dataclass
 
 from list3r.memory.errors import OptionError
-from list3r.queries.words import split_words
+from list3r.memory.words import split_words
 
 RELATIONS: dict[str, tuple[str, ...]] = {
     "on top of": ("on",),

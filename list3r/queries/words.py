@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-import re
-
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
+from list3r.memory.words import split_words
 
 _IGNORED = frozenset("a an the of in on at with and or some any my thing things object objects".split())
 STRUCTURE = frozenset(("floor", "ceiling", "wall"))
 """Kinds of structure that people name."""
-_SYNONYMS = {
-    "ground": "floor",
-    "gray": "grey",
-    "big": "large",
-    "little": "small",
-    "round": "cylinder",
-    "cylindrical": "cylinder",
-    "flat": "sheet",
-    "desk": "table",
-    "board": "panel",
-    "violet": "purple",
-    "lilac": "purple",
-    "turquoise": "teal",
-    "cup": "mug",
-    "couch": "sofa",
-    "telly": "tv",
-    "television": "tv",
-    "monitor": "screen",
-}
 
 
 def wanted_words(text: str) -> list[str]:
@@ -73,14 +53,3 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
             hit.append(word)
         total += best
     return total / len(wanted), hit
-
-
-def split_words(text: str) -> list[str]:
-    """The words of a text in lower case, plurals as singulars, synonyms as one word."""
-    return [_singular(w) for w in re.findall(r"[^\W_]+", text.lower())]
-
-
-def _singular(word: str) -> str:
-    if len(word) > 3 and word.endswith("s") and not word.endswith("ss"):
-        word = word[:-2] if word.endswith(("ches", "shes", "xes")) else word[:-1]
-    return _SYNONYMS.get(word, word)

@@ -1,0 +1,58 @@
+"""Words that name an instance: of its label, its kind of structure, its description and its colour."""
+
+from __future__ import annotations
+
+import re
+
+VERSION = 1
+"""Goes up with every change of what words an instance bears: the index of words in a file is then made anew."""
+
+_SYNONYMS = {
+    "ground": "floor",
+    "gray": "grey",
+    "big": "large",
+    "little": "small",
+    "round": "cylinder",
+    "cylindrical": "cylinder",
+    "flat": "sheet",
+    "desk": "table",
+    "board": "panel",
+    "violet": "purple",
+    "lilac": "purple",
+    "turquoise": "teal",
+    "cup": "mug",
+    "couch": "sofa",
+    "telly": "tv",
+    "television": "tv",
+    "monitor": "screen",
+}
+
+
+def vocabulary(label: str | None, structure: str | None, description: str, color_name: str) -> dict[str, float]:
+    """The words that an instance bears, singular and in one word for many, with how well each names it, in (0, 1].
+
+    Of the description only what stands before the first comma counts.
+    """
+    out: dict[str, float] = {}
+    told = split_words(description.split(",")[0])
+    color = split_words(color_name)
+    for score, words in ((1.0, split_words(label or "")), (0.9, split_words(structure or "")), (0.8, told)):
+        for word in words:
+            out[word] = max(out.get(word, 0.0), score)
+    for word in color:
+        out[word] = 1.0 if len(color) == 1 else 0.9
+    if label is None:
+        for word in told[-1:]:
+            out[word] = max(out[word], 0.9)
+    return out
+
+
+def split_words(text: str) -> list[str]:
+    """The words of a text in lower case, plurals as singulars, synonyms as one word."""
+    return [_singular(w) for w in re.findall(r"[^\W_]+", text.lower())]
+
+
+def _singular(word: str) -> str:
+    if len(word) > 3 and word.endswith("s") and not word.endswith("ss"):
+        word = word[:-2] if word.endswith(("ches", "shes", "xes")) else word[:-1]
+    return _SYNONYMS.get(word, word)
