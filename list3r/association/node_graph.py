@@ -149,7 +149,8 @@ def _problem(
     if rest:
         factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
         factors[[not e.accepted for e in rest]] *= _NOTHING
-        information = np.concatenate([information, information_of(rest, metric, weights) / factors[:, None, None]])
+        stiff = replace(weights, weights=replace(weights.weights, bend=0.0))  # the nodes bend instead
+        information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
     fixed = np.zeros(count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True
     u, v = np.array(ends).T

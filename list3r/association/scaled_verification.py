@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.keyframe_covariance import with_scale
 from list3r.association.verification import VerificationSettings, rejected, verify
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3, umeyama
@@ -41,11 +42,17 @@ def verify_scaled(
     edge = verify(_scaled(keyframe_u, unit), _scaled(keyframe_v, found), u_id, v_id, True, chosen)
     spread = float(np.linalg.norm(np.ptp(np.quantile(b, [0.05, 0.95], axis=0), axis=0)))
     S = edge.S_v_u
+    covariance = edge.covariance
+    if covariance is not None:
+        T = keyframe_u.T_chunk_cam
+        middle = T[:3, :3] @ np.median(a, axis=0) + T[:3, 3]
+        covariance = with_scale(covariance, middle, chosen.errors.common, unit)
     return replace(
         edge,
         S_v_u=Sim3(np.asarray(unit / found), S.rotation, S.translation / found),
         residual_m=edge.residual_m / found,
         scores=edge.scores | {"spread": max(spread, 1e-9)},
+        covariance=covariance,
     )
 
 

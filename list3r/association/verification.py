@@ -7,11 +7,12 @@ surface of the other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.keyframe_covariance import KeyframeErrorSettings, registration_covariance
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
@@ -41,6 +42,7 @@ class VerificationSettings:
     residual_scale_m: float = 0.03
     """Residual at which a point counts 1/e in the edge's confidence (sigma_r), metres."""
     noise: SensorNoise = field(default_factory=SensorNoise)
+    errors: KeyframeErrorSettings = field(default_factory=KeyframeErrorSettings)
 
 
 @dataclass(frozen=True)
@@ -201,7 +203,10 @@ class _EdgeBuilder:
         u, v = self._ends
         S_v_u = Sim3.from_matrix(v.T_chunk_cam @ T_v_u @ np.linalg.inv(u.T_chunk_cam))
         S_v_u = Sim3(np.ones(()), S_v_u.rotation, S_v_u.translation)
-        return self._edge(S_v_u, confidence, sum(c.agreeing for c in checks), checks[0].residual_m, good, reason)
+        edge = self._edge(S_v_u, confidence, sum(c.agreeing for c in checks), checks[0].residual_m, good, reason)
+        seen = u.depth_small[u.depth_small > 0]
+        depth = float(np.median(seen)) if seen.size else 1.0
+        return replace(edge, covariance=registration_covariance(found, u.T_chunk_cam, depth, settings.errors))
 
     def _edge(
         self, S_v_u: Sim3, confidence: float, inliers: int, residual_m: float, accepted: bool, reason: str
