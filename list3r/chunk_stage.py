@@ -17,11 +17,14 @@ from list3r.association.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
+from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
+from list3r.instances.registry import make_discoverer, make_tracker
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.errors import TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
+from list3r.models.cache import locate
 from list3r.reconstruction.base import Reconstruction, Reconstructor
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
@@ -45,6 +48,8 @@ class BuildSettings:
     """What follows them through the chunk."""
     features: str = "geometric"
     """What things are known again by."""
+    instance_weights: tuple[tuple[str, str], ...] = ()
+    """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
     chunks: ChunkSettings = field(default_factory=ChunkSettings)
     instances: InstanceSettings = field(default_factory=InstanceSettings)
     keep_pictures: bool = True
@@ -79,7 +84,7 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     except TrackingError:
         return _without_geometry(task, frames, camera, bad, clock.seconds)
     clock.mark("reconstruction")
-    library = build_library(frames, reconstruction, task.settings.instances)
+    library = build_library(frames, reconstruction, task.settings.instances, *_instance_models(task.settings))
     clock.mark("instances")
     keyframes = make_keyframes(frames, reconstruction, keep_jpeg=task.settings.keep_pictures)
     samples = frame_samples(reconstruction, library)
@@ -154,6 +159,15 @@ def _model(settings: BuildSettings, camera_known: bool) -> Reconstructor:
     """The model, loaded once in a process."""
     options = ModelOptions(settings.poses, camera_known, settings.device, settings.weights)
     return make_reconstructor(settings.reconstruction, options)
+
+
+def _instance_models(settings: BuildSettings) -> tuple[Discoverer, Tracker]:
+    """What finds and follows things, loaded once in a process."""
+    folders = tuple((name, str(locate(weights))) for name, weights in settings.instance_weights)
+    return (
+        make_discoverer(settings.discovery, settings.features, folders, settings.device, settings.instances),
+        make_tracker(settings.tracking, folders, settings.device, settings.instances),
+    )
 
 
 @lru_cache(maxsize=2)

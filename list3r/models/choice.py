@@ -1,0 +1,71 @@
+"""From the names of models to weights on this disk: allowed, installed, fetched, and named for ever."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from list3r.memory.errors import OptionError
+from list3r.models.cache import resolve
+from list3r.models.cards import ModelCard, find_card
+from list3r.models.licences import choose_weights
+from list3r.models.presets import Selection, missing_package
+
+PARTS_OF_OPTIONS = {
+    "reconstruction": "geometry",
+    "discovery": "discovery",
+    "tracking": "tracking",
+    "features": "features",
+}
+
+
+def parse_weights(words: list[str] | None) -> dict[str, str]:
+    """`--weights` as it was given, by option: `PATH` is the reconstruction's, `discovery=PATH` the discoverer's.
+
+    Raises `OptionError` for a part that is not known or given twice.
+    """
+    found: dict[str, str] = {}
+    for word in words or []:
+        part, equals, value = word.partition("=")
+        if not equals or "/" in part:
+            part, value = "reconstruction", word
+        if part not in PARTS_OF_OPTIONS:
+            raise OptionError(f"--weights {word}: {part} is no part; choose one of {', '.join(PARTS_OF_OPTIONS)}")
+        if part in found:
+            raise OptionError(f"--weights {word}: the weights of {part} are given twice")
+        found[part] = value
+    return found
+
+
+def check_allowed(selection: Selection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
+    """The weights to use, by option, those asked for and those that the licence profile leaves of the cards'.
+
+    Nothing is loaded or fetched. Raises `OptionError` for what the profile forbids and for packages that are missing.
+    """
+    chosen = dict(asked)
+    for option, card in selection.cards():
+        name = option.removeprefix("--")
+        weights = choose_weights(card, asked.get(name), profile, option)
+        check_package(card)
+        if weights is not None and name not in asked:
+            chosen[name] = f"{weights.repository}@{weights.revision}" if weights.pinned else weights.repository
+    return chosen
+
+
+def check_package(card: ModelCard) -> None:
+    """Raise `OptionError`, with what installs it, when a package of the card is missing."""
+    missing = missing_package(card)
+    if missing is not None:
+        raise OptionError(f"{card.name} needs the package {missing}: {card.install}")
+
+
+def pinned_weights(option: str, name: str, asked: str | None) -> str | None:
+    """The weights of one model as a path or `owner/name@commit`, fetched where they are not in the cache.
+
+    None for a model without a card, which needs none. Raises `OptionError`.
+    """
+    card = find_card(name, PARTS_OF_OPTIONS[option])
+    if card is None:
+        return asked
+    check_package(card)
+    known = choose_weights(card, asked, "any", f"--{option}")
+    return resolve(asked, known, f"--{option} {name}")
