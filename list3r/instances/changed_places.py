@@ -61,6 +61,10 @@ class ChangedPlaceSettings:
     """Share of a cluster that its unexplained rest must have, to be a thing of its own."""
     least_mask_px: int = 12
     """Pixels of the small depth image in which a keyframe must see it."""
+    foot_m: float = 0.12
+    """How far below what is seen through the rest of a thing may reach,"""
+    rim_m: float = 0.01
+    """this far inside its outline."""
     block_m: float = 0.5
     """Edge of the cells by which a frame is asked only about what it may see."""
     max_points: int = 2500
@@ -96,6 +100,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         return 0
     keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
     upright = store.get_value("gravity", "unknown") != "unknown"
+    first = min(c.component for c in chunks)
     added = 0
     for chunk in near:
         others = [
@@ -109,6 +114,8 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         seen = _ask(own, views, unit, s)
         nodes = store.local_nodes([chunk.chunk_id])
         clusters = _unexplained(_gone(seen, s), nodes, chunk, unit, s)
+        if upright and chunk.component == first:
+            clusters = [_down_to_its_foot(c, seen.points, unit, s) for c in clusters]
         frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
         maker = _Maker(chunk, keyframes[chunk.chunk_id], own, frames, unit, upright, s)
         following = 1 + max((n.local_id for n in nodes), default=-1)
@@ -232,8 +239,8 @@ def _unexplained(
         support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
         if len(support) == 0:
             continue
-        inside = tree.query(support, distance_upper_bound=reach)[0] < np.inf
-        if inside.mean() >= s.explained:
+        inside = np.asarray(tree.query(support, distance_upper_bound=reach)[0] < np.inf)
+        if float(np.mean(inside)) >= s.explained:
             stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
     out = []
     for rows in _clusters(points, unit, s):
@@ -244,6 +251,17 @@ def _unexplained(
         else:
             out += [points[left[r]] for r in _clusters(points[left], unit, s) if len(r) >= s.part * len(rows)]
     return out
+
+
+def _down_to_its_foot(cluster: Array, cells: Array, unit: float, s: ChangedPlaceSettings) -> Array:
+    """A cluster with what its chunk sees right below it: a thing hides what it stands on, and near its foot the other
+    session's frames see a surface that is too near to be told from it. z is up. Shapes (N, 3), (M, 3) -> (K, 3).
+    """
+    low, high = cluster.min(axis=0), cluster.max(axis=0)
+    rim = s.rim_m * unit
+    over = np.all((cells[:, :2] > low[:2] + rim) & (cells[:, :2] < high[:2] - rim), axis=1)
+    below = cells[over & (cells[:, 2] < low[2]) & (cells[:, 2] > low[2] - s.foot_m * unit)]
+    return np.concatenate([cluster, below])
 
 
 # ---------------------------------------------------------------------------------------------- what becomes of it

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from list3r.memory.records import ChunkRow
 from list3r.memory.shapes import ChunkShapes
 from list3r.memory.store import Store
 from list3r.memory.summaries import ChunkSummary, world_unit
-from list3r.memory.visibility import Look, View, look, views_of
+from list3r.memory.visibility import Look, View, changed_points, look, views_of
 
 _SPREAD = 0.02
 """Share of points outside the box at either end by which things are compared."""
@@ -36,7 +36,7 @@ def difference(a: Looks, b: Looks, s: ChangeSettings) -> float:
     """Sum of squared deviations between two looks; infinite for two that cannot be one thing."""
     sides = np.log(np.maximum(a.extent, 1e-3) / np.maximum(b.extent, 1e-3)) / s.moved_sides
     cosine = float(a.feature @ b.feature)
-    total = float(sides @ sides) + (1.0 - cosine) / s.moved_feature
+    total = float(np.minimum(sides**2, s.moved_side_most).sum()) + (1.0 - cosine) / s.moved_feature
     return total if cosine >= s.moved_cosine and total <= s.moved_most else float("inf")
 
 
@@ -59,7 +59,6 @@ class Places:
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
         self._views: dict[tuple[int, int], list[View]] = {}
-        self._known_views: dict[int, list[View]] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
@@ -100,32 +99,42 @@ class Places:
     def look_before(self, n: int, session: int) -> Look:
         """What the frames of the last session that could tell saw where a thing is now."""
         points = self.points(n, session, before=False)
-        component = self.component[n]
-        earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
-        for s in sorted(earlier, reverse=True):
-            found = look(points, self._views_of(s, component), self._s.visibility)
+        for views in self._views_before(n, session):
+            found = look(points, views, self._s.visibility)
             if found.verdict != "unseen":
                 return found
         return Look("unseen", 0.0, ())
+
+    def _views_before(self, n: int, session: int) -> Iterator[list[View]]:
+        """The views of the sessions before, in the world of a thing, the last session first."""
+        component = self.component[n]
+        earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
+        return (self._views_of(s, component) for s in sorted(earlier, reverse=True))
 
     def known_before(self, n: int, session: int) -> bool:
         """Whether an earlier session lies in the same world, so that a thing can be new to it."""
         return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
 
     def looks(self, n: int, session: int, *, before: bool) -> Looks:
-        """Its looks, the views that show most of it first."""
+        """Its looks, the views that show most of it first; what is there all along is left out of its size.
+
+        `before` a session that does not show it there any more, else in the first session that does.
+        """
         keys = self.members(n, session, before=before)
         weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
         feature = np.average([self.shapes[k].feature[self._at(k, i)] for k, i in keys], axis=0, weights=weight)
         length = float(np.linalg.norm(feature))
-        return Looks(self._extent(keys, weight), np.asarray(feature / max(length, 1e-12), np.float32))
+        views = self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
+        return Looks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
 
-    def _extent(self, keys: Sequence[Key], weight: Array) -> Array:
+    def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[View]) -> Array:
         """Weighted median over its whole views, so that what one view took from its surroundings does not count."""
         whole = [self.shapes[k].truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
         sizes, weights = [], []
         for key, is_whole, w in zip(keys, whole, weight, strict=True):
             points = self._points_of(key)
+            changed = points[changed_points(points, views, self._s.visibility)]
+            points = changed if len(changed) >= self._s.least_changed * len(points) else points
             if len(points) and (is_whole or not any(whole)):
                 sizes.append(self._sides(fit_box(points, upright=self._upright, trim=_SPREAD)))
                 weights.append(w)

@@ -31,6 +31,10 @@ class ChangeSettings:
     """or the ratio of their diagonals."""
     moved_sides: tuple[float, float, float] = (0.16, 0.42, 0.16)
     """Deviation of the logarithms of larger side, smaller side and height of one thing in two places."""
+    moved_side_most: float = 3.0
+    """Squared deviations that one side counts at most: what hides a part of a thing says nothing against it."""
+    least_changed: float = 0.3
+    """Share of a thing's points that must have changed, for the others to be left out of its size."""
     moved_feature: float = 0.01
     """What 1 - cosine of the features counts as one squared deviation;"""
     moved_cosine: float = 0.9

@@ -67,7 +67,9 @@ class Story:
         left = {thing.now: p.box(thing.now, session, before=True) for thing, _ in gone}
         came = {n: p.box(n, session, before=False) for n in fresh}
         found_gone = {thing.now: found for thing, found in gone}
-        for move in self._moves(gone, [n for n in fresh if looks[n].verdict != "there"], session):
+        replaced = {n for n in fresh if self._replaces(n, left, session)}
+        eligible = [n for n in fresh if looks[n].verdict != "there" or n in replaced]
+        for move in self._moves(gone, eligible, session):
             fresh.remove(move.place)
             self._move(move, session, found_gone[move.thing.now])
         for thing, found in gone:
@@ -77,14 +79,18 @@ class Story:
                 else:
                     self._remove(thing, session, found)
         for n in fresh:
-            replaces = any(
-                p.component[n] == p.component[place]
-                and p.inside(n, box, self._s.replaced_slack_m, session, before=False) >= self._s.replaced
-                for place, box in left.items()
-            )
-            if looks[n].verdict == "gone" or (replaces and looks[n].verdict != "there"):
-                if not self._scrap(n, came, session, before=False):
-                    self._add(n, session, looks[n])
+            new = looks[n].verdict == "gone" or n in replaced
+            if new and not self._scrap(n, came, session, before=False):
+                self._add(n, session, looks[n])
+
+    def _replaces(self, n: int, left: dict[int, OrientedBox], session: int) -> bool:
+        """Whether a new thing stands where one stood that is gone."""
+        p, s = self._p, self._s
+        return any(
+            p.component[n] == p.component[place]
+            and p.inside(n, box, s.replaced_slack_m, session, before=False) >= s.replaced
+            for place, box in left.items()
+        )
 
     def _missing(self, session: int, components: set[int]) -> list[tuple[_Thing, Look]]:
         """The things that are gone from where they were; all others that were known are given their state."""

@@ -133,6 +133,16 @@ def tell(points: Array, view: View, s: VisibilitySettings) -> NDArray[np.int8]:
     return out
 
 
+def changed_points(points: Array, views: Iterable[View], s: VisibilitySettings) -> NDArray[np.bool_]:
+    """The points of a surface of which no more frames say that they are still there than that they are not. (N,)."""
+    balance = np.zeros(len(points), np.int64)
+    for view in views:
+        told = tell(points, view, s)
+        balance += told == FREE
+        balance -= told == MET
+    return np.asarray(balance >= 0)
+
+
 def _told(points: Array, view: View, s: VisibilitySettings) -> tuple[int, int]:
     """How many points of a surface one frame sees where they should be, and through how many it sees further."""
     told = tell(points, view, s)
