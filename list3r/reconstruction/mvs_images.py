@@ -1,0 +1,110 @@
+"""Frames of a chunk as the stereo sees them: small grey pictures, cameras and poses as tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+
+Tensor = torch.Tensor
+Poses = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Every frame of a chunk at one size."""
+
+    gray: Tensor
+    """Brightness in [0, 1]. Shape (F, h, w)."""
+    camera: Camera
+    """Pinhole camera of that size."""
+
+
+def resized_camera(camera: Camera, width: int) -> Camera:
+    """The camera of the same picture at another width; (0, 0) stays the centre of the upper left pixel."""
+    height = max(1, round(camera.height * width / camera.width))
+    x, y = width / camera.width, height / camera.height
+    return Camera(width, height, camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
+
+
+def make_pictures(frames: Sequence[Frame], camera: Camera, width: int, device: str) -> Pictures:
+    """All frames in grey at `width` px."""
+    small = resized_camera(camera, width)
+    out = np.empty((len(frames), small.height, small.width), np.float32)
+    for number, frame in enumerate(frames):
+        gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+        out[number] = cv2.resize(gray, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return Pictures(torch.from_numpy(out / 255.0).to(device), small)
+
+
+def sharpness(gray: NDArray[np.float32]) -> float:
+    """How sharp a picture is: variance of its Laplacian."""
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+
+
+@dataclass(frozen=True)
+class Warp:
+    """Where the pixels of one picture lie in another: x ~ rotated + inverse depth * shift, homogeneous pixels."""
+
+    rotated: Tensor
+    """Shape (3, h, w)."""
+    shift: Tensor
+    """Shape (3,)."""
+
+    @staticmethod
+    def between(T_chunk_ref: Poses, T_chunk_other: Poses, camera: Camera, device: str) -> Warp:
+        """From the pixels of `ref` into `other`; both have the same camera."""
+        T = np.linalg.inv(T_chunk_other) @ T_chunk_ref
+        K = camera.matrix()
+        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+        rays = np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
+        rotated = (K @ T[:3, :3] @ np.linalg.inv(K) @ rays).reshape(3, camera.height, camera.width)
+        return Warp(
+            torch.from_numpy(rotated.astype(np.float32)).to(device),
+            torch.from_numpy((K @ T[:3, 3]).astype(np.float32)).to(device),
+        )
+
+    def place(self, inverse_depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """x and y in px and z over depth in the other picture for inverse depths that broadcast to (..., h, w)."""
+        ratio = self.rotated[2] + inverse_depth * self.shift[2]
+        safe = ratio.clamp_min(1e-4)
+        x = (self.rotated[0] + inverse_depth * self.shift[0]) / safe
+        y = (self.rotated[1] + inverse_depth * self.shift[1]) / safe
+        outside = torch.full((), -1e4, device=x.device)
+        return torch.where(ratio > 1e-4, x, outside), y, ratio
+
+
+def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> tuple[Tensor, Tensor]:
+    """Values of an image (h, w) at pixel places (..., h', w'), and where those lie inside it."""
+    height, width = image.shape
+    grid = torch.stack([x * (2.0 / max(width - 1, 1)) - 1.0, y * (2.0 / max(height - 1, 1)) - 1.0], dim=-1)
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    flat = grid.reshape(1, -1, grid.shape[-2], 2)
+    values = torch.nn.functional.grid_sample(
+        image[None, None], flat, mode=mode, padding_mode="border", align_corners=True
+    )
+    return values.reshape(x.shape), inside
+
+
+def box_sum(values: Tensor, radius: int) -> Tensor:
+    """Sums over windows of 2 radius + 1 squared, the picture repeated beyond its border. Shape (..., h, w)."""
+    if radius == 0:
+        return values
+    shape = values.shape
+    padded = torch.nn.functional.pad(values.reshape(1, -1, *shape[-2:]), (radius,) * 4, mode="replicate")[0]
+    rows = _run_sum(padded, 2 * radius + 1, -1)
+    return _run_sum(rows, 2 * radius + 1, -2).reshape(shape)
+
+
+def _run_sum(values: Tensor, length: int, dim: int) -> Tensor:
+    count = values.shape[dim] - length + 1
+    out = values.narrow(dim, 0, count).clone()
+    for start in range(1, length):
+        out += values.narrow(dim, start, count)
+    return out
