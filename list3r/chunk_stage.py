@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from list3r.association.motion import flag_moving
-from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo, guessed_camera
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
@@ -152,6 +152,21 @@ def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
         return None
     missing = np.full((4, 4), np.nan)
     return np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
+
+
+def joint_model(settings: BuildSettings, info: SourceInfo) -> Reconstructor | None:
+    """What reconstructs joint windows of frames of two places in the way that the chunks were; None for the usual one.
+
+    A network is loaded when the first window is asked for.
+    """
+    if settings.reconstruction == "rgbd":
+        return None
+    free = replace(settings, poses="estimate")
+
+    def reconstruct(frames: Sequence[Frame], camera: Camera) -> Reconstruction:
+        return _model(free, info.camera is not None)(frames, camera)
+
+    return reconstruct
 
 
 @lru_cache(maxsize=2)

@@ -19,17 +19,20 @@ from threadpoolctl import threadpool_limits
 
 from list3r import __version__
 from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
+from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.cuts import find_cuts
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
+from list3r.instances.registry import check_choice
 from list3r.mapping import add_chunk, finish_session
 from list3r.memory.codec import to_json
 from list3r.memory.connection import remove_memory
 from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
 from list3r.memory.records import ChunkResult
 from list3r.memory.store import Store
+from list3r.models.cards import find_card
+from list3r.models.choice import pinned_weights
 from list3r.reconstruction.registry import MODELS, entry
 from list3r.workers import OrderedPool, default_workers
 
@@ -90,6 +93,7 @@ def build(
     info = open_source(source, options).info
     settings = resolve_settings(settings or BuildSettings(poses="auto"), info)
     check_buildable(info, settings)
+    settings = with_weights(settings)
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: at least 1 process is needed")
     if debug_dir is not None:
@@ -104,7 +108,7 @@ def build(
             if span.index not in done
         ]
         if tasks:
-            pool = OrderedPool(process_chunk, min(workers or default_workers(), len(tasks)))
+            pool = OrderedPool(process_chunk, min(workers or usual_workers(settings), len(tasks)))
             try:
                 with threadpool_limits(1):
                     _add_all(target, session, tasks, pool, info, progress)
@@ -136,7 +140,7 @@ def _add_all(
     progress: Progress | None,
 ) -> None:
     """Add the chunks in order, with one thread, so that sums do not depend on the machine."""
-    joint = RgbdJointReconstructor(target.store, {session: tasks[0].options})
+    joint = RgbdJointReconstructor(target.store, {session: tasks[0].options}, joint_model(tasks[0].settings, info))
     debug_dir = None if tasks[0].debug_dir is None else Path(tasks[0].debug_dir)
     bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
     if progress is not None:
@@ -174,6 +178,27 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
     if settings.poses == "given" and not info.has_poses:
         raise OptionError(f"{info.path} has no poses; use --poses estimate")
+    check_choice(settings.discovery, settings.tracking, settings.features)
+
+
+def with_weights(settings: BuildSettings) -> BuildSettings:
+    """The settings with the weights of every network named by their commit, fetched where they are not in the cache.
+
+    Raises `OptionError` when a package is missing or weights can be had neither from the disk nor from the hub.
+    """
+    known = dict(settings.instance_weights)
+    for option in ("discovery", "tracking", "features"):
+        name = getattr(settings, option)
+        found = pinned_weights(option, name, known.get(f"{option}/{name}"))
+        if found is not None:
+            known[f"{option}/{name}"] = found
+    weights = pinned_weights("reconstruction", settings.reconstruction, settings.weights)
+    return replace(settings, weights=weights, instance_weights=tuple(sorted(known.items())))
+
+
+def usual_workers(settings: BuildSettings) -> int:
+    """Processes unless more are asked for: one where networks run, whose weights each process would hold once more."""
+    return 1 if settings.instance_weights or find_card(settings.reconstruction, "geometry") else default_workers()
 
 
 class _Target:
@@ -259,11 +284,23 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings) -> int:
         return sessions[0].session_id
     with store.transaction():
         store.set_value("created_by", f"list3r {__version__}")
-        store.set_value("scale_kind", info.scale_kind)
-        store.set_value("scale_source", "sensor depth" if info.has_depth else "none")
+        store.set_value("scale_kind", _scale_kind(info, settings))
+        store.set_value("scale_source", _scale_source(info, settings))
         store.set_value("gravity", "unknown")
         store.set_value("poses", settings.poses)
         return store.add_session(str(Path(info.path).resolve()), info.fingerprint, asdict(settings), info.frame_count)
+
+
+def _scale_kind(info: SourceInfo, settings: BuildSettings) -> str:
+    """Whether a unit is a metre; sensor depth says nothing where the model does not look at it."""
+    return "relative" if _scale_source(info, settings) == "none" else info.scale_kind
+
+
+def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:
+    """Who says how long a unit is, as far as the source and the settings do."""
+    if info.has_depth and entry(settings.reconstruction).needs_depth:
+        return "sensor depth"
+    return "given poses" if settings.poses == "given" else "none"
 
 
 def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
+from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.cuts import find_cuts
@@ -24,8 +24,8 @@ from list3r.mapping import add_chunk, finish_session
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Edge
 from list3r.memory.store import Store
-from list3r.pipeline import Progress, check_buildable, resolve_settings
-from list3r.workers import OrderedPool, default_workers
+from list3r.pipeline import Progress, check_buildable, resolve_settings, usual_workers, with_weights
+from list3r.workers import OrderedPool
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ def update(
     info = open_source(source, options).info
     settings = resolve_settings(settings or BuildSettings(poses="auto"), info)
     check_buildable(info, settings)
+    settings = with_weights(settings)
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: at least 1 process is needed")
     with Store.open(memory, writable=True) as store:
@@ -87,7 +88,7 @@ def update(
         tasks = [ChunkTask(str(source), options, span, settings) for span in spans if span.index not in done]
         with threadpool_limits(1):
             if tasks:
-                _add_all(store, session, tasks, min(workers or default_workers(), len(tasks)), info, progress)
+                _add_all(store, session, tasks, min(workers or usual_workers(settings), len(tasks)), info, progress)
             finish_session(store, session)
         return _report(store, session, info, spans, done, started)
 
@@ -142,7 +143,7 @@ def _add_all(
     store: Store, session: int, tasks: Sequence[ChunkTask], workers: int, info: SourceInfo, progress: Progress | None
 ) -> None:
     """Place the chunks in order; the library waits for the last one."""
-    joint = RgbdJointReconstructor(store, {session: tasks[0].options})
+    joint = RgbdJointReconstructor(store, {session: tasks[0].options}, joint_model(tasks[0].settings, info))
     bad = {index for s, index, _ in store.bad_frames() if s == session}
     if progress is not None:
         progress(len(store.frames(session)), info.frame_count)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from list3r.frames.base import Frame, FrameSource
+from list3r.frames.base import Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import TrackingError
@@ -49,8 +49,8 @@ class RgbdJointReconstructor:
         Raises `SourceError` when a session's source is no longer there.
         """
         u, v = self._read(u_session, u_frames), self._read(v_session, v_frames)
-        camera = self._source(u_session).info.camera
-        if camera is None or camera != self._source(v_session).info.camera or not u or not v:
+        camera = self._camera(u_session)
+        if camera != self._camera(v_session) or not u or not v:
             return None
         try:
             made = self._reconstructor([*u, *v], camera)
@@ -60,6 +60,10 @@ class RgbdJointReconstructor:
         if min(int(one.posed.sum()), int(two.posed.sum())) < 2:
             return None
         return JointWindow(frame_samples(one), frame_samples(two), made.scale_kind)
+
+    def _camera(self, session_id: int) -> Camera:
+        info = self._source(session_id).info
+        return info.camera or guessed_camera(info)
 
     def _source(self, session_id: int) -> FrameSource:
         if session_id not in self._sources:

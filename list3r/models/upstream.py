@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +37,10 @@ def load_upstream(cls: Any, path: Path, device: torch.device) -> Any:
     """
     check_weights(path)
     try:
-        model, names = (_from_folder if path.is_dir() else _from_file)(cls, path)
+        with contextlib.redirect_stdout(
+            io.StringIO()
+        ):  # packages print while they load; standard output is for results
+            model, names = (_from_folder if path.is_dir() else _from_file)(cls, path)
     except OptionError:
         raise
     except Exception as error:  # what torch, safetensors and the class raise on foreign weights is not a closed list
