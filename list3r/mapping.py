@@ -28,6 +28,7 @@ from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import estimate_gravity, world_from_graph
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
+from list3r.memory.scale import settle_scale
 from list3r.memory.store import Store
 
 
@@ -155,10 +156,11 @@ def place_chunks(
     store.place_chunks(graph.S_graph_chunk, graph.components, known)
     store.set_value("T_world_graph", np.eye(4).tolist())
     gravity = estimate_gravity(store)
-    T_world_graph = world_from_graph(gravity)
-    store.set_value("T_world_graph", T_world_graph.as_matrix().tolist())
+    upright = world_from_graph(gravity)
+    S_world_graph = settle_scale(store, store.chunks(), graph.S_graph_chunk) @ upright
+    store.set_value("T_world_graph", S_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
-    store.place_chunks({k: T_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
+    store.place_chunks({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
 
 
 def _straightened(

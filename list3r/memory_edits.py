@@ -51,6 +51,13 @@ class MemoryEdits:
         with self._lock:
             return edits.delete(self._writable(), instance_id, author)
 
+    def scale(self, anchor: str, *, author: str | None = None) -> EditReport:
+        """Say how long something is, like `12=0.095m` or `camera_height=1.5m`; lengths are metres from then on."""
+        from list3r.memory import edits
+
+        with self._lock:
+            return edits.scale(self._writable(), anchor, author)
+
     def undo(self, entry: int | None = None, *, author: str | None = None) -> EditReport:
         """Take back an edit or a decision of the merge log by its entry; without one, the last edit that stands."""
         from list3r.memory import edits

@@ -21,6 +21,7 @@ from list3r.cli import (
     file_commands,
     memory_commands,
     query_commands,
+    scale_commands,
     update_commands,
 )
 from list3r.memory.errors import List3rError
@@ -43,6 +44,7 @@ for module in (
     file_commands,
     evaluation_commands,
     update_commands,
+    scale_commands,
 ):
     module.register(app)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 from list3r.cli import source_options as src
 from list3r.cli.building import report_lines, run_build
 from list3r.cli.common import JsonOption, note, print_json
+from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
 
 
 def register(app: typer.Typer) -> None:
@@ -93,6 +95,7 @@ def build(
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
     ] = None,
+    scale_anchor: ScaleAnchor = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a build that was interrupted.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing memory.")] = False,
     debug: Annotated[
@@ -109,6 +112,7 @@ def build(
     from list3r.frames.source import open_source
 
     options = src.source_options(**_source_words(locals()))
+    check_anchor(scale_anchor)
     settings = BuildSettings(
         reconstruction=reconstruction,
         poses=poses,
@@ -121,6 +125,9 @@ def build(
             note(f"note: {line}")
     run = {"options": options, "settings": settings, "workers": workers, "resume": resume, "force": force}
     report = run_build(source, memory, quiet=json, debug_dir=debug, **run)
+    if scale_anchor is not None:
+        anchored = anchor_scale(memory, scale_anchor)
+        report = replace(report, notes=(*report.notes, anchored.text))
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:

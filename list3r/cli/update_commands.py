@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,7 @@ from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
 from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
+from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
 
 if TYPE_CHECKING:
     from list3r.updating import UpdateReport
@@ -52,6 +54,7 @@ def update(
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
     ] = None,
+    scale_anchor: ScaleAnchor = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an update that was interrupted.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -63,6 +66,7 @@ def update(
     from list3r.chunk_stage import BuildSettings
     from list3r.frames.chunks import ChunkSettings
 
+    check_anchor(scale_anchor)
     settings = BuildSettings(
         reconstruction=reconstruction,
         poses=poses,
@@ -71,6 +75,8 @@ def update(
     )
     options = src.source_options(**words)
     report = _run(memory, source, quiet=json, options=options, settings=settings, workers=workers, resume=resume)
+    if scale_anchor is not None:
+        report = replace(report, notes=(*report.notes, anchor_scale(memory, scale_anchor).text))
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:

@@ -26,7 +26,7 @@ class Edit:
     author: str
     """Who."""
     kind: str
-    """merge, split, label, delete, undo."""
+    """merge, split, label, delete, scale, undo."""
     parts: tuple[tuple[Key, ...], ...]
     """The local instances it speaks of: the two things of a merge, the two parts of a split, else one thing."""
     through: int
@@ -34,9 +34,11 @@ class Edit:
     before: tuple[tuple[int, str | None, tuple[Key, ...]], ...]
     """Ids, labels and local instances of the things it touched, as they were: what an undo brings back."""
     text: str | None = None
-    """The new label."""
+    """The new label, or the anchor of scale as it was said."""
     target: int | None = None
     """The entry of the log that it takes back."""
+    scale: tuple[int, float] | None = None
+    """Of an anchor of scale: a chunk id, and how many metres a unit of that chunk is."""
 
 
 def standing(edits: Sequence[Edit]) -> list[Edit]:

@@ -13,7 +13,7 @@ from list3r.memory.errors import MemoryFileError, UnknownIdError
 from list3r.memory.instance_verbs import InstanceVerbs
 from list3r.memory.records import MergeDecision
 
-EDIT_KINDS = ("merge", "split", "label", "delete", "undo")
+EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "undo")
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,15 @@ class EditVerbs(InstanceVerbs):
 
     def add_edit(self, edit: Edit) -> None:
         """Append an edit."""
-        arguments = {
+        arguments: dict[str, Any] = {
             "parts": edit.parts,
             "through": edit.through,
             "before": edit.before,
             "text": edit.text,
             "target": edit.target,
         }
+        if edit.scale is not None:
+            arguments["scale"] = edit.scale
         self._database.execute(
             "INSERT INTO edits (entry, created_at, author, kind, arguments) VALUES (?, ?, ?, ?, ?)",
             (edit.entry, edit.created_at, edit.author, edit.kind, to_json(arguments)),
@@ -129,8 +131,9 @@ def _edit(store: EditVerbs, row: tuple[Any, ...]) -> Edit:
             before=tuple((int(n), label, _keys(keys)) for n, label, keys in told["before"]),
             text=told["text"],
             target=told["target"],
+            scale=None if told.get("scale") is None else (int(told["scale"][0]), float(told["scale"][1])),
         )
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         raise MemoryFileError(f"{store.path}: edit {entry} is damaged; run `list3r verify {store.path}`") from error
 
 

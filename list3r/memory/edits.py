@@ -1,4 +1,6 @@
-"""What an operator does to the library: merge, split, label, delete, undo. Each is one transaction and one log entry.
+"""What an operator does to the library: merge, split, label, delete, scale, undo.
+
+Each is one transaction and one log entry.
 
 An edit is written down in terms of local instances (chunk:local), which never change; then the library is derived anew
 under all edits that stand (`memory.constraints`), and so it is whenever a chunk arrives later.
@@ -17,6 +19,7 @@ from list3r.memory.edit_verbs import LogEntry
 from list3r.memory.errors import OptionError
 from list3r.memory.parting import part_best
 from list3r.memory.records import MergeDecision, Observation
+from list3r.memory.scale import measure, parse_anchor, rescale
 from list3r.memory.store import Store
 
 Before = tuple[tuple[int, str | None, tuple[Key, ...]], ...]
@@ -30,7 +33,7 @@ class EditReport:
     entry: int
     """Its number in the merge log, for `undo`."""
     kind: str
-    """merge, split, label, delete, undo."""
+    """merge, split, label, delete, scale, undo."""
     ids: tuple[int, ...]
     """The instances that are there now of what it touched, the one that was spoken of first."""
     new: tuple[int, ...]
@@ -105,6 +108,21 @@ def delete(store: Store, instance_id: int, author: str | None = None) -> EditRep
         before = _as_they_are(store, [known])
         edit = _edit("delete", (before[0][2],), before, author)
         return _carry_out(store, edit, (f"#{known}", ""), f"{edit.author} deleted #{known}")
+
+
+def scale(store: Store, anchor: str, author: str | None = None) -> EditReport:
+    """Say how long something is, so that lengths are metres from now on; see `memory.scale` for what can be said.
+
+    The last anchor that stands counts. Raises `OptionError` where it cannot be measured or the memory is metric.
+    """
+    said = parse_anchor(_line(anchor, "anchor"))
+    with store.transaction():
+        found = measure(store, said)
+        what = f"#{store.resolve(said.instance_id)}" if said.kind in ("size", "height") else said.kind
+        edit = _edit("scale", (found.keys,) if found.keys else (), (), author)
+        edit = replace(edit, text=said.text, scale=(found.chunk_id, found.metres_per_unit))
+        reason = f"{edit.author} anchored the scale: {said.text} where it was {found.length:.4g} units"
+        return _carry_out(store, edit, (what, said.text), reason)
 
 
 def undo(store: Store, entry: int | None = None, author: str | None = None) -> EditReport:
@@ -217,6 +235,8 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
     there = {i.id for i in store.instances()}
     aliases = store.aliases()
     _give_back(store, bring_back, there, aliases)
+    if _of_scale(store, edit):
+        rescale(store)
     report = consolidate(store)
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     _check_effect(edit, home)
@@ -237,6 +257,14 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
         restored=tuple(n for n in touched if n not in there and n not in report.new),
         text=reason,
     )
+
+
+def _of_scale(store: Store, edit: Edit) -> bool:
+    """Whether it anchors the scale, or takes an anchor back, or brings one back."""
+    edits = {e.entry: e for e in store.edits()}
+    while edit.kind == "undo" and edit.target in edits:
+        edit = edits[edit.target]
+    return edit.kind == "scale"
 
 
 def _give_back(store: Store, before: Before, there: Collection[int], aliases: Mapping[int, int]) -> None:

@@ -76,6 +76,9 @@ def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
 
 def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> float:
     """What a metre is about in world units: 1 for a metric memory, else told by the distances of things."""
+    known = getattr(summaries, "metre", None)
+    if known is not None:
+        return float(known)
     units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in chunks]
     return float(np.median(units)) if units else 1.0
 
