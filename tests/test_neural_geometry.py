@@ -23,7 +23,7 @@ from list3r.reconstruction.feedforward_output import (
     to_reconstruction,
     with_given_poses,
 )
-from list3r.reconstruction.feedforward_windows import between, join, run_windows
+from list3r.reconstruction.feedforward_windows import between, join, regauged, run_windows
 from list3r.reconstruction.pi3 import read
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.vggt import decode_poses
@@ -146,14 +146,6 @@ def window(count: int = 8, seed: int = 0, size: tuple[int, int] = (42, 56)) -> W
     )
 
 
-def transformed(output: WindowOutput, S: Sim3) -> WindowOutput:
-    """The same answer in another gauge."""
-    T = output.T_window_cam.copy()
-    T[:, :3, :3] = S.rotation @ T[:, :3, :3]
-    T[:, :3, 3] = S.apply(output.T_window_cam[:, :3, 3])
-    return WindowOutput(T, output.depth * np.float32(S.scale), output.confidence, output.focal)
-
-
 def test_pi3_outputs_made_by_hand_are_read_in_our_conventions() -> None:
     height, width, fx, fy = 42, 70, 61.0, 58.0
     truth = window(5, size=(height, width))
@@ -200,7 +192,7 @@ def test_focal_lengths_survive_noise_and_ignore_what_is_not_believed() -> None:
 def test_windows_join_into_the_gauge_of_the_first(shared: int) -> None:
     whole = window(12)
     S = Sim3(np.asarray(2.3), Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
-    after = transformed(whole.part(slice(7 - shared, None)), S)
+    after = regauged(whole.part(slice(7 - shared, None)), S)
     joined = join(whole.part(slice(0, 7)), after, shared)
     assert np.allclose(joined.T_window_cam, whole.T_window_cam, atol=1e-5)
     assert np.allclose(joined.depth, whole.depth, rtol=1e-5)
@@ -238,7 +230,7 @@ def test_windows_are_halved_until_they_fit() -> None:
         if stop - start > 5:
             raise torch.OutOfMemoryError("CUDA out of memory")
         gauge = Sim3(np.asarray(1.0 + start), Rotation.from_rotvec([0, 0.1 * start, 0]).as_matrix(), np.ones(3) * start)
-        return transformed(whole.part(slice(start, stop)), gauge)
+        return regauged(whole.part(slice(start, stop)), gauge)
 
     out = run_windows(20, MemoryBudget(None, None, 1), run)
     assert [stop - start for start, stop in asked[:3]] == [20, 10, 5]

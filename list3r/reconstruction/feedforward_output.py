@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,9 +40,13 @@ class WindowOutput:
     focal: NDArray[np.float64]
     """fx and fy of each frame, px of the network's picture; the principal point is its centre. Shape (n, 2)."""
 
-    def part(self, which: slice) -> WindowOutput:
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """Its arrays, one row a frame."""
+        return self.T_window_cam, self.depth, self.confidence, self.focal
+
+    def part(self, which: slice | NDArray[Any]) -> WindowOutput:
         """Some of the frames."""
-        return WindowOutput(self.T_window_cam[which], self.depth[which], self.confidence[which], self.focal[which])
+        return WindowOutput(*(a[which] for a in self.arrays()))
 
     def valid(self) -> NDArray[np.bool_]:
         """Frames with a finite rigid pose, a possible focal length, and depth somewhere. Shape (n,)."""

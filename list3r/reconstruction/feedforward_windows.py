@@ -57,18 +57,17 @@ def join(before: WindowOutput, after: WindowOutput, shared: int) -> WindowOutput
     they are nearer to.
     """
     S = between(before.part(slice(len(before.depth) - shared, None)), after.part(slice(0, shared)))
-    T = after.T_window_cam.copy()
-    T[:, :3, :3] = S.rotation @ T[:, :3, :3]
-    T[:, :3, 3] = S.apply(after.T_window_cam[:, :3, 3])
-    moved = WindowOutput(T, (after.depth * np.float32(S.scale)).astype(np.float32), after.confidence, after.focal)
     keep = len(before.depth) - shared // 2
-    one, two = before.part(slice(0, keep)), moved.part(slice(shared - shared // 2, None))
-    return WindowOutput(
-        np.concatenate([one.T_window_cam, two.T_window_cam]),
-        np.concatenate([one.depth, two.depth]),
-        np.concatenate([one.confidence, two.confidence]),
-        np.concatenate([one.focal, two.focal]),
-    )
+    one, two = before.part(slice(0, keep)), regauged(after, S).part(slice(shared - shared // 2, None))
+    return WindowOutput(*(np.concatenate(pair) for pair in zip(one.arrays(), two.arrays(), strict=True)))
+
+
+def regauged(output: WindowOutput, S: Sim3) -> WindowOutput:
+    """An answer in another gauge, S from its own."""
+    T = output.T_window_cam.copy()
+    T[:, :3, :3] = S.rotation @ T[:, :3, :3]
+    T[:, :3, 3] = S.apply(output.T_window_cam[:, :3, 3])
+    return WindowOutput(T, (output.depth * np.float32(S.scale)).astype(np.float32), output.confidence, output.focal)
 
 
 def between(a: WindowOutput, b: WindowOutput) -> Sim3:

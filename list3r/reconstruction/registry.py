@@ -39,11 +39,13 @@ class ModelEntry:
 
 MODELS: dict[str, ModelEntry] = {
     "rgbd": ModelEntry("rgbd", needs_depth=True, needs_camera=True),
+    "sfm": ModelEntry("sfm"),
     "pi3": ModelEntry("pi3"),
     "pi3x": ModelEntry("pi3x"),
     "vggt": ModelEntry("vggt"),
     "mapanything": ModelEntry("mapanything"),
     "da3": ModelEntry("da3"),
+    "precomputed": ModelEntry("precomputed"),
 }
 """All that `--reconstruction` knows."""
 
