@@ -26,7 +26,8 @@ from list3r.memory.errors import TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.reconstruction.base import Reconstruction, Reconstructor
-from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
+from list3r.reconstruction.keyframe_record import KeyframeSettings, frame_samples, make_keyframes
+from list3r.reconstruction.learned import make_detector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 
 
@@ -50,6 +51,10 @@ class BuildSettings:
     """What things are known again by."""
     instance_weights: tuple[tuple[str, str], ...] = ()
     """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
+    local_features: str = "sift"
+    """What finds a keyframe again: sift, aliked or xfeat."""
+    feature_weights: str | None = None
+    """File of the weights of learned local features."""
     chunks: ChunkSettings = field(default_factory=ChunkSettings)
     instances: InstanceSettings = field(default_factory=InstanceSettings)
     keep_pictures: bool = True
@@ -86,7 +91,8 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     clock.mark("reconstruction")
     library = build_library(frames, reconstruction, task.settings.instances, *_instance_models(task.settings))
     clock.mark("instances")
-    keyframes = make_keyframes(frames, reconstruction, keep_jpeg=task.settings.keep_pictures)
+    keep, how = task.settings.keep_pictures, _keyframe_settings(task.settings)
+    keyframes = make_keyframes(frames, reconstruction, keep, how)
     samples = frame_samples(reconstruction, library)
     library = flag_moving(samples, library, reconstruction.camera)
     clock.mark("keyframes")
@@ -182,6 +188,17 @@ def _instance_models(settings: BuildSettings) -> tuple[Discoverer, Tracker]:
     return (
         make_discoverer(settings.discovery, settings.features, folders, settings.device, settings.instances),
         make_tracker(settings.tracking, folders, settings.device, settings.instances),
+    )
+
+
+@lru_cache(maxsize=2)
+def _keyframe_settings(settings: BuildSettings) -> KeyframeSettings:
+    """How keyframes are kept, with the network of the local features loaded once in a process."""
+    if settings.local_features == "sift":
+        return KeyframeSettings()
+    device = "cpu" if settings.device == "auto" else settings.device
+    return KeyframeSettings(
+        learned=make_detector(settings.local_features, Path(settings.feature_weights or ""), device)
     )
 
 

@@ -13,7 +13,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.descriptor import FrameDescriptor
-from list3r.reconstruction.features import FeatureSettings, detect
+from list3r.reconstruction.features import Features, FeatureSettings, detect, points_at
+from list3r.reconstruction.learned import LearnedDetector, as_bytes
 from list3r.reconstruction.view import SensorNoise, shrink_camera, shrink_depth
 from list3r.reconstruction.vlad import VladDescriptor
 
@@ -27,6 +28,10 @@ class KeyframeSettings:
     jpeg_quality: int = 85
     features: FeatureSettings = field(default_factory=FeatureSettings)
     descriptor: FrameDescriptor = field(default_factory=VladDescriptor)
+    learned: LearnedDetector | None = None
+    """What finds and describes the features that are kept, instead of SIFT."""
+    learned_count: int = 800
+    """Most of these on a frame."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
@@ -152,13 +157,18 @@ def _make_keyframe(
     camera, depth = reconstruction.camera, reconstruction.depth[position]
     features = detect(frame.color, depth, camera, settings.features)
     small = shrink_camera(camera, settings.depth_width)
+    kept = features
+    if settings.learned is not None:
+        found = settings.learned(frame.color, settings.learned_count)
+        described = as_bytes(found.descriptors, settings.learned.kind)
+        kept = Features(found.xy, described, points_at(found.xy, depth, camera))
     return Keyframe(
         frame_index=frame.index,
         T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
         descriptor=settings.descriptor(frame.color, features.descriptors),
-        keypoints_xy=features.xy,
-        keypoint_descriptors=features.descriptors,
-        points_cam=features.points_cam,
+        keypoints_xy=kept.xy,
+        keypoint_descriptors=kept.descriptors,
+        points_cam=kept.points_cam,
         depth_small=shrink_depth(depth, small, settings.noise),
         camera_small=(small.fx, small.fy, small.cx, small.cy),
         jpeg=_jpeg(frame.color, settings.jpeg_quality) if keep_jpeg else b"",
