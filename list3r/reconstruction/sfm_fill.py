@@ -101,9 +101,11 @@ def _look_for(segment: Segment, grays: Sequence[Gray], near: int, position: int,
     if len(xy) < settings.mapping.least_matches:
         return
     size = (settings.bridge_window_px, settings.bridge_window_px)
-    place, found, _ = cv2.calcOpticalFlowPyrLK(grays[near], grays[position], xy, None, winSize=size, maxLevel=5)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(grays[position], grays[near], place, None, winSize=size, maxLevel=5)
-    good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - xy, axis=1) < 2.0)
+    a, b = grays[near], grays[position]
+    place, found, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, np.zeros_like(xy), winSize=size, maxLevel=5)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, place, np.zeros_like(xy), winSize=size, maxLevel=5)
+    place = np.asarray(place, np.float32)
+    good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(np.asarray(back) - xy, axis=1) < 2.0)
     made = pose_of(place[good], points[good], segment.found.camera, segment.T_map_cam[near], settings.mapping)
     if made is not None and made[1].mean() > 0.5:
         segment.T_map_cam[position] = made[0]

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 
+pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -120,7 +122,7 @@ def triangulate(
     made = pycolmap.Reconstruction()
     mapper.begin_reconstruction(made)
     for image_id, image in sorted(made.images.items()):
-        image.frame.set_cam_from_world(image.camera_id, _rigid(np.linalg.inv(T_map_cam[image_id - 1])))
+        image.frame.set_cam_from_world(image.camera_id, _rigid(_inverse(T_map_cam[image_id - 1])))
         made.register_frame(image.frame_id)
     options = _options(camera, "", chosen)
     for image_id in sorted(made.images):
@@ -151,7 +153,7 @@ def pose_of(
     guess = pycolmap.estimate_and_refine_absolute_pose(px, points, lens, options)
     if guess is None or guess["num_inliers"] < settings.least_matches:
         return None
-    T = np.linalg.inv(_matrix(guess["cam_from_world"]))
+    T = _inverse(_matrix(guess["cam_from_world"]))
     found = _refined(px, points, lens, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
     return found if found is not None and found[1].mean() > 0.3 else None
 
@@ -165,7 +167,7 @@ def _refined(
     rows: NDArray[np.bool_],
     gate: float,
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
-    T_cam_map = np.linalg.inv(start)
+    T_cam_map = _inverse(start)
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.loss_function_scale, options.gradient_tolerance = 0.5 * _unit(camera), 1e-3
     for _ in range(2):
@@ -179,7 +181,7 @@ def _refined(
         rows = (seen[:, 2] > 0) & (np.linalg.norm(at - px, axis=1) < gate)
         if rows.sum() < 12:
             return None
-    return np.linalg.inv(T_cam_map), rows
+    return _inverse(T_cam_map), rows
 
 
 def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
@@ -259,7 +261,7 @@ def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any
 def _sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
     poses: dict[int, Poses] = {}
     for image_id in sorted(made.reg_image_ids()):
-        poses[image_id - 1] = np.linalg.inv(_matrix(made.images[image_id].cam_from_world()))
+        poses[image_id - 1] = _inverse(_matrix(made.images[image_id].cam_from_world()))
     points: dict[int, NDArray[np.float64]] = {}
     best: dict[int, int] = {}
     for _, point in sorted(made.points3D.items()):
@@ -298,6 +300,10 @@ def _matrix(rigid: Any) -> Poses:
     T = np.eye(4)
     T[:3] = rigid.matrix()
     return T
+
+
+def _inverse(T: Poses) -> Poses:
+    return np.asarray(np.linalg.inv(T), np.float64)
 
 
 def _rigid(T: Poses) -> Any:

@@ -187,7 +187,7 @@ class _Follower:
         s, alive, before = self.settings, self.alive, self.pictures[self.last]
         size, criteria = (s.window_px, s.window_px), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
         xy, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, gray, alive.xy, None, winSize=size, maxLevel=s.levels, criteria=criteria
+            before, gray, alive.xy, np.zeros_like(alive.xy), winSize=size, maxLevel=s.levels, criteria=criteria
         )
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
             gray, before, xy, alive.xy.copy(), winSize=size, maxLevel=1, criteria=criteria,
@@ -209,7 +209,7 @@ class _Follower:
             refined[mine], good[mine] = place, kept
         height, width = gray.shape
         inside = (refined >= 1).all(axis=1) & (refined[:, 0] < width - 2) & (refined[:, 1] < height - 2)
-        return _Alive(alive.ids, refined, alive.origin, alive.origin_xy).where(good & inside)
+        return _Alive(alive.ids, refined.astype(np.float32), alive.origin, alive.origin_xy).where(good & inside)
 
     def _moved_enough(self) -> bool:
         now = {int(i): p for i, p in zip(self.alive.ids, self.alive.xy, strict=True) if int(i) in self.at_keyframe}
@@ -233,7 +233,7 @@ class _Follower:
         found = cv2.goodFeaturesToTrack(gray, wanted, s.quality, gap, mask=free) if wanted > 0 else None
         if found is not None:
             fresh = found.reshape(-1, 2).astype(np.float32)
-            fresh = cv2.cornerSubPix(gray, fresh, (3, 3), (-1, -1), (3, 10, 0.03)).reshape(-1, 2)
+            fresh = np.asarray(cv2.cornerSubPix(gray, fresh, (3, 3), (-1, -1), (3, 10, 0.03)), np.float32)
             ids = np.arange(self.next_id, self.next_id + len(fresh))
             self.next_id += len(fresh)
             origin = np.full(len(fresh), position, np.int64)

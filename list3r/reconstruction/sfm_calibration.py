@@ -1,0 +1,184 @@
+"""The lens of an RGB source, estimated once before its chunks: focal length and radial distortion.
+
+One chunk alone says little of the focal length (on redkitchen 472 to 536 px of 524), so some windows spread over the
+video are mapped each by itself with a free camera, and then adjusted together with one camera for all. A window's
+parallax decides how much it says. All chunks are then made with the camera that was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import pycolmap
+
+from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
+from list3r.reconstruction.sfm_links import LinkSettings, keyframe_problem
+from list3r.reconstruction.sfm_mapping import MappingSettings, MapProblem, Poses, SparseMap, View, build_maps
+from list3r.reconstruction.sfm_tracks import TrackSettings, follow_corners
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """Which frames are looked at, and what is believed."""
+
+    windows: int = 5
+    """Stretches of the video that are looked at."""
+    frames: int = 100
+    """Frames in each."""
+    most_window_ratio: float = 1.3
+    """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
+    most_error_px: float = 2.0
+    """Observations farther from their point's image than this are left out."""
+    rounds: int = 3
+    """Joint adjustments, each without what the one before contradicts."""
+    focal_range: tuple[float, float] = (0.4, 3.0)
+    """Focal lengths believed, by the longer side of the picture."""
+    distortion_range: float = 0.5
+    """Largest k1 believed."""
+    least_shift_px: float = 0.3
+    """Distortion that shifts the corners of the picture by less is none."""
+    most_focal_ratio: float = 1.15
+    """A given focal length farther off than this is doubted aloud."""
+    tracks: TrackSettings = field(default_factory=TrackSettings)
+    links: LinkSettings = field(default_factory=LinkSettings)
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found of a source's camera."""
+
+    camera: Camera
+    """With the distortion of the pictures as they are handed out."""
+    windows: int
+    """Windows that it stands on; 0 where none could be mapped and the camera is as it was."""
+    focal_px: float | None
+    """Focal length by the pictures alone, None where they did not tell."""
+    notes: tuple[str, ...] = ()
+    """What the user should know, one sentence each."""
+
+
+def calibrate(source: FrameSource, settings: CalibrationSettings | None = None) -> Calibration:
+    """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given."""
+    chosen = settings or CalibrationSettings()
+    info = source.info
+    known = info.camera is not None
+    start = info.camera or guessed_camera(info)
+    looked = (_window(source, a, b, start, chosen) for a, b in _spans(info.frame_count, chosen))
+    windows = [w for w in looked if w is not None]
+    if not windows:
+        return _nothing(start, known)
+    focals = np.array([found.camera.fx for _, found in windows])
+    middle = float(np.exp(np.median(np.log(focals))))
+    agree = np.abs(np.log(focals / middle)) < np.log(chosen.most_window_ratio)
+    windows = [w for w, kept in zip(windows, agree.tolist(), strict=True) if kept]
+    free, k1 = _adjust_together(windows, replace(start, fx=middle, fy=middle), True, chosen)
+    low, high = (share * max(start.width, start.height) for share in chosen.focal_range)
+    if not low < free.fx < high or abs(k1) > chosen.distortion_range:
+        return _nothing(start, known)
+    if not known:
+        said = f"the camera was estimated from the pictures: focal length {free.fx:.0f} px, distortion k1 {k1:.3f}"
+        return Calibration(_lens(free, k1, chosen), len(windows), free.fx, (said,))
+    notes: tuple[str, ...] = ()
+    if abs(np.log(free.fx / start.fx)) > np.log(chosen.most_focal_ratio):
+        notes = (
+            f"the given focal length {start.fx:.0f} px does not fit the pictures, which say about {free.fx:.0f} px; "
+            "check --intrinsics, or leave it out",
+        )
+    fixed, k1 = _adjust_together(windows, start, False, chosen)
+    if abs(k1) > chosen.distortion_range:
+        return Calibration(start, len(windows), free.fx, notes)
+    return Calibration(_lens(fixed, k1, chosen), len(windows), free.fx, notes)
+
+
+def _nothing(start: Camera, known: bool) -> Calibration:
+    if known:
+        return Calibration(start, 0, None)
+    said = f"the camera could not be estimated; a focal length of {start.fx:.0f} px is a guess: give --intrinsics"
+    return Calibration(start, 0, None, (said,))
+
+
+def _spans(count: int, settings: CalibrationSettings) -> list[tuple[int, int]]:
+    """Windows spread evenly over a source, apart from each other."""
+    windows = max(1, min(settings.windows, count // settings.frames))
+    last = max(0, count - settings.frames)
+    starts = np.linspace(0, last, windows).astype(int).tolist() if windows > 1 else [last // 2]
+    return [(a, min(a + settings.frames, count)) for a in starts]
+
+
+def _window(
+    source: FrameSource, start: int, stop: int, camera: Camera, settings: CalibrationSettings
+) -> tuple[MapProblem, SparseMap] | None:
+    """The largest map of a window with a camera of its own."""
+    frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
+    if len(frames) < 2:
+        return None
+    grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
+    tracks = follow_corners(grays, settings.tracks)
+    if len(tracks.keyframes) < 3:
+        return None
+    problem = keyframe_problem(tracks, grays, settings.links)
+    maps = build_maps(problem, camera, free_camera="focal", settings=settings.mapping)
+    return (problem, maps[0]) if maps and len(maps[0].T_map_cam) >= 3 else None
+
+
+def _adjust_together(
+    windows: Sequence[tuple[MapProblem, SparseMap]], camera: Camera, free_focal: bool, settings: CalibrationSettings
+) -> tuple[Camera, float]:
+    """One camera and its k1 for all windows, by bundle adjustment of all of them."""
+    made = pycolmap.Reconstruction()
+    start = [0.5 * (camera.fx + camera.fy), camera.cx + 0.5, camera.cy + 0.5, 0.0]
+    if free_focal:
+        start[3] = float(np.median([found.k1 for _, found in windows]))
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=camera.width, height=camera.height, params=start, camera_id=1)
+    made.add_camera_with_trivial_rig(lens)
+    for number, (problem, found) in enumerate(windows):
+        _add_window(made, number, problem, found)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.print_summary = free_focal, False
+    solver = options.ceres
+    solver.loss_function_type, solver.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 0.5
+    solver.solver_options.num_threads, solver.solver_options.max_num_iterations = 1, 60
+    solver.solver_options.function_tolerance = 1e-6
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in made.reg_image_ids():
+        config.add_image(image_id)
+    for _ in range(settings.rounds):
+        pycolmap.create_default_bundle_adjuster(options, config, made).solve()
+        pycolmap.ObservationManager(made).filter_points3D_with_large_reprojection_error(
+            settings.most_error_px, set(made.points3D), pycolmap.ReprojectionErrorType.PIXEL
+        )
+    focal, cx, cy, k1 = made.cameras[1].params
+    return replace(camera, fx=float(focal), fy=float(focal), cx=float(cx) - 0.5, cy=float(cy) - 0.5), float(k1)
+
+
+def _add_window(made: pycolmap.Reconstruction, number: int, problem: MapProblem, found: SparseMap) -> None:
+    """Views and points of one window, apart from those of the others."""
+    base = 1 + 10_000 * number
+    seen: dict[int, list[tuple[int, int]]] = {}
+    for key, T in sorted(found.T_map_cam.items()):
+        view: View = problem.views[key]
+        image = pycolmap.Image(f"{base + key}", view.xy.astype(np.float64) + 0.5, 1, base + key)
+        made.add_image_with_trivial_frame(image, _cam_from_map(T))
+        for row, track in enumerate(view.ids.tolist()):
+            if track in found.points:
+                seen.setdefault(track, []).append((base + key, row))
+    for track, rows in sorted(seen.items()):
+        if len(rows) >= 2:
+            made.add_point3D(found.points[track], pycolmap.Track([pycolmap.TrackElement(*r) for r in rows]))
+
+
+def _cam_from_map(T_map_cam: Poses) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(np.linalg.inv(T_map_cam)[:3])
+
+
+def _lens(camera: Camera, k1: float, settings: CalibrationSettings) -> Camera:
+    """The camera with its distortion, unless that shifts nothing."""
+    x, y = max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)
+    square = (x / camera.fx) ** 2 + (y / camera.fy) ** 2
+    if abs(k1) * square * float(np.hypot(x, y)) < settings.least_shift_px:
+        return camera
+    return replace(camera, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
