@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import report_lines, run_build
 from list3r.cli.common import JsonOption, note, print_json
@@ -71,7 +72,14 @@ def inspect(
 def build(
     source: src.SourceArgument,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
-    reconstruction: Annotated[str, typer.Option("--reconstruction", help="rgbd or auto.")] = "auto",
+    reconstruction: mod.Reconstruction = None,
+    preset: mod.Preset = None,
+    discovery: mod.Discovery = None,
+    tracking: mod.Tracking = None,
+    features: mod.Features = None,
+    device: mod.Device = "auto",
+    weights: mod.WeightsWords = None,
+    licence: mod.LicenceProfile = "research",
     poses: Annotated[
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
     ] = "auto",
@@ -89,8 +97,8 @@ def build(
     end: src.End = None,
     sharpest: src.Sharpest = None,
     max_side: src.MaxSide = None,
-    chunk: Annotated[int, typer.Option("--chunk", help="Frames in a chunk.")] = 100,
-    overlap: Annotated[int, typer.Option("--overlap", help="Frames that neighbouring chunks share.")] = 30,
+    chunk: mod.Chunk = None,
+    overlap: mod.Overlap = None,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
@@ -107,22 +115,17 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    from list3r.chunk_stage import BuildSettings
-    from list3r.frames.chunks import ChunkSettings
+    words = {name: value for name, value in locals().items() if name in mod.WORDS}
+    options = src.source_options(**_source_words(locals()))
     from list3r.frames.source import open_source
 
-    options = src.source_options(**_source_words(locals()))
     check_anchor(scale_anchor)
-    settings = BuildSettings(
-        reconstruction=reconstruction,
-        poses=poses,
-        chunks=ChunkSettings(length=chunk, overlap=overlap),
-        keep_pictures=pictures,
-    )
+    info = open_source(source, options).info
+    resumed = memory if resume and not force else None
+    settings, told = mod.build_settings(info, words, poses=poses, pictures=pictures, resumed=resumed)
     if not json:
-        info = open_source(source, options).info
-        for line in info.notes:
-            note(f"note: {line}")
+        for line in (*(f"note: {n}" for n in info.notes), *told):
+            note(line)
     run = {"options": options, "settings": settings, "workers": workers, "resume": resume, "force": force}
     report = run_build(source, memory, quiet=json, debug_dir=debug, **run)
     if scale_anchor is not None:

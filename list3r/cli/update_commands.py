@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
@@ -30,7 +31,14 @@ def register(app: typer.Typer) -> None:
 def update(
     memory: MemoryArgument,
     source: src.SourceArgument,
-    reconstruction: Annotated[str, typer.Option("--reconstruction", help="rgbd or auto.")] = "auto",
+    reconstruction: mod.Reconstruction = None,
+    preset: mod.Preset = None,
+    discovery: mod.Discovery = None,
+    tracking: mod.Tracking = None,
+    features: mod.Features = None,
+    device: mod.Device = "auto",
+    weights: mod.WeightsWords = None,
+    licence: mod.LicenceProfile = "research",
     poses: Annotated[
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
     ] = "auto",
@@ -48,8 +56,8 @@ def update(
     end: src.End = None,
     sharpest: src.Sharpest = None,
     max_side: src.MaxSide = None,
-    chunk: Annotated[int, typer.Option("--chunk", help="Frames in a chunk.")] = 100,
-    overlap: Annotated[int, typer.Option("--overlap", help="Frames that neighbouring chunks share.")] = 30,
+    chunk: mod.Chunk = None,
+    overlap: mod.Overlap = None,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
@@ -62,18 +70,17 @@ def update(
 
     Example: list3r update house.l3r walk-2/
     """
-    words = {name: value for name, value in locals().items() if name in _SOURCE_WORDS}
-    from list3r.chunk_stage import BuildSettings
-    from list3r.frames.chunks import ChunkSettings
+    words = {name: value for name, value in locals().items() if name in mod.WORDS}
+    options = src.source_options(**{name: value for name, value in locals().items() if name in _SOURCE_WORDS})
+    from list3r.frames.source import open_source
 
     check_anchor(scale_anchor)
-    settings = BuildSettings(
-        reconstruction=reconstruction,
-        poses=poses,
-        chunks=ChunkSettings(length=chunk, overlap=overlap),
-        keep_pictures=pictures,
-    )
-    options = src.source_options(**words)
+    info = open_source(source, options).info
+    resumed = memory if resume else None
+    settings, told = mod.build_settings(info, words, poses=poses, pictures=pictures, resumed=resumed)
+    if not json:
+        for line in told:
+            note(line)
     report = _run(memory, source, quiet=json, options=options, settings=settings, workers=workers, resume=resume)
     if scale_anchor is not None:
         report = replace(report, notes=(*report.notes, anchor_scale(memory, scale_anchor).text))

@@ -90,6 +90,8 @@ class ModelCard:
     install: str
     """What installs them."""
     memory: MemoryFigures | None = None
+    pixels: int = 0
+    """Pixels of its pictures, at most, where `memory` is known."""
     about: str = ""
     """One line on what it is good for."""
 
@@ -110,9 +112,8 @@ _GIT = "pip install git+https://github.com"
 
 def _hub(name: str, part: str, repository: str, licence: Licence, about: str, *, gated: bool = False) -> ModelCard:
     """A model that the package transformers runs."""
-    return ModelCard(
-        name, part, APACHE, (Weights(repository, licence, gated),), _TRANSFORMERS, _MODELS_EXTRA, None, about
-    )
+    weights = (Weights(repository, licence, gated),)
+    return ModelCard(name, part, APACHE, weights, _TRANSFORMERS, _MODELS_EXTRA, about=about)
 
 
 CARDS: tuple[ModelCard, ...] = (
@@ -124,6 +125,7 @@ CARDS: tuple[ModelCard, ...] = (
         ("pi3",),
         f"{_GIT}/yyfz/Pi3",
         MemoryFigures(3658, 212, "its authors' capacity table, A800, bfloat16"),
+        255_000,
         "the paper's model",
     ),
     ModelCard(
@@ -134,6 +136,7 @@ CARDS: tuple[ModelCard, ...] = (
         ("pi3",),
         f"{_GIT}/yyfz/Pi3",
         MemoryFigures(3658, 212, "taken from pi3"),
+        255_000,
         "smoother than pi3, takes known intrinsics and poses",
     ),
     ModelCard(
@@ -147,6 +150,7 @@ CARDS: tuple[ModelCard, ...] = (
         ("vggt",),
         f"{_GIT}/facebookresearch/vggt",
         MemoryFigures(1690, 1075, "its README, H100: 1.9 GB at 1 frame, 40.6 GB at 200"),
+        518 * 392,
         "first frame is the frame of reference",
     ),
     ModelCard(
@@ -157,6 +161,7 @@ CARDS: tuple[ModelCard, ...] = (
         ("mapanything",),
         f"{_GIT}/facebookresearch/map-anything",
         MemoryFigures(3000, 345, "its README: 2,000 views in 140 GB, memory-efficient mode"),
+        518 * 392,
         "takes known intrinsics",
     ),
     ModelCard(
@@ -173,6 +178,7 @@ CARDS: tuple[ModelCard, ...] = (
         ("depth_anything_3",),
         "pip install depth-anything-3",
         MemoryFigures(10000, 600, "DA3-Streaming's table, giant weights: 28.3 GB at 120 frames of 504x378"),
+        504 * 378,
         "base and small weights are free for any use",
     ),
     _hub("eomt", "discovery", "tue-mps/coco_panoptic_eomt_large_640", MIT, "masks, query embeddings and labels"),
@@ -186,10 +192,10 @@ CARDS: tuple[ModelCard, ...] = (
     _hub("dinov3", "features", "facebook/dinov3-vits16-pretrain-lvd1689m", DINOV3_LICENCE, "appearance", gated=True),
     _hub("siglip2", "text", "google/siglip2-base-patch16-224", APACHE, "free words in find and nearest"),
     _hub("clip", "text", "openai/clip-vit-base-patch32", MIT, "free words in find and nearest"),
-    ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", None, "labels of 80 kinds of things"),
-    ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", None, "learned local features"),
+    ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of things"),
+    ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", about="learned local features"),
     ModelCard(
-        "xfeat", "local features", APACHE, (), ("onnxruntime",), "pip install onnxruntime", None, "small and fast"
+        "xfeat", "local features", APACHE, (), ("onnxruntime",), "pip install onnxruntime", about="small and fast"
     ),
 )
 """Every model that has an adapter here. Weights that a card does not name are the user's own (`--weights`)."""

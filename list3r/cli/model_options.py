@@ -1,0 +1,219 @@
+"""The options that choose models, the same on every command that builds, and the settings that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from list3r.chunk_stage import BuildSettings
+    from list3r.frames.base import SourceInfo
+    from list3r.frames.chunks import ChunkSettings
+    from list3r.models.cards import ModelCard
+    from list3r.models.presets import Selection
+
+Reconstruction = Annotated[
+    str | None,
+    typer.Option(
+        "--reconstruction",
+        metavar="MODEL",
+        help="rgbd, sfm, pi3, pi3x, vggt, mapanything, da3, precomputed or auto (rgbd with depth, else sfm).",
+        show_default=False,
+    ),
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        help="cpu (no weights), light (small networks, free for any use), paper, or auto (what this machine has).",
+        show_default=False,
+    ),
+]
+Discovery = Annotated[
+    str | None,
+    typer.Option("--discovery", help="geometric, eomt, mask2former, sam2 or sam3: what finds things."),
+]
+Tracking = Annotated[
+    str | None,
+    typer.Option("--tracking", help="reprojection, sam2, sam3 or edgetam: what follows them."),
+]
+Features = Annotated[
+    str | None,
+    typer.Option("--features", help="geometric, own, dinov2 or dinov3: what things are known again by."),
+]
+Device = Annotated[str, typer.Option("--device", help="Where networks run: cpu, cuda, cuda:1, or auto.")]
+WeightsWords = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--weights",
+        metavar="[PART=]WHERE",
+        help="Weights instead of the model's own: a folder, a file or owner/name@revision; PART is reconstruction "
+        "(the usual), discovery, tracking or features.",
+        show_default=False,
+    ),
+]
+LicenceProfile = Annotated[
+    str,
+    typer.Option(
+        "--licence", help="permissive (nothing non-commercial, gated, copyleft or of own terms), research, or any."
+    ),
+]
+Chunk = Annotated[
+    int | None,
+    typer.Option(
+        "--chunk",
+        metavar="N",
+        help="Frames in a chunk; default: 100, or what the GPU holds of a network.",
+        show_default=False,
+    ),
+]
+Overlap = Annotated[
+    int | None,
+    typer.Option(
+        "--overlap", metavar="N", help="Frames that neighbouring chunks share; default: 30 %.", show_default=False
+    ),
+]
+
+WORDS = (
+    "reconstruction",
+    "preset",
+    "discovery",
+    "tracking",
+    "features",
+    "device",
+    "weights",
+    "licence",
+    "chunk",
+    "overlap",
+)
+"""Names of the options above, as arguments of a command."""
+
+USUAL_CHUNK, LONGEST_CHUNK, SHORTEST_CHUNK = 100, 240, 16
+"""Frames: the paper's; the most that a GPU is filled with, from where passes grow slow and no figure shows a gain; the
+fewest that make a chunk."""
+
+
+def build_settings(
+    info: SourceInfo, words: Mapping[str, Any], *, poses: str, pictures: bool, resumed: Path | None = None
+) -> tuple[BuildSettings, list[str]]:
+    """Settings of a build, and what the user should know of the models, one line each.
+
+    `words` are the options named in `WORDS`; `resumed` is a memory whose unfinished session says how it was cut.
+    Raises `OptionError` for what is not known, not allowed or not installed, before anything is loaded or fetched.
+    """
+    from list3r.chunk_stage import BuildSettings
+    from list3r.models.choice import check_allowed, parse_weights
+    from list3r.models.licences import check_profile
+
+    check_profile(words["licence"])
+    selection = _selection(info, words)
+    asked = parse_weights(words["weights"])
+    chosen = check_allowed(selection, asked, words["licence"])
+    notes = [f"note: {selection.why}"] if selection.why else []
+    notes += _terms(selection, chosen)
+    settings = BuildSettings(
+        reconstruction=selection.reconstruction,
+        poses=poses,
+        device=words["device"],
+        weights=chosen.get("reconstruction"),
+        discovery=selection.discovery,
+        tracking=selection.tracking,
+        features=selection.features,
+        instance_weights=tuple(
+            sorted((f"{o}/{getattr(selection, o)}", chosen[o]) for o in chosen if o != "reconstruction")
+        ),
+        keep_pictures=pictures,
+    )
+    length, overlap = words["chunk"], words["overlap"]
+    chunks = None if resumed is None or length is not None else _recorded(resumed)
+    chunks = chunks or _cut(settings, length, overlap)
+    return replace(settings, chunks=chunks), notes
+
+
+def _selection(info: SourceInfo, words: Mapping[str, Any]) -> Selection:
+    """The preset's models, or the classical ones, with what was asked for by name put in their place."""
+    from list3r.models.device import find_gpu
+    from list3r.models.presets import Selection, select
+
+    preset = words["preset"]
+    chosen = Selection()
+    if preset is not None:
+        gpu = find_gpu(words["device"]) if preset == "auto" else None
+        chosen = select(preset, has_depth=info.has_depth, profile=words["licence"], gpu=gpu)
+    named = {k: words[k] for k in ("reconstruction", "discovery", "tracking", "features") if words[k] is not None}
+    if "discovery" in named and "features" not in named:
+        neural = named["discovery"] != "geometric"
+        if neural and chosen.features == "geometric":
+            named["features"] = "own"
+        elif not neural and chosen.features == "own":
+            named["features"] = "geometric"
+    if named and chosen.why:
+        named["why"] = f"{chosen.why}; {', '.join(f'--{k} {v}' for k, v in named.items())} as asked"
+    return replace(chosen, **named)
+
+
+def _terms(selection: Selection, chosen: Mapping[str, str]) -> list[str]:
+    """Licences that a user of the models should know of."""
+    from list3r.models.cards import find_weights
+    from list3r.models.licences import terms
+
+    told = []
+    for option, card in selection.cards():
+        where = chosen.get(option.removeprefix("--"))
+        text = terms(card, None if where is None else find_weights(card, where.split("@")[0]))
+        if text:
+            told.append(f"note: {text}; see `list3r models list`")
+    return told
+
+
+def _recorded(memory: Path) -> ChunkSettings | None:
+    """How the unfinished session of a memory was cut, None where there is none."""
+    from list3r.frames.chunks import ChunkSettings
+    from list3r.memory.store import Store
+
+    if not memory.is_file():
+        return None
+    with Store.open(memory) as store:
+        begun = [s for s in store.sessions() if s.state != "complete"]
+    said = begun[-1].settings.get("chunks") if begun else None
+    return ChunkSettings(int(said["length"]), int(said["overlap"])) if isinstance(said, dict) else None
+
+
+def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> ChunkSettings:
+    """How the video is cut: as asked, else as the files of a precomputed folder, else as the memory of the GPU allows."""
+    from list3r.frames.chunks import ChunkSettings
+    from list3r.models.cards import find_card
+
+    card = find_card(settings.reconstruction, "geometry")
+    if length is None and settings.reconstruction == "precomputed" and settings.weights is not None:
+        from list3r.reconstruction.precomputed_files import read_manifest
+
+        said = read_manifest(Path(settings.weights).expanduser())
+        length, overlap = said.length, overlap or said.overlap
+    elif length is None and card is not None:
+        length = _fitting(card, settings.device)
+    length = length or USUAL_CHUNK
+    return ChunkSettings(length, overlap or max(1, min(30, round(0.3 * length))))
+
+
+def _fitting(card: ModelCard, device: str) -> int:
+    """Frames that the GPU holds at once by published figures, within bounds; the usual ones without a GPU."""
+    from list3r.memory.errors import OptionError
+    from list3r.models.device import find_gpu, pictures_that_fit
+
+    gpu = find_gpu(device)
+    if gpu is None or card.memory is None:
+        return USUAL_CHUNK
+    fit = pictures_that_fit(gpu.free_mb, card.memory, card.pixels)
+    if fit < SHORTEST_CHUNK:
+        needed = card.memory.needed_mb(SHORTEST_CHUNK, card.pixels) / 1024
+        raise OptionError(
+            f"{card.name} needs about {needed:.1f} GB for {SHORTEST_CHUNK} frames and {gpu.name} has "
+            f"{gpu.free_mb / 1024:.1f} GB free; free it, use another model, --device cpu, or give --chunk to try"
+        )
+    return min(fit, LONGEST_CHUNK)
