@@ -73,8 +73,11 @@ class ChunkTask:
     """Folder for overlays, or None."""
 
 
-def process_chunk(task: ChunkTask) -> ChunkResult:
-    """Frames of one chunk to poses, keyframes and a local instance library."""
+def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
+    """Frames of one chunk to poses, keyframes and a local instance library.
+
+    A `discoverer` stands in for the one that the settings name.
+    """
     clock = _Clock()
     source = _source(task.path, task.options)
     camera = source.info.camera or guessed_camera(source.info)
@@ -89,7 +92,8 @@ def process_chunk(task: ChunkTask) -> ChunkResult:
     except TrackingError:
         return _without_geometry(task, frames, camera, bad, clock.seconds)
     clock.mark("reconstruction")
-    library = build_library(frames, reconstruction, task.settings.instances, *_instance_models(task.settings))
+    named, tracker = _instance_models(task.settings)
+    library = build_library(frames, reconstruction, task.settings.instances, discoverer or named, tracker)
     clock.mark("instances")
     keep, how = task.settings.keep_pictures, _keyframe_settings(task.settings)
     keyframes = make_keyframes(frames, reconstruction, keep, how)
@@ -160,17 +164,17 @@ def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
     return np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
 
 
-def joint_model(settings: BuildSettings, info: SourceInfo) -> Reconstructor | None:
-    """What reconstructs joint windows of frames of two places in the way that the chunks were; None for the usual one.
+def joint_model(task: ChunkTask) -> Reconstructor | None:
+    """What reconstructs joint windows of frames of two places in the way of the chunks; None for the usual one.
 
     A network is loaded when the first window is asked for.
     """
-    if settings.reconstruction == "rgbd":
+    if task.settings.reconstruction == "rgbd":
         return None
-    free = replace(settings, poses="estimate")
+    free, known = replace(task.settings, poses="estimate"), _source(task.path, task.options).info.camera is not None
 
     def reconstruct(frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        return _model(free, info.camera is not None)(frames, camera)
+        return _model(free, known)(frames, camera)
 
     return reconstruct
 

@@ -65,7 +65,7 @@ def choose_candidates(
         kept.append(n)
         labels[free] = len(kept)
     features = _unit(masks.features[kept])
-    plane = np.array([_plane(labels == k + 1, views, position, chosen.flat_rms) for k in range(len(kept))])
+    plane = np.array([plane_of_mask(labels == k + 1, views, position, chosen.flat_rms) for k in range(len(kept))])
     structure = np.array([bool(masks.names) and bounds_the_room(masks.names[n]) for n in kept], bool)
     names = tuple(masks.names[n] for n in kept) if masks.names else None
     return Proposals(position, labels, score[kept], features, plane.reshape(-1, 4), structure=structure, names=names)
@@ -81,7 +81,9 @@ def _unit(features: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(features / np.maximum(length, 1e-9), np.float32)
 
 
-def _plane(mask: NDArray[np.bool_], views: ChunkViews, position: int, flat_rms: float) -> NDArray[np.float64]:
+def plane_of_mask(
+    mask: NDArray[np.bool_], views: ChunkViews, position: int, flat_rms: float = 2.0
+) -> NDArray[np.float64]:
     """Plane of a candidate in the anchor's camera, towards it; NaN when it is not flat or too little is known."""
     view = views.view(position)
     small = mask[:: views.stride, :: views.stride] & view.confirmed

@@ -1,0 +1,209 @@
+"""Relations of simulated homes held against the truth, with the masks of things taken from the truth.
+
+python benchmarks/relations.py --seeds 1,2,3,4 --json benchmarks/results/relations.json
+
+The pictures, depth noise, poses, tracking, merging and all rules are those of a build; only which pixels belong to which
+thing is told, so that what is measured is the geometry and the rules and not the discovery (`benchmarks/simulated.py`
+measures both together). A thing counts when it was seen in 12 frames and once covered 300 pixels of 320 x 240.
+The same memory with gravity set to unknown must make no vertical claim.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from machine import machine, write_json
+from threadpoolctl import threadpool_limits
+
+from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
+from list3r.evaluation.relations import evaluate_relations
+from list3r.evaluation.scene import scene_relations
+from list3r.frames.chunks import plan_chunks
+from list3r.frames.source import SourceOptions, open_source
+from list3r.instances.base import Proposals
+from list3r.instances.candidates import plane_of_mask
+from list3r.instances.features import object_feature
+from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
+from list3r.instances.views import chunk_views
+from list3r.mapping import add_chunk, finish_session
+from list3r.memory.store import Store
+from list3r.queries.relations import VERTICAL
+from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
+
+MIN_PX, MIN_FRAMES = 300, 12
+PREDICATES = ("on", "in", "next_to")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="1,2,3,4")
+    parser.add_argument("--poses", choices=("given", "estimate"), default="estimate")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
+    words = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch, threadpool_limits(1):
+        for seed in (int(word) for word in words.seeds.split(",")):
+            rows.append(measure(seed, words.poses, words.keep or Path(scratch)))
+            print({k: v for k, v in rows[-1].items() if k not in ("wrong", "missed")})
+    pooled = {}
+    for name in PREDICATES:
+        true, claimed, correct = (sum(r[name][k] for r in rows) for k in ("true", "claimed", "correct"))
+        pooled[name] = {
+            "true": true,
+            "claimed": claimed,
+            "precision": round(correct / claimed, 4) if claimed else None,
+            "recall": round(correct / true, 4) if true else None,
+        }
+        print(f"{name:10} {pooled[name]}")
+    vertical = sum(r["vertical_without_gravity"] for r in rows)
+    print(f"vertical relations without gravity: {vertical}")
+    things = statistics.fmean(r["things"] for r in rows)
+    print(machine())
+    write_json(words.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": things, "seeds": rows})
+
+
+def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
+    """One home: build it from told masks, and compare."""
+    walk, memory = root / f"walk-{seed}", root / f"memory-{seed}.l3r"
+    if not (walk / "truth.json").exists():
+        write_walk(walk, WalkSettings(seed=seed, write_ids=True))
+    truth = _truth(walk)
+    memory.unlink(missing_ok=True)
+    with Store.create(memory) as store:
+        told = build(store, walk, truth, poses)
+        truth_of = _most_common(store, told)
+        claimed = [(r.subject, r.predicate, r.object) for r in store.relations()]
+        kept = {i for i, e in truth.items() if e["frames_seen"] >= MIN_FRAMES and e["largest_px"] >= MIN_PX}
+        matched = {k: v for k, v in truth_of.items() if v in kept}
+        errors = evaluate_relations(_relations(walk), claimed, matched, PREDICATES)
+        with store.transaction():
+            store.set_value("gravity", "unknown")
+        vertical = _vertical_without_gravity(store)
+    row: dict[str, Any] = {"seed": seed, "things": len(set(matched.values())), "true_things": len(kept)}
+    for name, entry in errors.by_predicate.items():
+        row[name] = {"true": entry.true_count, "claimed": entry.estimated_count, "correct": entry.correct}
+    names = {i: f"{e['label']}#{i}" for i, e in truth.items()}
+    row["wrong"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.wrong]
+    row["missed"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.missed]
+    row["vertical_without_gravity"] = vertical
+    return row
+
+
+def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str) -> dict[tuple[int, int], int]:
+    """Add all chunks with told masks; the true id of every local instance."""
+    settings = BuildSettings(poses=poses, keep_pictures=False)
+    source = open_source(walk, SourceOptions())
+    with store.transaction():
+        store.set_value("scale_kind", "metric")
+        store.set_value("poses", poses)
+        session = store.add_session(str(walk), "", {"poses": poses}, source.info.frame_count)
+    told: dict[tuple[int, int], int] = {}
+    for span in plan_chunks(source.info.frame_count, settings.chunks):
+        discoverer = ToldMasks(walk, truth, settings.instances)
+        result = process_chunk(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)
+        chunk = add_chunk(store, session, result)
+        for instance in result.library.instances:
+            told[chunk, instance.local_id] = _true_id(walk, instance.track)
+    finish_session(store, session)
+    return told
+
+
+class ToldMasks:
+    """A discoverer that reads the ids of the things from the truth."""
+
+    feature_space = FEATURE_SPACE
+
+    def __init__(self, walk: Path, truth: dict[int, dict[str, Any]], settings: InstanceSettings) -> None:
+        self._walk, self._truth, self._settings = walk, truth, settings
+
+    def __call__(self, frames: Any, reconstruction: Any, position: int) -> Proposals:
+        """What is in view on the frame at `position`, each thing once."""
+        views = chunk_views(frames, reconstruction, self._settings)
+        view = views.view(position)
+        ids = _ids(self._walk, int(frames[position].index))
+        area = np.bincount(ids.ravel())
+        present = [int(k) for k in np.flatnonzero(area >= 20) if int(k) in self._truth]
+        labels = np.zeros(ids.shape, np.int32)
+        features = []
+        for number, thing in enumerate(present):
+            mask = ids == thing
+            labels[mask] = number + 1
+            small = mask[:: views.stride, :: views.stride] & view.confirmed
+            up = -view.T_chunk_cam[:3, 1]
+            points = view.points[small] if small.any() else np.zeros((1, 3), np.float32)
+            rgb = view.rgb[small] if small.any() else np.zeros((1, 3), np.uint8)
+            features.append(object_feature(points, rgb, up, views.unit))
+        planes = [plane_of_mask(labels == n + 1, views, position) for n in range(len(present))]
+        return Proposals(
+            position,
+            labels,
+            np.ones(len(present), np.float32),
+            np.array(features, np.float32).reshape(len(present), -1),
+            np.array(planes).reshape(len(present), 4),
+            identity=np.array(present, np.int64),
+            structure=np.array([self._truth[k]["structure"] for k in present], bool),
+        )
+
+
+def _ids(walk: Path, index: int) -> np.ndarray:
+    image = cv2.imread(str(walk / "ids" / f"{frame_name(index)}.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image.astype(np.int32)
+
+
+def _true_id(walk: Path, track: Any) -> int:
+    """The thing that most of a track's masks lie on."""
+    from list3r.memory.masks import decode_mask
+
+    votes: Counter[int] = Counter()
+    for row in range(0, len(track.frames), 5):
+        mask = decode_mask(track.masks[row], track.image_size)
+        under = _ids(walk, int(track.frames[row]))[mask]
+        votes.update({int(k): int(n) for k, n in zip(*np.unique(under, return_counts=True), strict=True)})
+    return votes.most_common(1)[0][0]
+
+
+def _most_common(store: Store, told: dict[tuple[int, int], int]) -> dict[int, int]:
+    """True id of every global instance; of several instances of one thing the one with most observations counts."""
+    votes: dict[int, Counter[int]] = {}
+    for seen in store.observations():
+        votes.setdefault(seen.instance_id, Counter())[told[seen.chunk_id, seen.local_id]] += 1
+    best: dict[int, tuple[int, int]] = {}
+    for instance, counter in sorted(votes.items()):
+        true, count = counter.most_common(1)[0]
+        if true not in best or count > best[true][0]:
+            best[true] = (count, instance)
+    return {instance: true for true, (_, instance) in best.items()}
+
+
+def _vertical_without_gravity(store: Store) -> int:
+    """Vertical relations that a consolidation without gravity leaves; a relation query must call them unknown."""
+    from list3r.memory.consolidation import consolidate
+
+    with store.transaction():
+        consolidate(store)
+    return sum(r.predicate in VERTICAL for r in store.relations())
+
+
+def _truth(walk: Path) -> dict[int, dict[str, Any]]:
+    import json
+
+    return {int(e["id"]): e for e in json.loads((walk / "truth.json").read_text())["instances"]}
+
+
+def _relations(walk: Path) -> list[tuple[int, str, int]]:
+    import json
+
+    return scene_relations(json.loads((walk / "truth.json").read_text()))
+
+
+if __name__ == "__main__":
+    main()
