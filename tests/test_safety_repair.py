@@ -62,6 +62,41 @@ def test_verify_finds_any_row_that_is_not_as_it_was_written(case: str, tmp_path:
         assert store.verify() != []
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_is_not_as_it_was_written_is_not_answered_with(
+    whole: bool, make_memory: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make_memory()
+    spoil(path, "UPDATE instances SET confidence = 0.123 WHERE id = 3")
+    monkeypatch.setattr("list3r.memory.connection.WHOLE_BYTES", 2**40 if whole else 0)
+    for ask in (
+        lambda store: store.instances(),
+        lambda store: store.instance(3),
+        lambda store: store.instances_of([2, 3]),
+    ):
+        with Store.open(path) as store, pytest.raises(MemoryFileError, match=r"instances 3: .*repair"):
+            ask(store)
+    with Store.open(path) as store:
+        assert store.verify() != [], "what is damaged can be looked at"
+
+
+@pytest.mark.parametrize(
+    ("statement", "ask"),
+    [
+        ("UPDATE relations SET object = 5 WHERE subject = 3", lambda store: store.relations(3)),
+        ("UPDATE instance_boxes SET max_x = max_x + 1 WHERE id = 3", lambda store: store.ids_in_box([0] * 3, [1] * 3)),
+        ("UPDATE embeddings SET vector = zeroblob(64) WHERE instance = 2", lambda store: store.embedding_spaces()),
+        ("UPDATE memory SET value = '\"known\"' WHERE key = 'gravity'", lambda store: store.get_value("gravity")),
+        ("UPDATE supports SET points = zeroblob(length(points)) WHERE local_id = 4", lambda store: store.support(2)),
+    ],
+)
+def test_no_table_is_believed_unseen(statement: str, ask: Callable[[Store], object], make_memory: Make) -> None:
+    path = make_memory()
+    spoil(path, statement)
+    with Store.open(path) as store, pytest.raises(MemoryFileError, match="repair"):
+        ask(store)
+
+
 def test_a_sound_memory_is_left_alone_or_copied(make_memory: Make, tmp_path: Path) -> None:
     path = make_memory()
     before = path.read_bytes()

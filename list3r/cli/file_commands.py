@@ -44,8 +44,8 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
     """
     with open_memory(memory) as scene:
         found = scene.store.verify()
-        state = [s.state for s in scene.store.sessions()]
-        chunks = len(scene.store.chunks())
+        state = [] if found else [s.state for s in scene.store.sessions()]
+        chunks = None if found else len(scene.store.chunks())
     if json:
         print_json({"sound": not found, "damage": found, "sessions": state, "chunks": chunks})
     elif found:

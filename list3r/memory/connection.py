@@ -15,13 +15,12 @@ from urllib.parse import quote
 
 from list3r.memory.codec import MAX_BLOB_BYTES, from_json, to_json
 from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, unbelieved
 from list3r.memory.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
 from list3r.memory.sums import Sums, write_all
 from list3r.memory.word_index import WordIndex, up_to_date, write_words
 from list3r.memory.writer_lock import WriterLock, lock_path
 
-FAILURES = (sqlite3.Error, UnicodeError)
-"""What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
 PAGE_BYTES = 16384
 """Pages of new files. A row of a clustered table stays in its page up to a quarter of it. Vectors of up to 1,000
 numbers do; in pages of 4 KiB each of 256 takes a page of overflow, four times the room and one more page to read.
@@ -44,6 +43,8 @@ class Connection:
         self._lock = lock
         self._followers = () if lock is None else (WordIndex(database), Sums(database))
         """What follows the rows that a transaction changes; in this order as it commits."""
+        self._checks = ReadChecks(database) if _size(database) <= WHOLE_BYTES else None
+        self._writing = False
         self._guard = threading.RLock()
 
     @classmethod
@@ -161,9 +162,7 @@ class Connection:
         found = self._damage() if isinstance(error, Exception) and not isinstance(error, List3rError | OSError) else []
         self.close()
         if found:
-            raise MemoryFileError(
-                f"{self.path} is damaged ({found[0]}); `list3r repair {self.path}` saves what is sound"
-            ) from error
+            raise MemoryFileError(_damaged(self.path, found[0])) from error
 
     def _damage(self) -> list[str]:
         """What explains that something read could not be understood."""
@@ -175,6 +174,7 @@ class Connection:
         with self._guard:
             try:
                 self._database.execute("BEGIN IMMEDIATE")
+                self._writing = True
                 try:
                     yield
                     for follower in self._followers:
@@ -186,6 +186,8 @@ class Connection:
             except sqlite3.Error as error:
                 self._roll_back()
                 raise MemoryFileError(_explain(self.path, error)) from error
+            finally:
+                self._writing = False
 
     def _roll_back(self) -> None:
         for follower in self._followers:
@@ -224,9 +226,25 @@ class Connection:
 
     def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         try:
-            return self._database.execute(query, arguments).fetchall()
+            rows = self._database.execute(query, arguments).fetchall()
+            if self._checks is not None and self._checks.pending and not self._writing:
+                found = self._checks.found()
+                if found is not None:
+                    raise MemoryFileError(_damaged(self.path, found))
+            return rows
         except FAILURES as error:
             raise MemoryFileError(_explain(self.path, error)) from error
+
+    def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
+        if self._checks is None and not self._writing:
+            try:
+                bad = unbelieved(self._database, table, rows)
+            except FAILURES as error:
+                raise MemoryFileError(_explain(self.path, error)) from error
+            if bad:
+                raise MemoryFileError(_damaged(self.path, f"{table} {bad[0]}: the row is not as it was written"))
+        return rows
 
 
 _UNFINISHED = ("SQLITE_READONLY_ROLLBACK", "SQLITE_READONLY_RECOVERY", "SQLITE_CANTOPEN", "SQLITE_READONLY")
@@ -237,6 +255,16 @@ def remove_memory(path: Path) -> None:
     """Delete a memory file and what lies beside it while it is written."""
     for part in (path, *(Path(f"{path}{end}") for end in ("-wal", "-shm", "-journal")), lock_path(path)):
         part.unlink(missing_ok=True)
+
+
+def _damaged(path: Path, found: str) -> str:
+    return f"{path} is damaged ({found}); `list3r repair {path}` saves what is sound"
+
+
+def _size(database: sqlite3.Connection) -> int:
+    """Bytes of a database, what is only in its log included."""
+    pages = [database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")]
+    return int(pages[0]) * int(pages[1])
 
 
 def _explain(path: Path, error: Exception) -> str:

@@ -34,12 +34,14 @@ class InstanceVerbs(EmbeddingVerbs):
     def instances(self, *, structure: bool | None = None) -> list[Instance]:
         """All instances by id; only structure or only things where asked."""
         where = {None: "", True: "WHERE structure IS NOT NULL", False: "WHERE structure IS NULL"}[structure]
-        return [_instance(row) for row in self._rows(f"SELECT {_COLUMNS} FROM instances {where} ORDER BY id")]
+        rows = self._rows(f"SELECT {_COLUMNS} FROM instances {where} ORDER BY id")
+        return [_instance(row) for row in self._believed("instances", rows)]
 
     def instance(self, instance_id: int) -> Instance:
         """One instance; an alias gives the instance it was merged into. Raises `UnknownIdError`."""
         resolved = self.resolve(instance_id)
-        return _instance(self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id = ?", (resolved,))[0])
+        rows = self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id = ?", (resolved,))
+        return _instance(self._believed("instances", rows)[0])
 
     def instances_of(self, ids: Sequence[int]) -> list[Instance]:
         """The instances of these ids that are there, in the order of `ids`; aliases are not resolved."""
@@ -47,7 +49,8 @@ class InstanceVerbs(EmbeddingVerbs):
         for start in range(0, len(ids), _BATCH):
             part = [int(i) for i in ids[start : start + _BATCH]]
             marks = ",".join("?" * len(part))
-            for row in self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id IN ({marks})", tuple(part)):
+            rows = self._rows(f"SELECT {_COLUMNS} FROM instances WHERE id IN ({marks})", tuple(part))
+            for row in self._believed("instances", rows):
                 found[row[0]] = _instance(row)
         return [found[i] for i in map(int, ids) if i in found]
 
