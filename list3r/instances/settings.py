@@ -30,7 +30,9 @@ class ViewSettings:
     step: int = 2
     """Every how many of them."""
     max_sigma_m: float = 0.05
-    """Depth noisier than this (5 m away with the default noise) shows no things and is left out."""
+    """Depth noisier than this (5 m away with the default noise) shows no things and is left out,"""
+    max_computed: float = 0.025
+    """unless it was computed and its deviation is less than this share of depth: walls far off still bound the room."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
 
 

@@ -38,7 +38,8 @@ class ChunkViews:
         self._views: dict[int, View] = {}
         self._corrections: list[NDArray[np.float64]] = []
         if self.anchors:
-            self.noise_scale = self._measure_noise()
+            if reconstruction.depth_noise is None:
+                self.noise_scale = self._measure_noise()
             given = [self._fuse(position) for position in self.anchors]
             aligned = align_views(given, self.unit)
             self._views = {view.position: view for view in aligned}
@@ -62,6 +63,8 @@ class ChunkViews:
 
     def sigma(self, depth: Float) -> Float:
         """Standard deviation of single depth readings. Shape (...)."""
+        if self.reconstruction.depth_noise is not None:
+            return self.reconstruction.depth_noise.sigma(depth)
         return single_sigma(depth, self.settings.view.noise, self.unit) * np.float32(self.noise_scale)
 
     def _measure_noise(self) -> float:
@@ -88,6 +91,12 @@ class ChunkViews:
         read = cv2.remap(self.reconstruction.depth[other], x, y, cv2.INTER_NEAREST, borderValue=0)
         return read - z, (read > 0) & (depth > 0) & (z > 0)
 
+    def _most_sigma(self, depth: Float) -> Float:
+        """Standard deviation beyond which depth shows no things. Shape (...)."""
+        view = self.settings.view
+        share = 0.0 if self.reconstruction.depth_noise is None else view.max_computed
+        return np.asarray(np.maximum(view.max_sigma_m * self.unit, share * depth), np.float32)
+
     def _fuse(self, position: int) -> View:
         depth = self.small_depth(position)
         sigma = self.sigma(depth)
@@ -103,9 +112,10 @@ class ChunkViews:
             deny += seen & (residual >= tolerance)
         depth = np.where(depth > 0, depth + shift / weight, 0.0).astype(np.float32)
         edge = depth_edges(depth, sigma)
-        confirmed = (depth > 0) & (agree >= np.maximum(deny, 1)) & ~(edge & (agree < 2 * deny + 3))
+        sure = 2 * deny + 3 if self.reconstruction.depth_noise is None else np.inf
+        confirmed = (depth > 0) & (agree >= np.maximum(deny, 1)) & ~(edge & (agree < sure))
         alone = (agree + deny == 0) & ~edge & (depth > 0)
-        usable = sigma < self.settings.view.max_sigma_m * self.unit
+        usable = sigma < self._most_sigma(depth)
         T = self.reconstruction.T_chunk_cam[position]
         camera_points = backproject(depth, self.camera)
         points = (camera_points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)).astype(np.float32)

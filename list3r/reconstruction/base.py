@@ -13,6 +13,21 @@ from list3r.frames.base import Camera, Frame
 
 
 @dataclass(frozen=True)
+class DepthNoise:
+    """How rough depth is that a model computed: standard deviation base + quadratic * z^2, chunk units.
+
+    Frames share their errors, so that neither their agreement nor their mean tells more than one of them.
+    """
+
+    base: float
+    quadratic: float
+
+    def sigma(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Standard deviation of depths, chunk units. Shape (...)."""
+        return np.asarray(self.base + self.quadratic * depth * depth, np.float32)
+
+
+@dataclass(frozen=True)
 class Reconstruction:
     """Geometry of one chunk, in the chunk's own frame and units."""
 
@@ -35,6 +50,8 @@ class Reconstruction:
     moving: NDArray[np.uint8] | None = None
     """Number of the thing that moves of its own at every n-th pixel, from 1, and 0 for what stays; None where the model
     looks for none or nothing moves. Depth and confidence are 0 there. Shape (F, h, w)."""
+    depth_noise: DepthNoise | None = None
+    """Noise of depth that was computed; None for a sensor's readings, whose noise is known and new in each frame."""
 
     def __post_init__(self) -> None:
         count = len(self.frame_indices)

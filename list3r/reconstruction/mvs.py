@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
+from list3r.reconstruction.base import DepthNoise
 from list3r.reconstruction.mvs_fill import FillSettings, fill_regions
 from list3r.reconstruction.mvs_fusion import (
     DepthMap,
@@ -39,7 +40,7 @@ from list3r.reconstruction.mvs_views import (
     plane_depths,
 )
 
-__all__ = ["MvsSettings", "Sparse", "dense_depth"]
+__all__ = ["MvsSettings", "Sparse", "dense_depth", "stereo_noise"]
 
 Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Places (N, 2) in px and depths (N,) of a frame's triangulated points."""
@@ -119,6 +120,41 @@ def dense_depth(
                 continue
             depth[position], confidence[position] = _full_size(chunk, small, frames[position], camera)
     return depth, confidence
+
+
+def stereo_noise(
+    depth: NDArray[np.float32], confidence: NDArray[np.float16], most_frames: int = 12
+) -> DepthNoise | None:
+    """How rough stereo depth (F, H, W) is: what small windows deviate from a plane, growing with depth squared.
+
+    None where too little is known to measure it. Structure looks like roughness, so the smoother windows decide.
+    """
+    used = np.flatnonzero((depth > 0).any(axis=(1, 2)))
+    rates = []
+    for position in used[:: max(1, len(used) // most_frames)].tolist():
+        stride = max(1, depth.shape[2] // 320)
+        d, c = depth[position][::stride, ::stride], confidence[position][::stride, ::stride]
+        inverse = np.where(c > 0.3, 1.0 / np.maximum(d, 1e-9), 0.0)
+        rates.append(plane_residual(inverse, radius=8)[4:-4:4, 4:-4:4].ravel())
+    found = np.concatenate(rates) if rates else np.zeros(0)
+    found = found[np.isfinite(found)]
+    return DepthNoise(0.0, float(np.quantile(found, 0.4))) if len(found) >= 200 else None
+
+
+def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    """RMS deviation of inverse depth (h, w) from a plane in each window, NaN where a third of it is unknown."""
+    v, u = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float64)
+    known, size = (inverse > 0).astype(np.float64), (2 * radius + 1, 2 * radius + 1)
+    n, *rest = (
+        cv2.boxFilter(known * term, cv2.CV_64F, size, normalize=True, borderType=cv2.BORDER_CONSTANT)
+        for term in (np.ones_like(u), u, v, inverse, u * u, u * v, v * v, inverse * u, inverse * v, inverse**2)
+    )
+    mu, mv, mw, uu, uv, vv, wu, wv, ww = (term / np.maximum(n, 1e-9) for term in rest)
+    uu, uv, vv = uu - mu * mu, uv - mu * mv, vv - mv * mv
+    wu, wv, ww = wu - mw * mu, wv - mw * mv, ww - mw * mw
+    determinant = np.maximum(uu * vv - uv * uv, 1e-9)
+    explained = (vv * wu * wu - 2.0 * uv * wu * wv + uu * wv * wv) / determinant
+    return np.where(n > 0.67, np.sqrt(np.maximum(ww - explained, 0.0)), np.nan)
 
 
 def _prepare(
