@@ -6,11 +6,14 @@ as one that was never interrupted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import ChainMap
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.association.chunk_nodes import NodeSettings
 from list3r.association.edges import EdgeSettings, measure_edge
@@ -30,6 +33,8 @@ from list3r.memory.gravity import estimate_gravity, world_from_graph
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.scale import settle_scale
 from list3r.memory.store import Store
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -145,7 +150,8 @@ def place_chunks(
     edges = store.edges()
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
-    if new is not None and len(chunks) > SOLVED_WHOLE:
+    fitted = new is not None and len(chunks) > SOLVED_WHOLE
+    if new is not None and fitted:
         graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, settings)
     else:
         graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=settings)
@@ -153,14 +159,28 @@ def place_chunks(
     if nodes is not None:
         graph = _straightened(store, graph, chunks, metric, settings, nodes)
     known = {} if store.get_value("poses") == "given" else graph.covariances
-    store.place_chunks(graph.S_graph_chunk, graph.components, known)
-    store.set_value("T_world_graph", np.eye(4).tolist())
-    gravity = estimate_gravity(store)
+    if fitted and len(chunks) > UP_ALWAYS and len(chunks) % UP_AGAIN:
+        _place_fitted(store, graph, known)
+        return
+    gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
     upright = world_from_graph(gravity)
     S_world_graph = settle_scale(store, store.chunks(), graph.S_graph_chunk) @ upright
     store.set_value("T_world_graph", S_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
     store.place_chunks({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
+
+
+UP_ALWAYS, UP_AGAIN = 64, 32
+"""Chunks up to which every new one makes it be asked which way is up and what a unit of the world is; beyond, after how
+many chunks that is asked again."""
+
+
+def _place_fitted(store: Store, graph: GraphResult, covariances: Mapping[int, NDArray[np.float64]]) -> None:
+    """Write where the new chunk lies, and those that moved for it, in the world as it stands."""
+    S_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+    layers = graph.S_graph_chunk.maps if isinstance(graph.S_graph_chunk, ChainMap) else [graph.S_graph_chunk]
+    moved = sorted({k for layer in layers if isinstance(layer, dict) for k in layer})
+    store.place_chunks({k: S_world_graph @ graph.S_graph_chunk[k] for k in moved}, graph.components, covariances)
 
 
 def _straightened(
@@ -195,16 +215,32 @@ def finish_session(
 
 
 def _placed(store: Store, chunks: Sequence[ChunkRow], edges: Sequence[Edge], new: int) -> GraphResult:
-    """The graph as it was solved before the new chunk came."""
-    known = [c for c in chunks if c.chunk_id != new]
-    poses = _graph_poses(store)
+    """The graph as it was solved before the new chunk came, looked up where it is asked for."""
+    rows = {c.chunk_id: c for c in chunks if c.chunk_id != new}
+    T_graph_world = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist())).inverse()
     return GraphResult(
-        S_graph_chunk={c.chunk_id: poses[c.chunk_id] for c in known},
-        components={c.chunk_id: c.component for c in known},
+        S_graph_chunk=_Of(rows, lambda c: T_graph_world @ c.S_world_chunk),
+        components=_Of(rows, lambda c: c.component),
         edges=tuple(edges),
         residual=1.0,
-        covariances={c.chunk_id: np.zeros((7, 7)) if c.covariance is None else c.covariance for c in known},
+        covariances=_Of(rows, lambda c: np.zeros((7, 7)) if c.covariance is None else c.covariance),
     )
+
+
+class _Of(Mapping[int, T]):
+    """Something of each chunk, told when it is asked for."""
+
+    def __init__(self, rows: Mapping[int, ChunkRow], tell: Callable[[ChunkRow], T]) -> None:
+        self._rows, self._tell = rows, tell
+
+    def __getitem__(self, chunk_id: int) -> T:
+        return self._tell(self._rows[chunk_id])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
 
 
 def _graph_poses(store: Store) -> dict[int, Sim3]:

@@ -6,8 +6,10 @@ takes the same way as one that was not interrupted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import ChainMap
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import replace
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
 def extend(
@@ -71,8 +74,9 @@ def extend(
     squares = problem.squares(poses)
     covariance = _hanging(placed.covariances[here], active[first], here, weights[first])
     if len(active) > 1 and float(squares.max()) > chi2.ppf(0.95, problem.size):
-        moved = _moved(new, here, edges, mine, {**placed.S_graph_chunk, new: start}, placed.components, metric, chosen)
-        placed = replace(placed, S_graph_chunk=moved[0])
+        poses_of = ChainMap({new: start}, _under(placed.S_graph_chunk))
+        moved = _moved(new, here, edges, mine, poses_of, placed.components, metric, chosen)
+        placed = replace(placed, S_graph_chunk=ChainMap(moved[0], _under(placed.S_graph_chunk)))
         return _with(placed, new, moved[0][new], placed.components[here], moved[1], covariance)
     out = list(edges)
     for n, k in enumerate(mine):
@@ -87,12 +91,12 @@ def _moved(
     here: int,
     edges: Sequence[Edge],
     mine: Sequence[int],
-    poses_of: dict[int, Sim3],
-    components: dict[int, int],
+    poses_of: Mapping[int, Sim3],
+    components: Mapping[int, int],
     metric: bool,
     settings: GraphSettings,
 ) -> tuple[dict[int, Sim3], list[Edge]]:
-    """The neighbourhood moved by a step; its edges are believed as before, but the new chunk's loops are judged."""
+    """The neighbourhood, moved by a step, and all edges; believed as before but for the new chunk's loops."""
     known = [k for k, e in enumerate(edges) if e.accepted and e.u in poses_of and e.v in poses_of]
     ends = np.array([(edges[k].u, edges[k].v) for k in known])
     near = _near(new, here, ends, {_other(edges[k], new) for k in mine}, settings.most_moved)
@@ -125,7 +129,7 @@ def _moved(
         believed = bool(trust[n] == 1.0)
         reason = edge.reason if believed else contradicted(edge, deviations)
         out[used[n]] = replace(edge, accepted=believed, scores=scores, reason=reason)
-    return {**poses_of, **unstack(poses, ids)}, out
+    return unstack(poses, ids), out
 
 
 def _near(new: int, here: int, ends: NDArray[np.int64], others: set[int], most: int) -> NDArray[np.int64]:
@@ -147,6 +151,11 @@ def _near(new: int, here: int, ends: NDArray[np.int64], others: set[int], most: 
     return np.asarray(ids[nearest[np.isfinite(steps[nearest])]])
 
 
+def _under(known: Mapping[int, T]) -> MutableMapping[int, T]:
+    """A mapping as `ChainMap` is declared to want it; it is never written to."""
+    return cast("MutableMapping[int, T]", known)
+
+
 def _other(edge: Edge, chunk: int) -> int:
     return edge.u if edge.v == chunk else edge.v
 
@@ -158,12 +167,13 @@ def _kind(edge: Edge) -> int:
 def _with(
     placed: GraphResult, new: int, S: Sim3, component: int, edges: Sequence[Edge], covariance: Array
 ) -> GraphResult:
+    """`placed` with one more chunk; what stays is not copied, so that a chunk costs the same in a long video."""
     return GraphResult(
-        {**placed.S_graph_chunk, new: S},
-        {**placed.components, new: component},
+        ChainMap({new: S}, _under(placed.S_graph_chunk)),
+        ChainMap({new: component}, _under(placed.components)),
         tuple(edges),
         placed.residual,
-        {**placed.covariances, new: covariance},
+        ChainMap({new: covariance}, _under(placed.covariances)),
     )
 
 

@@ -46,15 +46,15 @@ class GraphSettings:
 class GraphResult:
     """Where the chunks are."""
 
-    S_graph_chunk: dict[int, Sim3]
+    S_graph_chunk: Mapping[int, Sim3]
     """By chunk id; chunks of different components share no frame."""
-    components: dict[int, int]
+    components: Mapping[int, int]
     """By chunk id: the smallest chunk id of its component."""
     edges: tuple[Edge, ...]
     """The edges as given, with `weight`, and loop edges that the rest contradicts no longer `accepted`."""
     residual: float
     """RMS of the trusted edges' errors in their own standard deviations, 1 where they keep what they state."""
-    covariances: dict[int, Array]
+    covariances: Mapping[int, Array]
     """By chunk id, of x in S_true = S_graph_chunk exp(x), x = (rho, omega, sigma), relative to the first chunk of the
     component, which has 0. Shape (7, 7) each."""
 

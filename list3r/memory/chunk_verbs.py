@@ -88,6 +88,8 @@ class ChunkVerbs(BendVerbs):
         self._chunk_rows: dict[int, ChunkRow] | None = None
         self._chunk_version = self._edge_version = -1
         self._edge_rows: dict[tuple[int, int, str, int, int], Edge] | None = None
+        self.touched: set[int] | None = None
+        """Chunks that were placed or measured anew since the library was derived; None where that is not known."""
 
     # ------------------------------------------------------------------ sessions
 
@@ -141,6 +143,7 @@ class ChunkVerbs(BendVerbs):
             "INSERT INTO placements VALUES (?, ?, ?, NULL)", (chunk_id, chunk_id, pack_sim3(Sim3.identity()))
         )
         self._chunk_rows = None if self._chunk_rows is None else {**self._chunk_rows, **self._read_chunks([chunk_id])}
+        self._touch([chunk_id])
         self._add_frames(session_id, chunk_id, result)
         self._database.executemany(
             "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)",
@@ -178,6 +181,7 @@ class ChunkVerbs(BendVerbs):
 
     def add_local_instance(self, chunk_id: int, instance: LocalInstance) -> None:
         """Store one more local instance of a chunk, under a local id that the chunk does not have yet."""
+        self.unsettle(chunk_id)
         track = pack(track_arrays(instance.track))
         feature = instance.feature.astype("<f4").tobytes()
         plane = None if instance.plane is None else f8(instance.plane)
@@ -274,6 +278,17 @@ class ChunkVerbs(BendVerbs):
             ],
         )
         self._chunk_rows = rows
+        self._touch(fresh)
+
+    def unsettle(self, chunk_id: int) -> None:
+        """What was derived from a chunk does not hold any more: it was measured anew."""
+        self._database.execute("DELETE FROM settled WHERE chunk_id = ?", (int(chunk_id),))
+        self.unsettled += 1
+        self._touch([chunk_id])
+
+    def _touch(self, chunk_ids: Iterable[int]) -> None:
+        if self.touched is not None:
+            self.touched.update(chunk_ids)
 
     def forget_rows(self) -> None:
         """Read chunks and edges again when they are next asked for."""
@@ -282,6 +297,7 @@ class ChunkVerbs(BendVerbs):
     def _roll_back(self) -> None:
         super()._roll_back()
         self.forget_rows()
+        self.touched = None
 
     def flag_dynamic(self, chunk_id: int, motions: Mapping[int, MotionTrack | None]) -> None:
         """Say of local instances, by local id, that they move, and where they were."""
@@ -289,6 +305,8 @@ class ChunkVerbs(BendVerbs):
             "UPDATE local_instances SET dynamic = 1, motion = coalesce(?, motion) WHERE chunk_id = ? AND local_id = ?",
             [(None if m is None else pack(asdict(m)), chunk_id, n) for n, m in motions.items()],
         )
+        if motions:
+            self.unsettle(chunk_id)
 
     def dynamic_locals(self, chunk_id: int) -> list[int]:
         """Local ids of a chunk's instances that move."""
@@ -389,9 +407,25 @@ class ChunkVerbs(BendVerbs):
         )
         return [read_frame_row(row) for row in self._rows(query, arguments)]
 
-    def posed_count(self) -> int:
-        """How many frames have a pose."""
-        return int(self._rows("SELECT count(*) FROM frames WHERE state = 'posed'")[0][0])
+    def frames_of(self, chunk: ChunkRow) -> list[FrameRow]:
+        """The frames that a chunk places, in order."""
+        query = (
+            "SELECT session_id, frame_index, time_s, chunk_id, state, T_chunk_cam FROM frames"
+            " WHERE session_id = ? AND frame_index BETWEEN ? AND ? AND chunk_id = ? ORDER BY frame_index"
+        )
+        arguments = (chunk.session_id, chunk.first_frame, chunk.last_frame, chunk.chunk_id)
+        return [read_frame_row(row) for row in self._rows(query, arguments)]
+
+    def frame_times(self, chunk: ChunkRow) -> dict[tuple[int, int], float]:
+        """Seconds by (session id, Frame.index) of the frames that lie in the span of a chunk, whoever places them."""
+        query = "SELECT frame_index, time_s FROM frames WHERE session_id = ? AND frame_index BETWEEN ? AND ?"
+        rows = self._rows(query, (chunk.session_id, chunk.first_frame, chunk.last_frame))
+        return {(chunk.session_id, int(f)): float(t) for f, t in rows}
+
+    def posed_count(self, most: int = -1) -> int:
+        """How many frames have a pose; counted up to `most` where that is given."""
+        query = "SELECT count(*) FROM (SELECT 1 FROM frames WHERE state = 'posed' LIMIT ?)"
+        return int(self._rows(query, (most,))[0][0])
 
     def bad_frames(self) -> list[tuple[int, int, str]]:
         """(session id, Frame.index, reason) of the frames that could not be decoded."""

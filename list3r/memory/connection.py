@@ -46,6 +46,10 @@ class Connection:
         self._checks = ReadChecks(database) if _size(database) <= WHOLE_BYTES else None
         self._writing = False
         self._guard = threading.RLock()
+        self.rollbacks = 0
+        """How often something written was taken back: an id may then stand for something else."""
+        self.unsettled = 0
+        """How often a chunk was unsettled, see `memory.library_verbs`."""
 
     @classmethod
     def create(cls, path: str | Path) -> Self:
@@ -190,6 +194,7 @@ class Connection:
                 self._writing = False
 
     def _roll_back(self) -> None:
+        self.rollbacks += 1
         for follower in self._followers:
             follower.forget()
         if self._database.in_transaction:

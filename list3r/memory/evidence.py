@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.merging import Key, PairScores
-from list3r.memory.shapes import ChunkShapes
+from list3r.memory.shapes import ChunkShapes, Ints
 
 
 @dataclass(frozen=True)
@@ -62,22 +62,33 @@ def weigh(
     chunks: Mapping[int, ChunkShapes],
     pairs: Mapping[tuple[int, int], PairScores],
     settings: EvidenceSettings,
+    wanted: Collection[int] | None = None,
 ) -> list[Evidence]:
-    """The evidence for each group, from the scores of all pairs of chunks."""
+    """The evidence for each group, from the scores of all pairs of chunks.
+
+    With `wanted` only these groups are weighed, by the pairs of their chunks, and the others are left without any;
+    every local instance of those chunks must be in a group.
+    """
     home = {k: np.full(len(c.local_id), -1, np.int64) for k, c in chunks.items()}
     frames: list[set[tuple[int, int]]] = []
     for n, group in enumerate(groups):
         seen: set[tuple[int, int]] = set()
         for chunk_id, local_id in group:
-            at = int(np.searchsorted(chunks[chunk_id].local_id, local_id))
-            home[chunk_id][at] = n
-            seen.update((chunks[chunk_id].session_id, int(f)) for f in chunks[chunk_id].frames[at])
+            if chunk_id in home:
+                at = int(np.searchsorted(chunks[chunk_id].local_id, local_id))
+                home[chunk_id][at] = n
+                if wanted is None or n in wanted:
+                    seen.update((chunks[chunk_id].session_id, int(f)) for f in chunks[chunk_id].frames[at])
         frames.append(seen)
+    weighed = np.ones(len(groups) + 1, dtype=bool)
+    if wanted is not None:
+        weighed[:] = False
+        weighed[list(wanted)] = True
     against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
     for (u, v), p in sorted(pairs.items()):
         a, b = home[u][p.i], home[v][p.j]
         for inner, outer, cover, chunk in ((a, b, p.i_on_j, v), (b, a, p.j_on_i, u)):
-            for e in np.flatnonzero((inner != outer) & (cover >= settings.swallowed)):
+            for e in np.flatnonzero((inner != outer) & weighed[inner] & (cover >= settings.swallowed)):
                 claim = (float(cover[e]), -int(outer[e]))
                 against[int(inner[e])][chunk] = max(claim, against[int(inner[e])].get(chunk, claim))
     out = []
@@ -98,29 +109,49 @@ def contested(
     S_world_chunk: Mapping[int, Sim3],
     unit: float,
     settings: EvidenceSettings,
-) -> dict[int, NDArray[np.bool_]]:
+    near: Ints | None = None,
+) -> dict[int, tuple[Ints, NDArray[np.bool_]]]:
     """The points of each chunk that it alone gives to a thing, while several chunks give their place to another one.
 
-    Only things that at least three chunks found lose points so: a chair's back that one chunk took for table.
+    Only things that at least three chunks found lose points so: a chair's back that one chunk took for table. Returns
+    by chunk which points were asked about and whether they are dropped, (M,) each; with `near` (keys of cells, see
+    `claim_cells`) only those that lie there are, and every local instance with points there must be in a group.
     """
     names = sorted(chunks)
+    number = {k: n for n, k in enumerate(names)}
     group = [np.full(len(chunks[k].local_id), -1, np.int64) for k in names]
-    large = np.array([len({k for k, _ in g}) >= 3 for g in groups], dtype=bool)
+    large = np.array([*(len({k for k, _ in g}) >= 3 for g in groups), False], dtype=bool)
     for n, members in enumerate(groups):
         for chunk_id, local_id in members:
-            group[names.index(chunk_id)][int(np.searchsorted(chunks[chunk_id].local_id, local_id))] = n
-    points = np.concatenate([S_world_chunk[k].apply(chunks[k].points) for k in names])
-    owner = np.concatenate([g[chunks[k].owner] for g, k in zip(group, names, strict=True)])
-    chunk = np.concatenate([np.full(len(chunks[k].points), n) for n, k in enumerate(names)])
-    drop = np.zeros(len(points), dtype=bool)
-    if len(points):
-        cell = np.floor(points / (settings.claim_m * unit)).astype(np.int64)
-        _, place = np.unique(cell @ np.array([73856093, 19349663, 83492791]), return_inverse=True)
-        claim, at = np.unique(place * len(groups) + owner, return_inverse=True)
+            if chunk_id in number:
+                group[number[chunk_id]][int(np.searchsorted(chunks[chunk_id].local_id, local_id))] = n
+    cells = [claim_cells(chunks[k], S_world_chunk[k], unit, settings) for k in names]
+    asked = [np.arange(len(c)) if near is None else np.flatnonzero(_among(c, near)) for c in cells]
+    owner = np.concatenate([g[chunks[k].owner[a]] for g, k, a in zip(group, names, asked, strict=True)])
+    chunk = np.concatenate([np.full(len(a), n) for n, a in enumerate(asked)])
+    drop = np.zeros(len(owner), dtype=bool)
+    if len(owner):
+        _, place = np.unique(np.concatenate([c[a] for c, a in zip(cells, asked, strict=True)]), return_inverse=True)
+        claim, at = np.unique(place * (len(groups) + 1) + owner, return_inverse=True)
         pairs = np.unique(at * len(names) + chunk)
         count = np.bincount(pairs // len(names), minlength=len(claim))
         most = np.zeros(int(place.max()) + 1, np.int64)
-        np.maximum.at(most, claim // len(groups), count)
+        np.maximum.at(most, claim // (len(groups) + 1), count)
         drop = large[owner] & (count[at] == 1) & (most[place] >= settings.claims)
-    split = np.cumsum([len(chunks[k].points) for k in names])[:-1]
-    return dict(zip(names, np.split(drop, split), strict=True))
+    split = np.cumsum([len(a) for a in asked])[:-1]
+    return {k: (a, d) for k, a, d in zip(names, asked, np.split(drop, split), strict=True)}
+
+
+def claim_cells(chunk: ChunkShapes, S_world_chunk: Sim3, unit: float, settings: EvidenceSettings) -> Ints:
+    """Key of the cell in which each representative point of a chunk lies. Shape (R,)."""
+    cell = np.floor(S_world_chunk.apply(chunk.points) / (settings.claim_m * unit)).astype(np.int64) + (1 << 20)
+    c = np.clip(cell, 0, (1 << 21) - 1)
+    return np.asarray(c[:, 0] << 42 | c[:, 1] << 21 | c[:, 2])
+
+
+def _among(keys: Ints, wanted: Ints) -> NDArray[np.bool_]:
+    """Whether each key is one of the wanted ones, which ascend."""
+    if len(wanted) == 0:
+        return np.zeros(len(keys), dtype=bool)
+    at = np.minimum(np.searchsorted(wanted, keys), len(wanted) - 1)
+    return np.asarray(wanted[at] == keys)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from list3r.memory.geometry import Array, Sim3, rotation_exp
 from list3r.memory.planes import Planes, place_planes
 from list3r.memory.store import Store
-from list3r.memory.summaries import cameras_of, chunk_summaries, world_unit
+from list3r.memory.summaries import cameras_of, chunk_summaries, sample_of, world_unit
 
 
 @dataclass(frozen=True)
@@ -164,22 +165,34 @@ def floor_height(
     return height
 
 
-def estimate_gravity(store: Store, settings: GravitySettings | None = None) -> Gravity:
-    """Up in the frame in which the store's chunks lie now, from the first component (see `ChunkRow.component`).
+def estimate_gravity(
+    store: Store,
+    S_graph_chunk: Mapping[int, Sim3] | None = None,
+    components: Mapping[int, int] | None = None,
+    settings: GravitySettings | None = None,
+) -> Gravity:
+    """Up in the frame in which chunks lie by `S_graph_chunk` (the default: as they are placed), from the chunks of the
+    first component (see `ChunkRow.component`), or 64 of them in a long memory.
 
-    Call it inside a transaction, while the chunks are placed by the pose graph alone; `world_from_graph` then gives
-    what stands them upright. An estimate that still agrees with the one before within `settled_deg` gives way to
-    that one, so that the world does not tremble with every chunk.
+    Call it inside a transaction; `world_from_graph` then gives what stands the chunks upright. An estimate that still
+    agrees with the one before within `settled_deg` gives way to that one, so that the world does not tremble with every
+    chunk.
     """
     s = settings or GravitySettings()
     chunks = store.chunks()
+    if S_graph_chunk is None or components is None:
+        S_graph_chunk = {c.chunk_id: c.S_world_chunk for c in chunks}
+        components = {c.chunk_id: c.component for c in chunks}
     if not chunks:
         return Gravity("unknown", np.array([0.0, 0.0, 1.0]), np.inf, 0.0, 0.0, None, "the memory is empty")
-    component = min(c.component for c in chunks)
+    component = min(components[k] for k in S_graph_chunk)
     summaries = chunk_summaries(store)
-    inside = [c for c in chunks if c.component == component]
+    rows = sample_of([c for c in chunks if components[c.chunk_id] == component])
+    inside = [replace(c, component=component, S_world_chunk=S_graph_chunk[c.chunk_id]) for c in rows]
     planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in inside])
     unit = world_unit(inside, summaries)
+    if summaries.metre is not None:
+        unit *= float(inside[0].S_world_chunk.scale) / float(rows[0].S_world_chunk.scale)
     found = gravity_from_planes(planes, cameras_of(store, inside), unit, s)
     settled = _settled(found, store.get_value("gravity_estimate"), unit, s)
     if settled is found and found.status != "unknown":

@@ -83,7 +83,12 @@ class InstanceVerbs(EmbeddingVerbs):
     def drop_instance(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
         self.vectors_touched.append(int(instance_id))
-        for table, column in (("instances", "id"), ("instance_boxes", "id"), ("embeddings", "instance")):
+        for table, column in (
+            ("instances", "id"),
+            ("instance_boxes", "id"),
+            ("embeddings", "instance"),
+            ("anchors", "instance"),
+        ):
             self._database.execute(f"DELETE FROM {table} WHERE {column} = ?", (instance_id,))
         self._database.execute("DELETE FROM relations WHERE subject = ? OR object = ?", (instance_id, instance_id))
         if alias_of is not None:
@@ -225,6 +230,16 @@ class InstanceVerbs(EmbeddingVerbs):
             out[chunk_id] = (out[chunk_id] * 31 + 7919 * (local_id + 1) + (length or 0)) & 0xFFFFFFFF
         return out
 
+    def node_checksum(self, chunk_id: int) -> int:
+        """The same of one chunk; another one after a rollback, when its id may stand for another chunk."""
+        row = self._rows("SELECT crc FROM chunks WHERE chunk_id = ?", (int(chunk_id),))
+        moving = self._rows(
+            "SELECT local_id, length(motion) FROM local_instances WHERE dynamic AND chunk_id = ? ORDER BY local_id",
+            (int(chunk_id),),
+        )
+        count = self._rows("SELECT count(*) FROM local_instances WHERE chunk_id = ?", (int(chunk_id),))
+        return hash((self.rollbacks, row[0][0] if row else 0, count[0][0], *moving))
+
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a moving instance was: seconds of shape (V,) and places in the world of shape (V, 3), in order of time.
 
@@ -322,6 +337,29 @@ class InstanceVerbs(EmbeddingVerbs):
             "INSERT INTO merges (chunk_id, kind, a, b, scores, reason) VALUES (?, ?, ?, ?, ?, ?)",
             [(chunk_id, d.kind, d.a, d.b, to_json(d.scores), d.reason) for d in decisions],
         )
+
+    def has_decided(self, kind: str, a: str, b: str) -> bool:
+        """Whether the log holds a decision of this kind on these two."""
+        return bool(self._rows("SELECT 1 FROM merges WHERE a = ? AND b = ? AND kind = ? LIMIT 1", (a, b, kind)))
+
+    def has_moving(self) -> bool:
+        """Whether any local instance was seen moving."""
+        return bool(self._rows("SELECT 1 FROM local_instances WHERE dynamic LIMIT 1"))
+
+    def instance_count(self) -> tuple[int, int]:
+        """How many things and how many pieces of structure there are."""
+        total, things = self._rows("SELECT count(*), count(*) - count(structure) FROM instances")[0]
+        return int(things), int(total) - int(things)
+
+    def observed_as(self, keys: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
+        """The instances of these local instances (chunk id, local id) that belong to one."""
+        query = "SELECT instance FROM observations WHERE chunk_id = ? AND local_id = ?"
+        found = {key: self._rows(query, key) for key in keys}
+        return {key: int(rows[0][0]) for key, rows in found.items() if rows}
+
+    def forget_observations(self, keys: Iterable[tuple[int, int]]) -> None:
+        """Forget which instances these local instances belong to."""
+        self._database.executemany("DELETE FROM observations WHERE chunk_id = ? AND local_id = ?", list(keys))
 
     def decisions(self) -> list[MergeDecision]:
         """The merge log, oldest first."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,10 @@ class MergeSettings:
     """Share of the pairs across two clusters that may speak against joining them."""
     max_angle_deg: float = 10.0
     """Between the normals of two pieces of one plane."""
+    most_span_m: float = 20.0
+    """Along the longest edge of its box: a floor or wall that goes on beyond is continued by another one. So no thing
+    grows with the memory: its points stay dense, its box says where it is, and a new chunk touches only what is near.
+    """
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,17 @@ class PairScores:
 class _Edge:
     a: int
     b: int
+    score: float
+    kind: str
+    scores: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A pair of local instances that argue for being one thing."""
+
+    a: Key
+    b: Key
     score: float
     kind: str
     scores: dict[str, float]
@@ -114,7 +130,7 @@ def merge_nodes(
     """
     s = settings or MergeSettings()
     chunks = sorted(chunks, key=lambda c: c.chunk_id)
-    table = _Table.of(chunks, S_world_chunk)
+    table = Nodes.of(chunks, S_world_chunk)
     known = pairs if pairs is not None else score_all(chunks, S_world_chunk)
     edges: list[_Edge] = []
     overlap: dict[tuple[int, int], float] = {}
@@ -124,6 +140,41 @@ def merge_nodes(
     edges.sort(key=lambda e: (-e.score, e.a, e.b))
     enemies = _enemies(table, cannot_link)
     return _join(table, edges, overlap, enemies, s, None if word is None or not word else word.growing())
+
+
+def local_edges(
+    u: Nodes, v: Nodes, scores: PairScores, settings: MergeSettings
+) -> tuple[list[Edge], dict[tuple[Key, Key], float]]:
+    """The pairs of two chunks that argue for being one thing, and how far each pair overlaps, both ways."""
+    inside = u.keys == v.keys
+    table = u if inside else Nodes.join([u, v])
+    overlap: dict[tuple[int, int], float] = {}
+    edges = _edges(table, 0, 0 if inside else len(u.keys), scores, overlap, settings)
+    k = table.keys
+    return (
+        [Edge(k[e.a], k[e.b], e.score, e.kind, e.scores) for e in edges],
+        {(k[a], k[b]): share for (a, b), share in overlap.items()},
+    )
+
+
+def form_groups(
+    nodes: Nodes,
+    edges: Sequence[Edge],
+    overlap: Mapping[tuple[Key, Key], float],
+    cannot_link: Sequence[tuple[Key, Key]],
+    settings: MergeSettings,
+    word: Constraints | None = None,
+) -> tuple[list[list[Key]], list[MergeDecision]]:
+    """The same as `merge_nodes`, of these local instances alone, from edges that are known."""
+    at = {key: n for n, key in enumerate(nodes.keys)}
+    found = [_Edge(min(at[e.a], at[e.b]), max(at[e.a], at[e.b]), e.score, e.kind, e.scores) for e in edges]
+    found.sort(key=lambda e: (-e.score, e.a, e.b))
+    known: dict[tuple[int, int], float] = {}
+    for (a, b), share in overlap.items():
+        if a in at and b in at:
+            known[at[a], at[b]] = share
+    growing = None if word is None or not word else word.growing()
+    return _join(nodes, found, known, _enemies(nodes, cannot_link), settings, growing)
 
 
 def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> dict[tuple[int, int], PairScores]:
@@ -140,8 +191,8 @@ def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) 
 
 
 @dataclass(frozen=True)
-class _Table:
-    """All nodes of all chunks in one numbering, world coordinates."""
+class Nodes:
+    """Local instances in one numbering, world coordinates: what merging asks about them."""
 
     keys: list[Key]
     start: dict[int, int]
@@ -154,12 +205,18 @@ class _Table:
     tolerance: Array
     unit: Array
     lab: Array
+    low: Array
+    high: Array
+    """Corners of the boxes of their points, world. Shape (N, 3) each."""
 
     @staticmethod
-    def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> _Table:
+    def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> Nodes:
         keys: list[Key] = []
-        start, center, size, plane, tolerance, unit = {}, [], [], [], [], []
+        start, center, size, plane, tolerance, unit, low, high = {}, [], [], [], [], [], [], []
         for c in chunks:
+            lower, upper = c.spans(S_world_chunk[c.chunk_id])
+            low.append(lower)
+            high.append(upper)
             placed = S_world_chunk[c.chunk_id]
             start[c.chunk_id] = len(keys)
             keys += [(c.chunk_id, int(n)) for n in c.local_id]
@@ -170,7 +227,7 @@ class _Table:
             tolerance.append(np.full(len(c.local_id), 2.0 * c.grain * float(placed.scale)))
             unit.append(np.full(len(c.local_id), c.unit * float(placed.scale)))
         features = [c.feature for c in chunks if len(c.local_id)]
-        return _Table(
+        return Nodes(
             keys,
             start,
             np.concatenate(center) if center else np.zeros((0, 3)),
@@ -182,7 +239,28 @@ class _Table:
             np.concatenate(tolerance) if tolerance else np.zeros(0),
             np.concatenate(unit) if unit else np.zeros(0),
             np.concatenate([c.lab for c in chunks]) if chunks else np.zeros((0, 3)),
+            np.concatenate(low) if low else np.zeros((0, 3)),
+            np.concatenate(high) if high else np.zeros((0, 3)),
         )
+
+    @staticmethod
+    def join(parts: Sequence[Nodes]) -> Nodes:
+        """Those of several chunks, in the order of the chunks."""
+        start: dict[int, int] = {}
+        count = 0
+        for p in parts:
+            start |= {chunk: count + at for chunk, at in p.start.items()}
+            count += len(p.keys)
+        features = [p.feature for p in parts if len(p.keys)]
+        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
+        feature = np.concatenate(features) if features else np.zeros((0, 1), np.float32)
+        return Nodes(keys=[k for p in parts for k in p.keys], start=start, feature=feature, **joined)
+
+    def only(self, keys: Collection[Key]) -> Nodes:
+        """Some of them."""
+        at = np.array([n for n, k in enumerate(self.keys) if k in keys], np.int64)
+        chosen: dict[str, Any] = {name: getattr(self, name)[at] for name in (*_COLUMNS, "feature")}
+        return Nodes(keys=[self.keys[n] for n in at], start={}, **chosen)
 
     def coplanar(self, a: Ints, b: Ints, angle_deg: float) -> NDArray[np.bool_]:
         """Whether pairs of flat nodes lie in one plane; false where one is not flat."""
@@ -193,8 +271,11 @@ class _Table:
         return np.asarray((cosine > np.cos(np.radians(angle_deg))) & near)
 
 
+_COLUMNS = ("center", "size", "plane", "truncated", "structure", "tolerance", "unit", "lab", "low", "high")
+
+
 def _edges(
-    t: _Table, start_u: int, start_v: int, p: PairScores, overlap: dict[tuple[int, int], float], s: MergeSettings
+    t: Nodes, start_u: int, start_v: int, p: PairScores, overlap: dict[tuple[int, int], float], s: MergeSettings
 ) -> list[_Edge]:
     """The pairs that argue for being one thing. Also notes how far each pair overlaps, both ways, in `overlap`."""
     a, b = p.i + start_u, p.j + start_v
@@ -263,7 +344,7 @@ def box_iou(a: Array, b: Array) -> Array:
 # ---------------------------------------------------------------------------------------------- the decision
 
 
-def _enemies(t: _Table, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]]:
+def _enemies(t: Nodes, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]]:
     at = {key: n for n, key in enumerate(t.keys)}
     out: list[set[int]] = [set() for _ in t.keys]
     for a, b in cannot_link:
@@ -274,7 +355,7 @@ def _enemies(t: _Table, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]
 
 
 def _join(
-    t: _Table,
+    t: Nodes,
     edges: Sequence[_Edge],
     overlap: dict[tuple[int, int], float],
     enemies: list[set[int]],
@@ -283,6 +364,7 @@ def _join(
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     group = list(range(len(t.keys)))
     members = {n: [n] for n in group}
+    low, high = t.low.copy(), t.high.copy()
     foes = {n: set(enemies[n]) for n in group}
     decisions: list[MergeDecision] = []
     refused: set[tuple[int, int]] = set()
@@ -291,6 +373,9 @@ def _join(
         if a == b or (a, b) in refused:
             continue
         against = word.objection(t.keys[a], t.keys[b]) if word is not None else ""
+        span = float((np.maximum(high[a], high[b]) - np.minimum(low[a], low[b])).max())
+        if not against and span > s.most_span_m * max(t.unit[a], t.unit[b]):
+            against = f"together they would reach over {span:.0f} m"
         against = against or _objection(t, members[a], members[b], foes[a], overlap, s)
         name_a, name_b = _name(t.keys[e.a]), _name(t.keys[e.b])
         if against:
@@ -301,6 +386,7 @@ def _join(
         if word is not None:
             word.join(t.keys[a], t.keys[b])
         members[a] = sorted(members[a] + members.pop(b))
+        low[a], high[a] = np.minimum(low[a], low[b]), np.maximum(high[a], high[b])
         foes[a] |= foes.pop(b)
         for n in members[a]:
             group[n] = a
@@ -317,7 +403,7 @@ _REASONS = {
 
 
 def _objection(
-    t: _Table,
+    t: Nodes,
     a: list[int],
     b: list[int],
     foes_of_a: set[int],

@@ -4,15 +4,19 @@ is derived from a chunk need not be derived again for a millimetre.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.library_verbs import SettledRow
 from list3r.memory.records import ChunkRow
 from list3r.memory.store import Store
 from list3r.memory.summaries import ChunkSummary
+
+_FAR_M = 0.5
+"""Chunks whose points lie further apart than this share no thing."""
 
 
 @dataclass(frozen=True)
@@ -36,31 +40,40 @@ class Settled:
     """The same poses in the frame of the graph, which do not change when the world is turned upright."""
     S_exact_settled: dict[int, Sim3]
     """In the world: from where a chunk is settled to where it lies."""
+    moved: frozenset[int]
+    """Ids of the chunks that were not settled here before."""
 
 
-def settle(store: Store, summaries: Mapping[int, ChunkSummary], settings: SettlingSettings | None = None) -> Settled:
-    """The settled poses of all chunks: the one kept in the store unless the chunk has moved on, then its own.
+def settle(
+    store: Store,
+    summaries: Mapping[int, ChunkSummary],
+    settings: SettlingSettings | None = None,
+    among: Iterable[int] | None = None,
+) -> Settled:
+    """The settled poses of all chunks, or of those `among` them: the one kept in the store unless the chunk has moved
+    on or belongs to another component, then its own.
 
-    Writes to the key-value table (`settled_poses`), so that a build that goes on takes up the same poses.
+    Writes to the table `settled`, so that a build that goes on takes up the same poses.
     """
     s = settings or SettlingSettings()
-    chunks = store.chunks()
+    chunks = store.chunks() if among is None else [store.chunk(k) for k in sorted(among)]
     T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
-    before = store.get_value("settled_poses", {})
-    kept: dict[str, list[list[float]]] = {}
+    T_graph_world = T_world_graph.inverse()
+    before = store.settled()
+    fresh: dict[int, SettledRow] = {}
+    graph: dict[int, Sim3] = {}
     for c in chunks:
-        S_graph_chunk = T_world_graph.inverse() @ c.S_world_chunk
-        name = str(c.chunk_id)
-        unit = summaries[c.chunk_id].unit * float(c.S_world_chunk.scale)
-        if name in before and _near(Sim3.from_matrix(before[name]), S_graph_chunk, unit, s):
-            kept[name] = before[name]
-        else:
-            kept[name] = S_graph_chunk.as_matrix().tolist()
-    if kept != before:
-        store.set_value("settled_poses", kept)
-    graph = {c.chunk_id: Sim3.from_matrix(kept[str(c.chunk_id)]) for c in chunks}
+        S_graph_chunk, row = T_graph_world @ c.S_world_chunk, before.get(c.chunk_id)
+        graph[c.chunk_id] = S_graph_chunk if row is None else row.S_graph_chunk
+        unit = float(S_graph_chunk.scale) * (1.0 if c.scale_kind == "metric" else summaries[c.chunk_id].unit)
+        if row is None or row.component != c.component or not _near(row.S_graph_chunk, S_graph_chunk, unit, s):
+            graph[c.chunk_id] = S_graph_chunk
+            extent = _extent(summaries[c.chunk_id], S_graph_chunk, 0.5 * _FAR_M * unit)
+            fresh[c.chunk_id] = SettledRow(c.component, S_graph_chunk, extent)
+    if fresh:
+        store.put_settled(fresh)
     moved = [replace(c, S_world_chunk=T_world_graph @ graph[c.chunk_id]) for c in chunks]
-    return Settled(moved, graph, _corrections(chunks, moved))
+    return Settled(moved, graph, _corrections(chunks, moved), frozenset(fresh))
 
 
 def _corrections(exact: Sequence[ChunkRow], settled: Sequence[ChunkRow]) -> dict[int, Sim3]:
@@ -72,3 +85,21 @@ def _near(a: Sim3, b: Sim3, unit: float, s: SettlingSettings) -> bool:
     moved = float(np.linalg.norm(a.translation - b.translation))
     grown = abs(float(a.scale) / float(b.scale) - 1.0)
     return bool(moved <= s.move_m * unit and np.degrees(turn) <= s.turn_deg and grown <= s.scale)
+
+
+def _extent(summary: ChunkSummary, S_graph_chunk: Sim3, slack: float) -> Array:
+    """Axis-aligned box of a chunk's points in the graph's frame, grown. Shape (2, 3)."""
+    if len(summary.shapes.points) == 0:
+        return np.array([[np.inf] * 3, [-np.inf] * 3])
+    p = S_graph_chunk.apply(summary.shapes.points)
+    return np.stack([p.min(axis=0) - slack, p.max(axis=0) + slack])
+
+
+def neighbours(rows: Mapping[int, SettledRow], chunk_id: int) -> list[int]:
+    """Ids of the chunks of one component that lie near a chunk, itself among them, in order."""
+    ids = np.fromiter(rows, np.int64, len(rows))
+    extents = np.array([r.extent for r in rows.values()])
+    here = rows[chunk_id]
+    meet = np.all((extents[:, 0] <= here.extent[1]) & (extents[:, 1] >= here.extent[0]), axis=1)
+    found = [int(k) for k in ids[meet] if rows[int(k)].component == here.component]
+    return sorted({chunk_id, *found})

@@ -8,8 +8,10 @@ what is small or densely sampled, coarser (by powers of two) where the support p
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,10 +70,10 @@ class ChunkShapes:
     """Their colours. Shape (R, 3)."""
     owner: Ints
     """Instance (0 to N - 1) of each point, ascending. Shape (R,)."""
-    cells: Ints
-    """Keys of the grown cells, ascending. Shape (C,)."""
-    cell_owner: Ints
-    """Instance of each grown cell. Shape (C,)."""
+    occupied: Ints
+    """Keys of the occupied cells, by instance. Shape (C,)."""
+    occupied_owner: NDArray[np.int32]
+    """Instance of each occupied cell, ascending. Shape (C,)."""
     level: Ints
     """Grid of each instance. Shape (N,)."""
     grain: float
@@ -107,6 +109,19 @@ class ChunkShapes:
     visible_fraction: tuple[NDArray[np.float32], ...]
     """Shape (V,) each."""
 
+    def spans(self, S_world_chunk: Sim3) -> tuple[Array, Array]:
+        """Corners of the boxes of the instances' points, world; the origin of the chunk for those without any.
+        Shape (N, 3) each.
+        """
+        low = np.tile(S_world_chunk.translation, (len(self.local_id), 1)).astype(np.float64)
+        high = low.copy()
+        if len(self.points):
+            p = S_world_chunk.apply(self.points)
+            first = np.flatnonzero(np.diff(self.owner, prepend=-1))
+            low[self.owner[first]] = np.minimum.reduceat(p, first)
+            high[self.owner[first]] = np.maximum.reduceat(p, first)
+        return low, high
+
 
 def chunk_shapes(
     nodes: Sequence[LocalNode],
@@ -124,7 +139,7 @@ def chunk_shapes(
     s = settings or ShapeSettings()
     nodes = sorted(nodes, key=lambda n: n.local_id)
     grain = 0.5 * s.tolerance_m * unit
-    points, rgb, owner, cells, cell_owner = [], [], [], [], []
+    points, rgb, owner, cells = [], [], [], []
     seen = seen_xyxy([n.boxes_xyxy for n in nodes], image_size, s.blind)
     level = np.zeros(len(nodes), np.int64)
     count = np.zeros(len(nodes), np.int64)
@@ -137,15 +152,11 @@ def chunk_shapes(
         center[n], size[n] = (low + high) / 2, float(np.linalg.norm(high - low))
         level[n], occupied, first = _own_grid(p, grain, s.crowd, at_least=2 if node.structure else 0)
         count[n] = len(occupied)
-        grown = np.unique((_key(occupied, int(level[n]))[:, None] + _REACH).ravel())
-        cells.append(grown)
-        cell_owner.append(np.full(len(grown), n))
+        cells.append(_key(occupied, int(level[n])))
         chosen = first[:: max(1, -(-len(first) // s.max_points))]
         points.append(p[chosen])
         rgb.append(node.support.rgb[chosen])
         owner.append(np.full(len(chosen), n))
-    keys, owners = _stack(cells, np.int64), _stack(cell_owner, np.int64)
-    order = np.argsort(keys, kind="stable")
     return ChunkShapes(
         chunk_id=chunk_id,
         session_id=session_id,
@@ -153,8 +164,8 @@ def chunk_shapes(
         points=np.concatenate(points) if points else np.zeros((0, 3)),
         rgb=np.concatenate(rgb) if rgb else np.zeros((0, 3), np.uint8),
         owner=_stack(owner, np.int64),
-        cells=keys[order],
-        cell_owner=owners[order],
+        occupied=_stack(cells, np.int64),
+        occupied_owner=np.repeat(np.flatnonzero(count), [len(c) for c in cells]).astype(np.int32),
         level=level,
         grain=grain,
         unit=unit,
@@ -183,23 +194,45 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) ->
     On means within the tolerance of the target's support and, where the target is flat, of its plane.
     """
     shape = (len(source.local_id), len(target.local_id))
-    if len(source.points) == 0 or len(target.cells) == 0:
+    if len(source.points) == 0 or len(target.occupied) == 0:
         return np.zeros(shape)
+    cells, cell_owner = _grown(target)
     p = S_target_source.apply(source.points)
     hits = np.zeros(shape[0] * shape[1])
     for level in np.unique(target.level):
         keys = _key(np.floor(p / (target.grain * 2.0**level)).astype(np.int64), int(level))
-        start, stop = np.searchsorted(target.cells, keys, "left"), np.searchsorted(target.cells, keys, "right")
+        start, stop = np.searchsorted(cells, keys, "left"), np.searchsorted(cells, keys, "right")
         times = stop - start
         which = np.repeat(np.arange(len(p)), times)
         offset = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
-        at = target.cell_owner[np.repeat(start, times) + offset]
+        at = cell_owner[np.repeat(start, times) + offset]
         plane = target.plane[at]
         off = np.abs(np.einsum("ij,ij->i", p[which], plane[:, :3]) + plane[:, 3])
         on = ~(off > 2.0 * target.grain)
         hits += np.bincount(source.owner[which[on]] * shape[1] + at[on], minlength=len(hits))
     total = np.bincount(source.owner, minlength=shape[0])
     return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
+
+
+_KEPT = 16
+_known: OrderedDict[int, tuple[ChunkShapes, Ints, NDArray[np.int32]]] = OrderedDict()
+"""The grown cells of the chunks compared last: they take more memory than all else that is kept of a chunk."""
+
+
+def _grown(shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
+    """Keys of the cells within the tolerance of each instance, ascending, and their instances. Shape (G,) each."""
+    found = _known.get(id(shapes))
+    if found is None or found[0] is not shapes:
+        start = np.searchsorted(shapes.occupied_owner, np.arange(len(shapes.local_id) + 1))
+        parts = [np.unique((shapes.occupied[i:j, None] + _REACH).ravel()) for i, j in pairwise(start)]
+        keys = _stack(parts, np.int64)
+        owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+        order = np.argsort(keys, kind="stable")
+        found = _known[id(shapes)] = (shapes, keys[order], owner[order])
+    _known.move_to_end(id(shapes))
+    while len(_known) > _KEPT:
+        _known.popitem(last=False)
+    return found[1], found[2]
 
 
 def _own_grid(points: Array, grain: float, crowd: float, at_least: int) -> tuple[int, Ints, Ints]:

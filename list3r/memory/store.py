@@ -9,6 +9,7 @@ import numpy as np
 
 from list3r.memory.edit_verbs import EditVerbs
 from list3r.memory.event_verbs import EventVerbs
+from list3r.memory.library_verbs import LibraryVerbs
 from list3r.memory.read_checks import BOXES, FAILURES, WORDS, any_text, damage_of
 from list3r.memory.sums import summed_tables
 
@@ -22,7 +23,7 @@ _REFERENCES = (
 )
 
 
-class Store(EditVerbs, EventVerbs):
+class Store(EditVerbs, EventVerbs, LibraryVerbs):
     """Verbs of the memory file. `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew."""
 
     def verify(self) -> list[str]:

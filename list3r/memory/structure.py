@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,27 +31,41 @@ class StructureSettings:
     behind: float = 0.1
     """Share of the points before and behind a bounding surface that may lie just behind it."""
     under_ceiling: float = 0.02
-    """Share of all points that may lie above the ceiling."""
+    """Share of the points near a ceiling that may lie above it."""
+    near_m: float = 3.0
+    """What lies further from a surface has no say."""
 
 
 def classify_structure(
     bodies: Sequence[Body],
     floor_height: float | None,
-    cameras: Array,
+    eye_level: Callable[[Body], float],
     unit: float,
     settings: StructureSettings | None = None,
+    around: Sequence[Body] | None = None,
 ) -> list[str | None]:
     """floor, ceiling, wall, plane or None for each body; z must be up.
 
-    `floor_height` is the z of the floor, None where it was not seen; `cameras` are camera centres (F, 3); `unit` is
-    what a metre is in world units. A floor is level and lies at the floor; a ceiling is level, above the cameras, and
-    faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. A smaller surface that the
-    chunks flagged and that has nothing behind it is `plane`. A table top or a cabinet front stands in the room and is
-    none of these.
+    `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
+    saw a body (90 % of them are below); `unit` is what a metre is in world units. A floor is level and lies at the
+    floor; a ceiling is level, above the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing
+    lies behind it. A smaller surface that the chunks flagged and that has nothing behind it is `plane`. A table top or
+    a cabinet front stands in the room and is none of these. What lies near a body decides, so `around` may be all
+    bodies (the default: those given) or those within `near_m`.
     """
     s = settings or StructureSettings()
-    cloud = np.concatenate([b.points[:: max(1, len(b.points) // 100)] for b in bodies]) if bodies else np.zeros((0, 3))
-    return [_classify(b, floor_height, cameras, cloud, unit, s) for b in bodies]
+    known = bodies if around is None else around
+    cloud = [b.points[:: max(1, len(b.points) // 100)] for b in known]
+    box = np.array([b.aabb for b in known]).reshape(-1, 2, 3)
+    out: list[str | None] = []
+    for b in bodies:
+        if b.normal is None:
+            out.append(None)
+            continue
+        gap = np.maximum(box[:, 0] - b.aabb[1], b.aabb[0] - box[:, 1]).max(axis=1)
+        near = np.concatenate([cloud[n] for n in np.flatnonzero(gap <= s.near_m * unit)])
+        out.append(_classify(b, floor_height, eye_level, near, unit, s))
+    return out
 
 
 def flagged_only(bodies: Sequence[Body]) -> list[str | None]:
@@ -60,7 +74,12 @@ def flagged_only(bodies: Sequence[Body]) -> list[str | None]:
 
 
 def _classify(
-    body: Body, floor_height: float | None, cameras: Array, cloud: Array, unit: float, s: StructureSettings
+    body: Body,
+    floor_height: float | None,
+    eye_level: Callable[[Body], float],
+    cloud: Array,
+    unit: float,
+    s: StructureSettings,
 ) -> str | None:
     if body.normal is None:
         return None
@@ -73,8 +92,8 @@ def _classify(
     if abs(body.normal[2]) > np.cos(np.radians(s.level_deg)):
         if floor_height is not None and abs(height - floor_height) < s.floor_band_m * unit:
             return "floor"
-        above = len(cameras) and height > float(np.quantile(cameras[:, 2], 0.9)) + 0.2 * unit
-        if body.normal[2] < 0 and above and (cloud[:, 2] > height + 0.1 * unit).mean() < s.under_ceiling:
+        above = body.normal[2] < 0 and height > eye_level(body) + 0.2 * unit
+        if above and (cloud[:, 2] > height + 0.1 * unit).mean() < s.under_ceiling:
             return "ceiling"
         return None
     if not _bounds(body, cloud, unit, s):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -40,19 +41,63 @@ class ChunkSummary:
     """The local instances that move, by local id, and where they were; what bounds a room never does."""
 
 
-_cache: WeakKeyDictionary[Store, dict[int, tuple[int, ChunkSummary]]] = WeakKeyDictionary()
+_KEPT = 64
+"""Summaries that are kept; more are derived again when they are asked for, so that memory does not grow with chunks."""
+_SAMPLED = 64
+"""Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
+_cache: WeakKeyDictionary[Store, OrderedDict[int, tuple[int, ChunkSummary]]] = WeakKeyDictionary()
 
 
-def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> dict[int, ChunkSummary]:
-    """The summaries of all chunks by id. They depend on what the chunks measured, not on where they are placed."""
-    checks = store.node_checksums()
-    known = _cache.setdefault(store, {})
-    for chunk_id in [k for k, (crc, _) in known.items() if checks.get(k) != crc]:
-        del known[chunk_id]
-    for chunk in store.chunks():
-        if chunk.chunk_id not in known:
-            known[chunk.chunk_id] = (checks[chunk.chunk_id], _summary(store, chunk, settings))
-    return {k: summary for k, (_, summary) in sorted(known.items())}
+class Summaries(Mapping[int, ChunkSummary]):
+    """The summaries of chunks by id, derived when first asked for.
+
+    They depend on what the chunks measured, not on where they are placed.
+    """
+
+    def __init__(self, store: Store, settings: ShapeSettings | None = None) -> None:
+        self._store = store
+        self._settings = settings
+        self._ids = [c.chunk_id for c in store.chunks()]
+        self._known = _cache.setdefault(store, OrderedDict())
+        self._checked: dict[int, int] = {}
+
+    def __getitem__(self, chunk_id: int) -> ChunkSummary:
+        if chunk_id not in self._checked:
+            self._checked[chunk_id] = self._store.node_checksum(chunk_id)
+        found = self._known.get(chunk_id)
+        if found is None or found[0] != self._checked[chunk_id]:
+            summary = _summary(self._store, self._store.chunk(chunk_id), self._settings)
+            found = self._known[chunk_id] = (self._checked[chunk_id], summary)
+        self._known.move_to_end(chunk_id)
+        while len(self._known) > _KEPT:
+            self._known.popitem(last=False)
+        return found[1]
+
+    @property
+    def metre(self) -> float | None:
+        """What a metre is where the chunks lie now, of a memory whose scale was anchored; None where nobody knows."""
+        metres = self._store.get_value("metres_per_graph_unit")
+        if metres is None:
+            return None
+        scale = Sim3.from_matrix(self._store.get_value("T_world_graph", np.eye(4).tolist())).scale
+        return float(scale) / float(metres)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._ids)
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+
+def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> Summaries:
+    """The summaries of all chunks by id."""
+    return Summaries(store, settings)
+
+
+def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:
+    """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is told by them."""
+    step = max(1, -(-len(chunks) // _SAMPLED))
+    return list(chunks[::step])
 
 
 def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> ChunkSummary:
@@ -75,23 +120,25 @@ def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
 
 
 def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> float:
-    """What a metre is about in world units: 1 for a metric memory, else told by the distances of things."""
+    """What a metre is in world units: 1 for a metric memory, what an anchor says, or what the distances tell."""
     known = getattr(summaries, "metre", None)
     if known is not None:
         return float(known)
-    units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in chunks]
+    if all(c.scale_kind == "metric" and float(c.S_world_chunk.scale) == 1.0 for c in chunks):
+        return 1.0
+    units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in sample_of(chunks)]
     return float(np.median(units)) if units else 1.0
 
 
-def light_of(summaries: Mapping[int, ChunkSummary]) -> Reference:
-    """The light of a memory, from the colours of all its chunks."""
-    return scene_reference(np.concatenate([s.lab for s in summaries.values()] or [np.zeros((0, 3))]))
+def light_of(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> Reference:
+    """The light of a memory, from the colours of its chunks."""
+    return scene_reference(np.concatenate([summaries[c.chunk_id].lab for c in sample_of(chunks)] or [np.zeros((0, 3))]))
 
 
 def cameras_of(store: Store, chunks: Sequence[ChunkRow]) -> Sim3:
     """Poses `S_world_cam` of all posed frames of these chunks, batched over frames."""
     placed = {c.chunk_id: c.S_world_chunk for c in chunks}
-    frames = [f for f in store.frames() if f.state == "posed" and f.chunk_id in placed]
+    frames = [f for c in chunks for f in store.frames_of(c) if f.state == "posed"]
     if not frames:
         return Sim3(np.ones(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     T_chunk_cam: Array = np.array([f.T_chunk_cam for f in frames])
