@@ -6,7 +6,9 @@ before; a build or an update goes on with --resume and must come to the scene of
 
 from __future__ import annotations
 
+import os
 import random
+import resource
 import shutil
 import subprocess
 import sys
@@ -15,6 +17,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from machine import descendants
 
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.connection import remove_memory
@@ -100,27 +104,28 @@ def _kill_runs(
     rng: random.Random,
 ) -> Result:
     begin(whole)
-    started = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(alone, check=True, capture_output=True)
-    length = time.monotonic() - started
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    length = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     with Store.open(whole) as store:
         wanted = scene_dict(store)
     begin(memory)
+    first = chunks_in(memory)
     counts: Counter[str] = Counter()
     problems: list[str] = []
     while True:
         least = chunks_in(memory)
         process = subprocess.Popen(resumed, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        try:
-            _, text = process.communicate(timeout=None if counts["kills"] >= kills else rng.uniform(0.2, 1.0) * length)
-        except subprocess.TimeoutExpired:
+        if counts["kills"] < kills and _runs_for(process, rng.uniform(0.1, 1.0) * length):
             before = chunks_in(memory)
             process.kill()
             process.communicate()
             counts["kills"] += 1
-            counts["with chunks committed"] += before > least
+            counts["with chunks committed"] += before > first
             problems += judge(memory, max(least, before))
             continue
+        text = process.communicate()[1]
         counts["completed"] += 1
         problems += judge(memory, least)
         if process.returncode != 0:
@@ -133,6 +138,26 @@ def _kill_runs(
             return {"kills": kills, **counts, "problems": problems}
         remove_memory(memory)
         begin(memory)
+
+
+def _runs_for(process: subprocess.Popen[str], cpu_s: float) -> bool:
+    """Wait until a process and its children have used so much of a processor; False when it ends before.
+
+    Not by the clock, so that the moment of a kill does not depend on what else the machine does.
+    """
+    while process.poll() is None:
+        if sum(map(_cpu_s, [process.pid, *descendants(process.pid)])) >= cpu_s:
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def _cpu_s(pid: int) -> float:
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:  # it has ended meanwhile
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 # ------------------------------------------------------------------------------------------- single transactions
@@ -270,13 +295,11 @@ def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
             before = scene_dict(store)
             ids = [i.id for i in store.instances(structure=False)]
         command = _edit_command(memory, ids, known, rng)
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        try:
-            process.communicate(timeout=rng.uniform(0.4, 1.3))
-        except subprocess.TimeoutExpired:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        if _runs_for(process, rng.uniform(0.4, 1.1)):
             process.kill()
-            process.communicate()
             counts["kills"] += 1
+        process.communicate()
         problems += judge(memory, 0)
         with Store.open(memory) as store:
             fresh = {e.entry for e in store.edits()} - known

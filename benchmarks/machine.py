@@ -42,19 +42,20 @@ def _watch(process: subprocess.Popen[str]) -> float:
     """Peak of the summed set sizes of a process and its descendants, bytes, looked at ten times a second."""
     peak = 0.0
     while process.poll() is None:
-        peak = max(peak, sum(_resident(pid) for pid in [process.pid, *_descendants(process.pid)]))
+        peak = max(peak, sum(_resident(pid) for pid in [process.pid, *descendants(process.pid)]))
         time.sleep(0.1)
     return peak
 
 
-def _descendants(pid: int) -> list[int]:
+def descendants(pid: int) -> list[int]:
+    """Processes that a process has started, and theirs."""
     found: list[int] = []
     try:
         texts = [(task / "children").read_text() for task in Path(f"/proc/{pid}/task").iterdir()]
     except OSError:  # it has ended meanwhile
         return found
     for child in (int(word) for text in texts for word in text.split()):
-        found += [child, *_descendants(child)]
+        found += [child, *descendants(child)]
     return found
 
 

@@ -298,8 +298,8 @@ def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Any]]
 
     seed, runs = words.seed, 3 * words.kills // 10
     edits, writes = (words.kills - 2 * runs) // 4, (words.kills - 2 * runs) // 4
-    first = write_walk(folder / "first", WalkSettings(seed=3, frames=44, size=(160, 120)), workers=1)
-    second = WalkSettings(seed=3, walk_seed=4, start=6, frames=30, size=(160, 120))
+    first = write_walk(folder / "first", WalkSettings(seed=3, frames=36, size=(128, 96)), workers=1)
+    second = WalkSettings(seed=3, walk_seed=4, start=6, frames=24, size=(128, 96))
     yield "kills while building", kill_builds(first, folder, runs, seed)
     memory = folder / "whole.l3r"
     again = write_walk(folder / "second", second, workers=1)
