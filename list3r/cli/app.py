@@ -20,6 +20,7 @@ from list3r.cli import (
     evaluation_commands,
     file_commands,
     memory_commands,
+    model_commands,
     query_commands,
     scale_commands,
     update_commands,
@@ -45,6 +46,7 @@ for module in (
     evaluation_commands,
     update_commands,
     scale_commands,
+    model_commands,
 ):
     module.register(app)
 

@@ -185,7 +185,7 @@ def _recorded(memory: Path) -> ChunkSettings | None:
 
 
 def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> ChunkSettings:
-    """How the video is cut: as asked, else as the files of a precomputed folder, else as the memory of the GPU allows."""
+    """How the video is cut: as asked, else as precomputed files were, else as the memory of the GPU allows."""
     from list3r.frames.chunks import ChunkSettings
     from list3r.models.cards import find_card
 

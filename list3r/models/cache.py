@@ -24,7 +24,7 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 _MAX_HEADER = 100 * 2**20
 
 NO_NETWORK = (
-    "the hub cannot be reached, and the cache has no copy; run `list3r models fetch NAME` where there is a network, "
+    "the hub cannot be reached, and the cache has no copy; run `list3r models fetch {name}` where there is a network, "
     "or give --weights DIR"
 )
 
@@ -130,7 +130,7 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
             raise
         why = NO_NETWORK
     if why:
-        raise OptionError(f"{name}@{wanted} cannot be fetched: {why}")
+        raise OptionError(f"{name}@{wanted} cannot be fetched: {why.format(name=name)}")
     cached = find_cached(name, wanted) or find_cached(name, folder.name)
     if cached is None:
         raise OptionError(f"{name}@{wanted} has no weights in a form that is read here ({', '.join(SINGLE_FILES)})")
