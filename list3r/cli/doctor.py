@@ -10,6 +10,11 @@ import sqlite3
 import tempfile
 from importlib import metadata
 
+from list3r.models.cache import cache_folder, find_cached
+from list3r.models.cards import CARDS, ModelCard
+from list3r.models.device import find_gpu
+from list3r.models.presets import missing_package
+
 _PACKAGES = (
     ("numpy", "everything"),
     ("scipy", "everything"),
@@ -21,10 +26,29 @@ _PACKAGES = (
     ("usd-core", "export --to usd"),
     ("trimesh", "export --to glb"),
     ("typer", "the command line"),
-    ("torch", "neural models (later versions)"),
+    ("torch", "dense depth of RGB video, networks"),
+    ("pycolmap", "RGB video without networks (sfm)"),
+    ("transformers", "discovery, tracking, features and free words by networks"),
+    ("huggingface_hub", "fetching weights"),
+    ("safetensors", "reading weights"),
+    ("ncnn", "labels by a box detector"),
+    ("onnxruntime", "learned local features (xfeat)"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
-_OPTIONAL = {"torch", "open3d-cpu|open3d"}
+_OPTIONAL = {
+    "torch",
+    "pycolmap",
+    "transformers",
+    "huggingface_hub",
+    "safetensors",
+    "ncnn",
+    "onnxruntime",
+    "open3d-cpu|open3d",
+}
+_LIBRARIES = (
+    ("GL", "Open3D only (apt-get install libgl1 libegl1)"),
+    ("gomp", "threads of torch and faiss, where their packages bring none (apt-get install libgomp1)"),
+)
 
 
 def findings() -> list[tuple[str, str, str]]:
@@ -37,9 +61,45 @@ def findings() -> list[tuple[str, str, str]]:
     ]
     rows += [_package(name, use) for name, use in _PACKAGES]
     rows.append(_sqlite())
-    library = ctypes.util.find_library("GL")
-    rows.append(("libGL", "found" if library else "absent", "Open3D only (apt-get install libgl1 libegl1 libgomp1)"))
-    return rows
+    rows += [(f"lib{name}", "found" if ctypes.util.find_library(name) else "absent", use) for name, use in _LIBRARIES]
+    rows += [_gpu(), _weights_cache()]
+    return rows + [_model(card) for card in CARDS]
+
+
+def _gpu() -> tuple[str, str, str]:
+    use = "networks at the speed of video"
+    try:
+        gpu = find_gpu()
+    except ImportError:
+        return "GPU", "unknown, torch is absent", use
+    except RuntimeError as error:
+        return "GPU", f"cannot be used: {str(error).splitlines()[0][:80]}", use
+    if gpu is None:
+        return "GPU", "none", use
+    return "GPU", f"{gpu.name}, {gpu.free_mb / 1024:.1f} of {gpu.total_mb / 1024:.1f} GB free", use
+
+
+def _weights_cache() -> tuple[str, str, str]:
+    folder = cache_folder()
+    if not folder.is_dir():
+        return "weights", f"none; {folder} is not there", "networks"
+    size = sum(p.stat().st_size for p in folder.glob("models--*/blobs/*"))
+    return "weights", f"{size / 1e9:.2f} GB in {folder}", "networks"
+
+
+def _model(card: ModelCard) -> tuple[str, str, str]:
+    """A model: whether its package and which of its weights are here, and its licences."""
+    missing = missing_package(card)
+    held = [c for w in card.weights if (c := find_cached(w.repository, w.revision)) is not None]
+    state = [f"no package {missing}" if missing else "installed"]
+    if held:
+        state.append(", ".join(f"{c.repository}@{c.commit[:8]} {c.size_bytes / 1e6:.0f} MB" for c in held))
+    elif card.weights:
+        state.append("weights not fetched")
+    first = card.weights[0] if card.weights else None
+    licences = f"code {card.code.name}" + (f", weights {first.licence.name}" if first else "")
+    marks = ("" if card.commercial else "; not for any use") + ("; gated" if first is not None and first.gated else "")
+    return f"{card.part}: {card.name}", "; ".join(state), licences + marks
 
 
 def _memory() -> str:
