@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.base import Proposals
+from list3r.instances.fusion import View
 from list3r.instances.views import ChunkViews
 from list3r.memory.errors import OptionError
 
@@ -64,11 +66,43 @@ def choose_candidates(
             continue
         kept.append(n)
         labels[free] = len(kept)
+    labels = without_spill(labels, views.view(position), views.stride)
     features = _unit(masks.features[kept])
     plane = np.array([plane_of_mask(labels == k + 1, views, position, chosen.flat_rms) for k in range(len(kept))])
     structure = np.array([bool(masks.names) and bounds_the_room(masks.names[n]) for n in kept], bool)
     names = tuple(masks.names[n] for n in kept) if masks.names else None
     return Proposals(position, labels, score[kept], features, plane.reshape(-1, 4), structure=structure, names=names)
+
+
+BORDER = 2
+"""Pixels of the working size along the border of a mask that may belong to what is behind the thing."""
+
+
+def without_spill(labels: NDArray[np.int32], view: View, stride: int) -> NDArray[np.int32]:
+    """Labels (H, W) without pixels near a mask's border whose depth is not that of the mask's inside.
+
+    A picture's edge and the depth's edge never lie on the same pixel; without this every thing would own a rim of the
+    wall behind it. Masks too small to have an inside stay as they are.
+    """
+    small = np.ascontiguousarray(labels[::stride, ::stride])
+    keep = np.ones(small.shape, bool)
+    ring = np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)
+    for number in np.unique(small[small > 0]).tolist():
+        mask = small == number
+        inside = cv2.erode(mask.astype(np.uint8), ring, borderType=cv2.BORDER_REPLICATE) > 0
+        inside &= view.depth > 0
+        if inside.sum() < 12:
+            continue
+        _, at = cv2.distanceTransformWithLabels(
+            (~inside).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        depth_of = np.zeros(int(at.max()) + 1, np.float32)
+        depth_of[at[inside]] = view.depth[inside]
+        step = np.abs(view.depth - depth_of[at])
+        steep = 6.0 * view.reading + 4.0 * BORDER * view.depth / view.camera.fx
+        keep &= ~(mask & ~inside & ((step > steep) | (view.depth <= 0)))
+    full = np.repeat(np.repeat(keep, stride, axis=0), stride, axis=1)[: labels.shape[0], : labels.shape[1]]
+    return np.where(full, labels, 0).astype(np.int32)
 
 
 def bounds_the_room(name: str) -> bool:
