@@ -1,0 +1,342 @@
+"""Model cards, licences, the cache of weights, presets: no network needed, a hub of our own answers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import ClassVar
+from urllib.parse import urlparse
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
+from list3r.memory.errors import OptionError
+from list3r.models.cache import (
+    cache_folder,
+    check_weights,
+    fetch,
+    find_cached,
+    locate,
+    read_header,
+    resolve,
+    split_name,
+)
+from list3r.models.cards import (
+    APACHE,
+    CARDS,
+    CC_BY_NC,
+    PARTS,
+    SAM_LICENCE,
+    UNPINNED,
+    Licence,
+    ModelCard,
+    Weights,
+    cards_named,
+    find_card,
+)
+from list3r.models.choice import check_allowed, parse_weights, pinned_weights
+from list3r.models.device import Gpu
+from list3r.models.licences import PROFILES, choose_weights, objection, terms
+from list3r.models.presets import Selection, obstacle, select
+from list3r.reconstruction.registry import MODELS
+
+GPU = Gpu("a GPU", 24_000.0, 23_000.0)
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache that is empty."""
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
+    return tmp_path / "hub"
+
+
+def put(repository: str, commit: str = COMMIT, branch: str = "main") -> Path:
+    """Weights in the cache, as the hub's package lays them; the folder."""
+    base = cache_folder() / f"models--{repository.replace('/', '--')}"
+    folder = base / "snapshots" / commit
+    folder.mkdir(parents=True)
+    (base / "refs").mkdir(exist_ok=True)
+    (base / "refs" / branch).write_text(commit)
+    save_file({"x": torch.zeros(4)}, folder / "model.safetensors")
+    return folder
+
+
+def card(code: Licence = APACHE, *weights: Weights) -> ModelCard:
+    return ModelCard("thing", "geometry", code, weights, ("json",), "pip install thing")
+
+
+def test_every_adapter_has_a_card_and_every_card_an_adapter() -> None:
+    known = {("geometry", m) for m in MODELS if m not in ("rgbd", "sfm", "precomputed")}
+    known |= {("discovery", d) for d in DISCOVERERS if d != "geometric"}
+    known |= {("tracking", t) for t in TRACKERS if t != "reprojection"}
+    known |= {("features", f) for f in FEATURES if f not in ("geometric", "own")}
+    carded = {(c.part, c.name) for c in CARDS}
+    assert known <= carded
+    assert {pair for pair in carded if pair[0] in ("geometry", "discovery", "tracking", "features")} == known
+    assert all(c.part in PARTS and c.packages and c.install for c in CARDS)
+    assert len(carded) == len(CARDS)
+
+
+def test_a_revision_is_a_commit_or_says_that_it_is_none() -> None:
+    for weights in (w for c in CARDS for w in c.weights):
+        assert weights.revision == UNPINNED or len(weights.revision) == 40
+        assert weights.pinned == (weights.revision != UNPINNED)
+
+
+@pytest.mark.parametrize(
+    ("licence", "gated", "allowed"),
+    [
+        (APACHE, False, ("permissive", "research", "any")),
+        (APACHE, True, ("research", "any")),
+        (CC_BY_NC, False, ("research", "any")),
+        (SAM_LICENCE, True, ("research", "any")),
+        (Licence("GPL-3.0", "copyleft"), False, ("research", "any")),
+        (Licence("no licence file", "none"), False, ("any",)),
+    ],
+)
+def test_profiles_allow_what_they_say(licence: Licence, gated: bool, allowed: tuple[str, ...]) -> None:
+    weights = Weights("a/b", licence, gated)
+    for profile in PROFILES:
+        assert (objection(card(APACHE, weights), weights, profile) is None) == (profile in allowed)
+        if not gated:
+            assert (objection(card(licence), None, profile) is None) == (profile in allowed)
+
+
+def test_a_refusal_names_model_licence_and_way_out() -> None:
+    pi3 = find_card("pi3", "geometry")
+    assert pi3 is not None and not pi3.commercial
+    with pytest.raises(
+        OptionError, match=r"--reconstruction pi3: the weights yyfz233/Pi3 are under CC-BY-NC.*research"
+    ):
+        choose_weights(pi3, None, "permissive", "--reconstruction")
+    with pytest.raises(OptionError, match="--licence free is not known"):
+        choose_weights(pi3, None, "free", "--reconstruction")
+    assert "CC-BY-NC" in terms(pi3, pi3.weights[0])
+
+
+def test_a_profile_takes_the_first_weights_that_it_allows() -> None:
+    both = card(APACHE, Weights("a/nc", CC_BY_NC), Weights("a/free", APACHE))
+    free = choose_weights(both, None, "permissive", "--x")
+    assert free is not None and free.repository == "a/free"
+    assert choose_weights(both, "someone/else", "permissive", "--x") is None
+    with pytest.raises(OptionError, match="a/nc"):
+        choose_weights(both, "a/nc@main", "permissive", "--x")
+
+
+def test_cached_weights_are_found_by_branch_and_commit() -> None:
+    folder = put("a/b")
+    cached = find_cached("a/b")
+    assert cached is not None and cached.commit == COMMIT and cached.folder == folder
+    assert cached.size_bytes == (folder / "model.safetensors").stat().st_size
+    assert cached.name == f"a/b@{COMMIT}"
+    assert find_cached("a/b", COMMIT) == cached
+    assert find_cached("a/b", "f" * 40) is None and find_cached("a/c") is None
+    (folder / "model.safetensors").unlink()
+    assert find_cached("a/b") is None, "a folder without weights is no copy"
+    assert split_name("a/b@v1") == ("a/b", "v1") and split_name("weights.pt") is None
+
+
+def test_what_is_in_the_cache_needs_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    folder = put("yyfz233/Pi3")
+    pi3 = find_card("pi3", "geometry")
+    assert pi3 is not None
+    name = resolve(None, pi3.weights[0], "--reconstruction pi3")
+    assert name == f"yyfz233/Pi3@{COMMIT}" and locate(name) == folder
+    assert resolve("yyfz233/Pi3", None, "x") == name and resolve(f"yyfz233/Pi3@{COMMIT}", None, "x") == name
+    assert resolve(str(folder), None, "x") == str(folder.resolve())
+
+
+def test_without_network_and_copy_one_line_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    _reload_hub(monkeypatch, "http://127.0.0.1:9")
+    with pytest.raises(OptionError, match=r"list3r models fetch a/b") as caught:
+        fetch(Weights("a/b", APACHE))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(OptionError, match="not there any more"):
+        locate(f"a/b@{COMMIT}")
+
+
+class _Hub(BaseHTTPRequestHandler):
+    """As much of the hub as fetching a snapshot needs."""
+
+    files: ClassVar[dict[str, bytes]] = {}
+    gated = False
+    asked: ClassVar[list[str]] = []
+
+    def do_HEAD(self) -> None:
+        self._answer(body=False)
+
+    def do_GET(self) -> None:
+        self._answer(body=True)
+
+    def log_message(self, *arguments: object) -> None:
+        """Quiet."""
+
+    def _answer(self, body: bool) -> None:
+        path = urlparse(self.path).path
+        self.asked.append(path)
+        parts = path.strip("/").split("/")
+        if self.gated:
+            return self._send(403, b"{}", {"X-Error-Code": "GatedRepo", "X-Error-Message": "gated"}, body)
+        if parts[0] == "api" and "tree" in parts:
+            listing = [
+                {"type": "file", "path": n, "size": len(d), "oid": hashlib.sha1(d).hexdigest()}
+                for n, d in self.files.items()
+            ]
+            return self._send(200, json.dumps(listing).encode(), {}, body)
+        if parts[0] == "api":
+            info = {"id": "a/b", "modelId": "a/b", "sha": COMMIT, "siblings": [{"rfilename": n} for n in self.files]}
+            return self._send(200, json.dumps(info).encode(), {}, body)
+        data = self.files.get(parts[-1])
+        if data is None:
+            return self._send(404, b"", {"X-Error-Code": "EntryNotFound"}, body)
+        return self._send(200, data, {"ETag": f'"{hashlib.sha1(data).hexdigest()}"', "X-Repo-Commit": COMMIT}, body)
+
+    def _send(self, status: int, data: bytes, headers: dict[str, str], body: bool) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Length": str(len(data)), **headers}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if body:
+            self.wfile.write(data)
+
+
+def _reload_hub(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
+    """Point the hub's package, which reads its environment once, at another place and at the cache of this test."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "ENDPOINT", endpoint)
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", endpoint + "/{repo_id}/resolve/{revision}/{filename}")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache_folder()))
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[type[_Hub]]:
+    save_file({"x": torch.arange(4.0)}, tmp_path / "m.safetensors")
+    _Hub.files = {"model.safetensors": (tmp_path / "m.safetensors").read_bytes(), "config.json": b"{}"}
+    _Hub.files["train.bin.zip"] = b"not wanted"
+    _Hub.gated, _Hub.asked = False, []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Hub)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    _reload_hub(monkeypatch, f"http://127.0.0.1:{server.server_port}")
+    yield _Hub
+    server.shutdown()
+
+
+def test_fetched_once_used_from_then_on(hub: type[_Hub]) -> None:
+    cached = fetch(Weights("a/b", APACHE))
+    assert cached.name == f"a/b@{COMMIT}"
+    assert {p.name for p in cached.folder.iterdir()} == {"model.safetensors", "config.json"}
+    check_weights(cached.folder)
+    asked = len(hub.asked)
+    assert resolve("a/b", None, "x") == cached.name
+    assert len(hub.asked) == asked, "the branch stands for what was fetched, and nobody is asked again"
+
+
+def test_gated_weights_say_so(hub: type[_Hub]) -> None:
+    hub.gated = True
+    with pytest.raises(OptionError, match="its owner must grant access first"):
+        fetch(Weights("a/b", SAM_LICENCE, gated=True))
+
+
+def test_a_repository_without_weights_says_so(hub: type[_Hub]) -> None:
+    hub.files = {"config.json": b"{}"}
+    with pytest.raises(OptionError, match="no weights in a form that is read here"):
+        fetch(Weights("a/b", APACHE))
+
+
+def test_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
+    good = tmp_path / "model.safetensors"
+    save_file({"x": torch.zeros(100)}, good)
+    assert read_header(good)["x"]["shape"] == [100]
+    data = good.read_bytes()
+    for damage, words in (
+        (data[:-1], "cut off"),
+        (data[:20], "cut off"),
+        (b"", "cut off"),
+        (b"\xff" * 64, "cut off"),
+        (data[:8] + b"[" + data[9:], "damaged table of contents"),
+    ):
+        good.write_bytes(damage)
+        with pytest.raises(OptionError, match=words):
+            check_weights(tmp_path)
+    with pytest.raises(OptionError, match="holds no weights"):
+        check_weights(tmp_path / "nothing")
+
+
+def test_presets_choose_and_say_why() -> None:
+    assert select("cpu", has_depth=True, profile="any", gpu=None) == Selection(why="preset cpu: no weights")
+    light = select("light", has_depth=False, profile="permissive", gpu=None)
+    assert all(c.commercial for _, c in light.cards()) and len(light.cards()) == 4
+    assert select("light", has_depth=True, profile="permissive", gpu=None).reconstruction == "auto"
+    assert select("paper", has_depth=False, profile="research", gpu=None).reconstruction == "pi3"
+    with pytest.raises(OptionError, match="--preset fast is not known"):
+        select("fast", has_depth=False, profile="any", gpu=None)
+
+
+def test_auto_takes_what_is_installed_fetched_and_allowed() -> None:
+    nothing = select("auto", has_depth=True, profile="any", gpu=None)
+    assert nothing.discovery == "geometric" and "no GPU" in nothing.why
+    bare = select("auto", has_depth=False, profile="any", gpu=GPU)
+    assert (bare.reconstruction, bare.discovery, bare.tracking, bare.features) == (
+        "auto",
+        "geometric",
+        "reprojection",
+        "geometric",
+    )
+    assert "pi3 is not installed" in bare.why and "weights not fetched" in bare.why
+    put("tue-mps/coco_panoptic_eomt_large_640")
+    put("facebook/sam3")
+    put("yonigozlan/EdgeTAM-hf")
+    some = select("auto", has_depth=True, profile="research", gpu=GPU)
+    assert (some.discovery, some.tracking, some.features) == ("eomt", "sam3", "own")
+    assert "a GPU" in some.why and "eomt" in some.why
+    assert select("auto", has_depth=True, profile="permissive", gpu=GPU).tracking == "edgetam"
+    assert obstacle("sam3", "tracking", "permissive") == "SAM License is not permissive"
+
+
+def test_weights_words_name_their_part() -> None:
+    assert parse_weights(None) == {}
+    assert parse_weights(["dir/with=sign", "discovery=a/b@v1"]) == {
+        "reconstruction": "dir/with=sign",
+        "discovery": "a/b@v1",
+    }
+    with pytest.raises(OptionError, match="foo is no part"):
+        parse_weights(["foo=x"])
+    with pytest.raises(OptionError, match="given twice"):
+        parse_weights(["a", "b"])
+
+
+def test_what_is_forbidden_or_missing_is_refused_before_anything_is_fetched() -> None:
+    with pytest.raises(OptionError, match="--tracking sam3: the weights facebook/sam3"):
+        check_allowed(Selection(tracking="sam3"), {}, "permissive")
+    with pytest.raises(OptionError, match="pi3 needs the package pi3: pip install git"):
+        check_allowed(Selection(reconstruction="pi3"), {}, "research")
+    assert check_allowed(Selection(), {}, "permissive") == {}
+    assert check_allowed(Selection(discovery="eomt"), {}, "permissive") == {
+        "discovery": "tue-mps/coco_panoptic_eomt_large_640"
+    }
+    assert check_allowed(Selection(discovery="eomt"), {"discovery": "x/y"}, "permissive") == {"discovery": "x/y"}
+
+
+def test_weights_of_a_build_are_named_by_commit(tmp_path: Path) -> None:
+    put("tue-mps/coco_panoptic_eomt_large_640")
+    assert pinned_weights("discovery", "eomt", None) == f"tue-mps/coco_panoptic_eomt_large_640@{COMMIT}"
+    assert pinned_weights("discovery", "geometric", None) is None
+    assert pinned_weights("reconstruction", "precomputed", str(tmp_path)) == str(tmp_path.resolve())
+
+
+def test_unknown_names_list_the_known_ones() -> None:
+    with pytest.raises(OptionError, match=r"choose one of .*pi3"):
+        cards_named("pi4")
+    assert {c.part for c in cards_named("sam2")} == {"discovery", "tracking"}
