@@ -30,6 +30,7 @@ from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import estimate_gravity, world_from_graph
+from list3r.memory.labels import apply_labels
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.scale import settle_scale
 from list3r.memory.store import Store
@@ -75,6 +76,7 @@ def add_chunk(
         place_chunks(store, chosen.graph, chunk_id)
         if library:
             consolidate(store, chunk_id)
+            apply_labels(store)
     return chunk_id
 
 
@@ -159,7 +161,8 @@ def place_chunks(
     if nodes is not None:
         graph = _straightened(store, graph, chunks, metric, settings, nodes)
     known = {} if store.get_value("poses") == "given" else graph.covariances
-    if fitted and len(chunks) > UP_ALWAYS and len(chunks) % UP_AGAIN:
+    settled = store.get_value("gravity") == "estimated" or len(chunks) % UP_AGAIN
+    if fitted and len(chunks) > UP_ALWAYS and settled:
         _place_fitted(store, graph, known)
         return
     gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
@@ -171,8 +174,9 @@ def place_chunks(
 
 
 UP_ALWAYS, UP_AGAIN = 64, 32
-"""Chunks up to which every new one makes it be asked which way is up and what a unit of the world is; beyond, after how
-many chunks that is asked again."""
+"""Chunks up to which every new one makes it be asked which way is up and what a unit of the world is. Beyond, that
+stands until the session is finished: to turn the world is to touch all of it. Where up is not known yet it is asked
+again after so many chunks."""
 
 
 def _place_fitted(store: Store, graph: GraphResult, covariances: Mapping[int, NDArray[np.float64]]) -> None:
@@ -211,6 +215,7 @@ def finish_session(
         if library:
             add_changed_places(store, session_id)
             consolidate(store)
+            apply_labels(store)
         store.complete_session(session_id)
 
 

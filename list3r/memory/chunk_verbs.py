@@ -282,8 +282,8 @@ class ChunkVerbs(BendVerbs):
 
     def unsettle(self, chunk_id: int) -> None:
         """What was derived from a chunk does not hold any more: it was measured anew."""
-        self._database.execute("DELETE FROM settled WHERE chunk_id = ?", (int(chunk_id),))
-        self.unsettled += 1
+        gone = self._database.execute("DELETE FROM settled WHERE chunk_id = ?", (int(chunk_id),)).rowcount
+        self.unsettled += gone
         self._touch([chunk_id])
 
     def _touch(self, chunk_ids: Iterable[int]) -> None:

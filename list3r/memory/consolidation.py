@@ -60,7 +60,8 @@ def consolidate(
     world = known_world(store, chunks, s)
     report = None
     if world is not None and len(chunks) > s.whole_chunks and not _is_whole(store, chunks):
-        if len(chunks) >= 2 * world.chunks:
+        again = len(chunks) <= _LOOKED_AT or chunk_id is None
+        if again and len(chunks) >= 2 * world.chunks:
             now = look_at_world(store, chunks, summaries, s)
             world = replace(world, chunks=now.chunks) if world.near(now) else None
         if world is not None:
@@ -69,6 +70,11 @@ def consolidate(
         report = _derive_whole(store, summaries, last, s)
     store.touched = set()
     return report
+
+
+_LOOKED_AT = 64
+"""Chunks up to which it is looked again, each time they have doubled, what holds for the whole memory; later that is
+done when a session ends, for what changes it makes all things be derived anew."""
 
 
 def _is_whole(store: Store, chunks: Sequence[ChunkRow]) -> bool:
@@ -80,29 +86,30 @@ def _derive_whole(store: Store, summaries: Summaries, chunk_id: int, s: Consolid
     settled = settle(store, summaries, s.settling)
     chunks = settled.chunks
     world = look_at_world(store, chunks, summaries, s)
-    motions = {(k, n): track for k, v in summaries.items() for n, track in v.motions.items()}
-    shapes = {k: v.shapes for k, v in summaries.items()}
-    pairs = without_moving(_known_pairs(store, settled, summaries), shapes, motions)
+    held = dict(summaries.items())
+    motions = {(k, n): track for k, v in held.items() for n, track in v.motions.items()}
+    shapes = {k: v.shapes for k, v in held.items()}
+    pairs = without_moving(_known_pairs(store, settled, held), shapes, motions)
     pairs = across_sessions(pairs, shapes, s.changes)
     word = store.constraints()
-    groups, decisions = _partition(chunks, summaries, pairs, s.merging, word)
-    groups, movers, joined = _with_movers(store, groups, chunks, summaries, motions, word, s)
+    groups, decisions = _partition(chunks, held, pairs, s.merging, word)
+    groups, movers, joined = _with_movers(store, groups, chunks, held, motions, word, s)
     groups, movers = word.joined(groups, {c.chunk_id: c.component for c in chunks}, movers)
     evidence = weigh(groups, shapes, pairs, s.evidence)
     shown = word.shown(groups, [e.shown(s.evidence, world.posed) for e in evidence])
-    changes = find_changes(store, groups, shown, frozenset(movers), chunks, summaries, s.changes)
+    changes = find_changes(store, groups, shown, frozenset(movers), chunks, held, s.changes)
     if changes.current:
         groups, evidence = changes.groups, weigh(changes.groups, shapes, pairs, s.evidence)
     decisions += joined + changes.decisions
     before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
-    weights = {key: len(shapes[key[0]].frames[_at(summaries, key)]) for group in groups for key in group}
+    weights = {key: len(shapes[key[0]].frames[_at(held, key)]) for group in groups for key in group}
     told = {c.first for c in changes.events}
     shown = word.shown(
         groups, [e.shown(s.evidence, world.posed) or g[0] in told for e, g in zip(evidence, groups, strict=True)]
     )
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
-    things = _things(store, groups, ids, evidence, chunks, summaries, s, movers, changes.current, world)
+    things = _things(store, groups, ids, evidence, chunks, held, s, movers, changes.current, world)
     things = _with_structure(store, things, chunks, groups, ids, s, world)
     states = {n: changes.states[g[0]] for g, n in zip(groups, ids.of_group, strict=True) if g[0] in changes.states}
     labels = {ids.of_group[n]: text for n, text in word.labels_of(groups, weights).items()}

@@ -1,0 +1,281 @@
+"""What one more chunk costs as a memory grows, and what memory it takes.
+
+python benchmarks/incremental.py --chunks 1000 --json benchmarks/results/incremental.json
+
+The chunks are made up (things, floors, samples, keyframes of a walk) and go through `mapping.add_chunk` like those of a
+build: edge to the chunk before, revisits, pose graph, library. Three walks: `rooms`, on into new rooms for ever;
+`corridor`, along one floor; `stay`, to and fro in one room, where every chunk touches all that is there. Every chunk
+sees 12 things and a floor. Printed are medians over nine chunks round the 10th, 100th, 1,000th: user seconds of
+processor time of placing (edges, revisits, graph) and of the library, things written anew, resident memory then and its
+peak so far.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+import resource
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, write_json
+
+from list3r import mapping
+from list3r.memory.consolidation import consolidate
+from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.store import Store
+
+SEEN, STEP = 12, 6
+"""Things in a chunk, and how many further the next one has gone."""
+SPACING_M = 0.9
+FRAMES, HOP = 20, 14
+SPACE = "synthetic@1/64"
+WALKS = ("rooms", "corridor", "stay")
+IMAGE = (480, 640)
+LENS = (500.0, 500.0, 320.0, 240.0)
+LOOKING_ALONG = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""World to camera axes: along x, level."""
+SAMPLES, KEYFRAMES, WORDS = 150, 2, 384
+"""Samples of a frame, keyframes of a chunk, numbers of a descriptor."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--chunks", type=int, default=1000)
+    parser.add_argument("--walks", default="rooms,corridor,stay", help="some of rooms, corridor, stay")
+    parser.add_argument("--stay-chunks", type=int, default=100, help="most chunks of the walk that stays")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--profile", action="store_true", help="where the last ten chunks' time went")
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    found = {}
+    print(machine())
+    for name in words.walks.split(","):
+        count = min(words.chunks, words.stay_chunks) if name == "stay" else words.chunks
+        with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "walk.l3r") as store:
+            rows = walk(store, name, count, words.seed, profile=words.profile)
+            size_mb = round((Path(scratch) / "walk.l3r").stat().st_size / 1e6, 1)
+        found[name] = [mark(rows, n) for n in (10, 30, 100, 300, 1000, 3000) if n <= count]
+        print(f"{name}: {count} chunks, {size_mb} MB")
+        for row in found[name]:
+            print("  " + "  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+    write_json(words.json, {"walks": found})
+
+
+def walk(store: Store, name: str, count: int, seed: int, *, profile: bool = False) -> list[dict[str, float]]:
+    """All chunks, one after the other: what each cost."""
+    with store.transaction():
+        store.set_value("scale_kind", "metric")
+        session = store.add_session("walk", "synthetic", {}, HOP * count + FRAMES)
+    rows, watched, spent = [], cProfile.Profile(), {"library_s": 0.0}
+
+    def timed(*arguments: Any) -> Any:
+        started = user_s()
+        report = consolidate(*arguments)
+        spent["library_s"] = user_s() - started
+        return report
+
+    for k in range(count + 4):
+        result = chunk(k, name, seed)
+        if profile and k >= count - 6:
+            watched.enable()
+        before = len(store.vectors_touched)
+        started = user_s()
+        mapping.consolidate, kept = timed, mapping.consolidate  # type: ignore[assignment]
+        try:
+            mapping.add_chunk(store, session, result)
+        finally:
+            mapping.consolidate = kept
+        taken = user_s() - started
+        watched.disable()
+        rows.append(
+            {
+                "placing_s": taken - spent["library_s"],
+                "library_s": spent["library_s"],
+                "all_s": taken,
+                "written": len(store.vectors_touched) - before,
+                "instances": sum(store.instance_count()),
+                "resident_mb": resident_mb(),
+                "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            }
+        )
+    if profile:
+        pstats.Stats(watched).sort_stats("cumtime").print_stats(60)
+    return rows
+
+
+def mark(rows: list[dict[str, float]], n: int) -> dict[str, Any]:
+    """Medians round the n-th chunk."""
+    part = rows[n - 5 : n + 4]
+    out: dict[str, Any] = {"chunk": n, "instances": int(rows[n - 1]["instances"])}
+    for key in ("placing_s", "library_s", "all_s"):
+        out[key] = round(float(np.median([r[key] for r in part])), 4)
+    out["written"] = int(np.median([r["written"] for r in part]))
+    return {**out, "resident_mb": rows[n - 1]["resident_mb"], "peak_mb": rows[n - 1]["peak_mb"]}
+
+
+def place_of(k: int, name: str) -> int:
+    """How far along the way chunk k is."""
+    return k % 2 if name == "stay" else k
+
+
+def chunk(k: int, name: str, seed: int) -> ChunkResult:
+    """Chunk k of a walk; its frame of reference is the world's, with an error of 5 mm."""
+    rng = np.random.default_rng([seed, 7, k])
+    error = rng.normal(0.0, 0.005, 3)
+    place = place_of(k, name)
+    frames = np.arange(HOP * k, HOP * k + FRAMES)
+    things = [thing(n, STEP * place + n, seed, error, frames, rng) for n in range(SEEN)]
+    things.append(floor(SEEN, place, name, error, frames, rng))
+    links = np.array([(a, b) for a in range(len(things)) for b in range(a)], np.int32)
+    T_chunk_cam = np.stack([camera(int(f), name, error) for f in frames])
+    samples = samples_of(k, frames, T_chunk_cam, name, seed, error)
+    return ChunkResult(
+        index=k,
+        frame_indices=frames,
+        times_s=frames / 30.0,
+        posed=np.ones(FRAMES, bool),
+        T_chunk_cam=T_chunk_cam,
+        T_source_cam=None,
+        intrinsics=LENS,
+        image_size=IMAGE,
+        scale_kind="metric",
+        keyframes=tuple(
+            keyframe(int(f), place, seed, T) for f, T in zip(frames, T_chunk_cam, strict=True) if f % 7 == 0
+        ),
+        samples=samples,
+        library=LocalLibrary(tuple(things), links, SPACE),
+    )
+
+
+def camera(frame: int, name: str, error: np.ndarray) -> np.ndarray:
+    """T_chunk_cam of a frame: it goes along x, or to and fro."""
+    along = frame / HOP if name != "stay" else abs((frame / HOP + 1.0) % 2.0 - 1.0)
+    T = np.eye(4)
+    T[:3, :3] = LOOKING_ALONG
+    T[:3, 3] = np.array([SPACING_M * STEP * along - 3.0, 0.0, 1.5]) + error
+    return T
+
+
+def samples_of(
+    k: int, frames: np.ndarray, T_chunk_cam: np.ndarray, name: str, seed: int, error: np.ndarray
+) -> FrameSamples:
+    """Points of things and floor in every frame, the same pixels of one frame in every chunk, with 2 mm of noise."""
+    frame, pixel, points, instance = [], [], [], []
+    for f, T in zip(frames.tolist(), T_chunk_cam, strict=True):
+        rng = np.random.default_rng([seed, 3, f])
+        ahead = T[0, 3] - error[0] + rng.uniform(1.0, 7.0, SAMPLES)
+        p = np.stack([ahead, rng.uniform(-1.5, 1.5, SAMPLES), np.where(rng.random(SAMPLES) < 0.5, 0.0, 0.7)], axis=1)
+        p[:, 2] *= rng.random(SAMPLES)
+        at = (p - (T[:3, 3] - error)) @ T[:3, :3]
+        uv = np.rint(at[:, :2] / at[:, 2:] * LENS[0] + np.array(LENS[2:])).astype(int)
+        seen = np.all((uv >= 0) & (uv < np.array(IMAGE[::-1])), axis=1)
+        number, first = np.unique((uv @ np.array([1, IMAGE[1]]))[seen], return_index=True)
+        noise = np.random.default_rng([seed, 4, k, f]).normal(0.0, 0.002, (len(first), 3))
+        points.append(p[seen][first] + error + noise)
+        pixel.append(number)
+        frame.append(np.full(len(number), f))
+        instance.append(np.full(len(number), -1))
+    count = sum(map(len, frame))
+    return FrameSamples(
+        frame=np.concatenate(frame),
+        pixel=np.concatenate(pixel).astype(np.int32),
+        points=np.concatenate(points).astype(np.float32),
+        confidence=np.full(count, 0.9, np.float32),
+        instance=np.concatenate(instance).astype(np.int32),
+        camera_frames=frames.astype(np.int64),
+        T_chunk_cam=T_chunk_cam,
+    )
+
+
+def keyframe(frame: int, place: int, seed: int, T_chunk_cam: np.ndarray) -> Keyframe:
+    """A keyframe without features; frames of one place look alike."""
+    own = np.random.default_rng([seed, 5, place]).normal(size=WORDS)
+    own = own + 0.3 * np.random.default_rng([seed, 6, frame]).normal(size=WORDS)
+    return Keyframe(
+        frame_index=frame,
+        T_chunk_cam=T_chunk_cam,
+        descriptor=(own / np.linalg.norm(own)).astype(np.float32),
+        keypoints_xy=np.zeros((0, 2), np.float32),
+        keypoint_descriptors=np.zeros((0, 32), np.uint8),
+        points_cam=np.zeros((0, 3), np.float32),
+        depth_small=np.zeros((0, 0), np.float32),
+        camera_small=LENS,
+    )
+
+
+def thing(
+    local_id: int, number: int, seed: int, error: np.ndarray, frames: np.ndarray, rng: np.random.Generator
+) -> LocalInstance:
+    """Thing `number` of the way, always the same: a box that stands on the floor."""
+    own = np.random.default_rng([seed, number])
+    size = own.uniform(0.15, 0.6, 3)
+    center = np.array([SPACING_M * number, own.uniform(-0.4, 0.4), size[2] / 2])
+    points = surface(center, size, 400, rng) + error
+    feature = own.normal(size=64)
+    return local(local_id, points, tuple(own.integers(40, 220, 3)), feature, frames, 31 * (number % 19))
+
+
+def floor(
+    local_id: int, place: int, name: str, error: np.ndarray, frames: np.ndarray, rng: np.random.Generator
+) -> LocalInstance:
+    """The piece of floor under a chunk; where there are rooms it ends where the room does, a step up or down."""
+    rooms = name == "rooms"
+    start = SPACING_M * STEP * (place // 2 * 2 if rooms else place)
+    at = np.array([start + SPACING_M * SEEN / 2, 0.0, -0.01 - (0.3 if rooms and place // 2 % 2 else 0.0)])
+    points = surface(at, np.array([SPACING_M * SEEN, 3.0, 0.02]), 1500, rng) + error
+    feature = np.random.default_rng(99).normal(size=64)
+    plane = np.array([0.0, 0.0, 1.0, -float(at[2]) - 0.01])
+    return local(local_id, points, (120, 120, 120), feature, frames, 600, plane)
+
+
+def surface(center: np.ndarray, size: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Noisy points on an upright box. Shape (count, 3)."""
+    p = rng.uniform(-0.5, 0.5, (count, 3))
+    axis = rng.choice(3, count, p=np.roll(size, 1) * np.roll(size, 2) / np.sum(np.roll(size, 1) * np.roll(size, 2)))
+    p[np.arange(count), axis] = 0.5 * rng.choice([-1.0, 1.0], count)
+    return np.asarray(center + p * size + rng.normal(0.0, 0.003, p.shape))
+
+
+def local(
+    local_id: int,
+    points: np.ndarray,
+    rgb: tuple[int, ...],
+    feature: np.ndarray,
+    frames: np.ndarray,
+    left: int,
+    plane: np.ndarray | None = None,
+) -> LocalInstance:
+    """A local instance with the same box in all of its frames."""
+    count = len(frames)
+    track = MaskTrack(
+        frames=frames,
+        boxes_xyxy=np.tile(np.float32([left + 5, 100, left + 35, 200]), (count, 1)),
+        centers_xy=np.tile(np.float32([left + 20, 150]), (count, 1)),
+        areas_px=np.full(count, 3000, np.int32),
+        visible_fraction=np.full(count, 0.9, np.float32),
+        masks=tuple(np.array([20 * 640 + 10, 20], np.uint32) for _ in range(count)),
+        image_size=IMAGE,
+    )
+    p = points.astype(np.float32)
+    support = Support(p, np.full(len(p), 0.8, np.float32), np.tile(np.uint8(rgb), (len(p), 1)))
+    unit = (feature / np.linalg.norm(feature)).astype(np.float32)
+    return LocalInstance(local_id, track, unit, support, 0.9, plane=plane, structure=plane is not None)
+
+
+def user_s() -> float:
+    """User seconds of processor time of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_utime
+
+
+def resident_mb() -> float:
+    """Resident set of this process now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return round(pages * resource.getpagesize() / 1e6, 1)
+
+
+if __name__ == "__main__":
+    main()
