@@ -15,6 +15,7 @@ import typer
 
 from list3r.cli import (
     build_commands,
+    detect_commands,
     edit_commands,
     embed_commands,
     evaluation_commands,
@@ -46,6 +47,7 @@ for module in (
     evaluation_commands,
     update_commands,
     scale_commands,
+    detect_commands,
     model_commands,
 ):
     module.register(app)

@@ -12,6 +12,7 @@ from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import report_lines, run_build
 from list3r.cli.common import JsonOption, note, print_json
+from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector, run_detector
 from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
 
 
@@ -104,6 +105,8 @@ def build(
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
     ] = None,
     scale_anchor: ScaleAnchor = None,
+    detector: DetectorFile = None,
+    detector_classes: ClassFile = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a build that was interrupted.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing memory.")] = False,
     debug: Annotated[
@@ -120,6 +123,7 @@ def build(
     from list3r.frames.source import open_source
 
     check_anchor(scale_anchor)
+    check_detector(detector, detector_classes)
     info = open_source(source, options).info
     resumed = memory if resume and not force else None
     settings, told = mod.build_settings(info, words, poses=poses, pictures=pictures, resumed=resumed)
@@ -131,6 +135,9 @@ def build(
     if scale_anchor is not None:
         anchored = anchor_scale(memory, scale_anchor)
         report = replace(report, notes=(*report.notes, anchored.text))
+    if detector is not None:
+        seen = run_detector(memory, detector, detector_classes, source, options, quiet=json)
+        report = replace(report, notes=(*report.notes, f"{seen.detector} named {len(seen.labels)} things"))
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:

@@ -11,6 +11,7 @@ import typer
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
 
 if TYPE_CHECKING:
+    from list3r.memory.labels import DetectedLabel
     from list3r.memory.records import Instance
     from list3r.scene_memory import SceneMemory
 
@@ -145,6 +146,8 @@ def show(
 
     Example: list3r show house.l3r 12
     """
+    from list3r.memory.labels import detected_labels, label_source
+
     with open_memory(memory) as scene:
         instance = scene.instance(instance_id)
         relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
@@ -153,9 +156,11 @@ def show(
         track = scene.track(instance.id) if instance.dynamic else None
         parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations(instance.id)]
         units = scene.units
+        named = detected_labels(scene.store).get(instance.id)
     if json:
         related = [vars(r) for r in relations]
-        print_json({**instance_dict(instance, track), "relations": related, "aliases": aliases, "observed_as": parts})
+        told = {"relations": related, "aliases": aliases, "observed_as": parts}
+        print_json({**instance_dict(instance, track), **label_source(instance, named), **told})
         return
     print(f"{instance.id}  {instance.label or instance.description}")
     for key, value in (
@@ -165,6 +170,7 @@ def show(
             "confidence",
             f"{instance.confidence:.2f}, seen in {instance.observations} frames of {len(parts)} chunk instances",
         ),
+        *(() if instance.label is None else (("named by", _named_by(instance, named)),)),
         ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
         ("aliases", ", ".join(map(str, aliases)) or "none"),
         *(() if track is None else _track_lines(*track, units)),
@@ -175,6 +181,11 @@ def show(
             f"  {names.get(r.subject, '?')} ({r.subject}) {r.predicate} {names.get(r.object, '?')} ({r.object})"
             f"  confidence {r.confidence:.2f}, margin {r.margin:.3f} {units}"
         )
+
+
+def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
+    who = "an operator" if named is None else f"{named.detector}, confidence {named.confidence:.2f}"
+    return f"{who}; it looks like {instance.description}"
 
 
 def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:

@@ -14,6 +14,7 @@ from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
 from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
+from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector, run_detector
 from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ def update(
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
     ] = None,
     scale_anchor: ScaleAnchor = None,
+    detector: DetectorFile = None,
+    detector_classes: ClassFile = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an update that was interrupted.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -75,6 +78,7 @@ def update(
     from list3r.frames.source import open_source
 
     check_anchor(scale_anchor)
+    check_detector(detector, detector_classes)
     info = open_source(source, options).info
     resumed = memory if resume else None
     settings, told = mod.build_settings(info, words, poses=poses, pictures=pictures, resumed=resumed)
@@ -84,6 +88,9 @@ def update(
     report = _run(memory, source, quiet=json, options=options, settings=settings, workers=workers, resume=resume)
     if scale_anchor is not None:
         report = replace(report, notes=(*report.notes, anchor_scale(memory, scale_anchor).text))
+    if detector is not None:
+        seen = run_detector(memory, detector, detector_classes, source, options, quiet=json)
+        report = replace(report, notes=(*report.notes, f"{seen.detector} named {len(seen.labels)} things"))
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:

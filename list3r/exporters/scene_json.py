@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from list3r.exporters.components import Component, frames_per_second, has_box, read_components
 from list3r.exporters.output import replacing, units
 from list3r.memory.geometry import quat_wxyz_from_rotation
+from list3r.memory.labels import detected_labels, label_source
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store import Store
 
@@ -48,6 +49,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
     decimals = _length_decimals(store, components)
     instances = sorted((i for c in components for i in c.instances), key=lambda i: i.id)
     known = {i.id for i in instances}
+    detected = detected_labels(store)
     relations = [r for r in store.relations() if r.subject in known and r.object in known]
     return {
         "format": FORMAT,
@@ -61,7 +63,13 @@ def scene_dict(store: Store) -> dict[str, Any]:
         },
         "sessions": _sessions(store),
         "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
-        "instances": [instance_entry(i, decimals, store.track(i.id) if i.dynamic else None) for i in instances],
+        "instances": [
+            {
+                **instance_entry(i, decimals, store.track(i.id) if i.dynamic else None),
+                **label_source(i, detected.get(i.id)),
+            }
+            for i in instances
+        ],
         "relations": [_relation(r, decimals) for r in relations],
         "aliases": [{"id": k, "instance": v} for k, v in store.aliases().items()],
     }

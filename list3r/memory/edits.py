@@ -17,6 +17,7 @@ from list3r.memory.consolidation import consolidate
 from list3r.memory.constraints import Edit, Key, standing
 from list3r.memory.edit_verbs import LogEntry
 from list3r.memory.errors import OptionError
+from list3r.memory.labels import apply_labels
 from list3r.memory.parting import part_best
 from list3r.memory.records import MergeDecision, Observation
 from list3r.memory.scale import measure, parse_anchor, rescale
@@ -246,6 +247,7 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
     retired = _retired(store, edit.before + bring_back, home, now, dict(report.merged))
     store.add_aliases(retired)
     store.drop_revived_aliases()
+    apply_labels(store)
     touched = sorted({home[k] for _, _, keys in edit.before + bring_back for k in keys if k in home})
     first = [n for n, _, _ in bring_back + edit.before if n in touched]
     return EditReport(

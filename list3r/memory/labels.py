@@ -1,0 +1,174 @@
+"""What things are called by a detector: votes kept for local instances, labels derived from them.
+
+Votes are log odds that add up, kept in the key-value table for each chunk, so that labels follow whatever becomes of
+the groups. An operator's word always wins, a name that an operator took away stays away, and structure is never named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from list3r.memory.constraints import Key
+from list3r.memory.records import Instance
+from list3r.memory.store import Store
+
+PRIOR_ODDS = math.log(0.02 / 0.98)
+"""Log odds that a thing is of a given class before anything is seen: some fifty kinds of things stand in rooms."""
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What was seen of a local instance, or of several together."""
+
+    missed: float
+    """Log odds that every class loses for all frames that looked; a class has them back for those that found it."""
+    classes: Mapping[str, tuple[float, float]]
+    """By class: in how many pictures it was found (weighted), and the log odds that they add up to."""
+
+    def __add__(self, other: Votes) -> Votes:
+        names = sorted({*self.classes, *other.classes})
+        zero = (0.0, 0.0)
+        return Votes(
+            self.missed + other.missed,
+            {n: _plus(self.classes.get(n, zero), other.classes.get(n, zero)) for n in names},
+        )
+
+
+@dataclass(frozen=True)
+class LabelSettings:
+    """When votes make a label."""
+
+    min_found: float = 1.2
+    """Independent pictures in which the class was found, weighted by how well they see the thing: one is not enough."""
+    min_confidence: float = 0.5
+    """Probability of the class."""
+    always_wrong: float = 0.03
+    """A detector may be wrong in the same way in every picture; no label is surer than one less this."""
+
+
+@dataclass(frozen=True)
+class DetectedLabel:
+    """A label and where it comes from."""
+
+    label: str
+    confidence: float
+    """Probability of the class, in [0, 1]."""
+    found: float
+    """Independent pictures in which it was found, weighted."""
+    detector: str
+
+
+def put_votes(store: Store, chunk_id: int, detector: str, votes: Mapping[int, Votes]) -> None:
+    """Keep what a detector saw of a chunk, instead of what one saw before. Call inside `transaction()`."""
+    rows = {
+        str(n): [round(v.missed, 4), {c: [round(a, 4), round(b, 4)] for c, (a, b) in v.classes.items()}]
+        for n, v in sorted(votes.items())
+    }
+    store.set_value(_key(chunk_id), {"detector": detector, "locals": rows})
+
+
+def votes_of(store: Store, chunk_id: int) -> tuple[str, dict[int, Votes]]:
+    """The detector and its votes by local id; nothing where none looked at the chunk."""
+    told: dict[str, Any] | None = store.get_value(_key(chunk_id))
+    if told is None:
+        return "", {}
+    rows = told["locals"].items()
+    found = {int(n): Votes(missed, {c: (a, b) for c, (a, b) in classes.items()}) for n, (missed, classes) in rows}
+    return str(told["detector"]), found
+
+
+def decide(votes: Votes, settings: LabelSettings | None = None) -> tuple[str, float, float] | None:
+    """(class, its probability, frames in which it was found), None where no class is likely enough.
+
+    The classes exclude one another and all of them may be wrong, which has the odds of 1.
+    """
+    s = settings or LabelSettings()
+    odds = {c: PRIOR_ODDS + got - votes.missed for c, (_, got) in votes.classes.items()}
+    if not odds:
+        return None
+    top = max(0.0, *odds.values())
+    total = math.exp(-top) + sum(math.exp(v - top) for v in odds.values())
+    best = min(odds, key=lambda c: (-odds[c], c))
+    confidence = (1.0 - s.always_wrong) * math.exp(odds[best] - top) / total
+    found = votes.classes[best][0]
+    if confidence < s.min_confidence or found < s.min_found:
+        return None
+    return best, confidence, found
+
+
+def detected_labels(store: Store) -> dict[int, DetectedLabel]:
+    """The labels that instances have from a detector, by id."""
+    rows: dict[str, list[Any]] = store.get_value("detected labels", {})
+    return {int(n): DetectedLabel(str(r[0]), float(r[1]), float(r[2]), str(r[3])) for n, r in rows.items()}
+
+
+def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str, Any]:
+    """Who gave an instance its label and how sure that is, for JSON; nothing for one without a label."""
+    if instance.label is None:
+        return {}
+    if detected is None:
+        return {"label_source": "operator", "label_confidence": 1.0}
+    return {"label_source": detected.detector, "label_confidence": round(detected.confidence, 4)}
+
+
+def apply_labels(store: Store, settings: LabelSettings | None = None) -> dict[int, DetectedLabel]:
+    """Name the instances by what detectors saw of them; what was named so before and is not any more loses its name.
+
+    Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was derived.
+    """
+    before = store.get_value("detected labels")
+    votes = {c.chunk_id: votes_of(store, c.chunk_id) for c in store.chunks()}
+    if before is None and not any(found for _, found in votes.values()):
+        return {}
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    spoken = _named_by_operators(store, home)
+    members: dict[int, list[Key]] = {}
+    for key, n in home.items():
+        members.setdefault(n, []).append(key)
+    out: dict[int, DetectedLabel] = {}
+    changed: dict[int, str | None] = {}
+    for i in store.instances():
+        if i.id in spoken:
+            continue
+        label = None if i.structure is not None else _label(members.get(i.id, ()), votes, settings)
+        if label is not None:
+            out[i.id] = label
+        text = None if label is None else label.label
+        if i.label != text and (text is not None or str(i.id) in (before or {})):
+            changed[i.id] = text
+    store.set_labels(changed)
+    rows = {str(n): [d.label, round(d.confidence, 4), round(d.found, 2), d.detector] for n, d in sorted(out.items())}
+    if rows != before:
+        store.set_value("detected labels", rows)
+    return out
+
+
+def _label(
+    keys: Iterable[Key], votes: Mapping[int, tuple[str, Mapping[int, Votes]]], settings: LabelSettings | None
+) -> DetectedLabel | None:
+    total, detectors = Votes(0.0, {}), set()
+    for chunk_id, local_id in sorted(keys):
+        detector, found = votes.get(chunk_id, ("", {}))
+        if local_id in found:
+            total += found[local_id]
+            detectors.add(detector)
+    chosen = decide(total, settings)
+    if chosen is None:
+        return None
+    return DetectedLabel(chosen[0], chosen[1], chosen[2], ", ".join(sorted(detectors)))
+
+
+def _named_by_operators(store: Store, home: Mapping[Key, int]) -> Collection[int]:
+    """Instances of which an operator said what they are called, or that they are called nothing."""
+    return {home[k] for keys, _ in store.constraints().labels for k in keys if k in home}
+
+
+def _plus(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
+    return a[0] + b[0], a[1] + b[1]
+
+
+def _key(chunk_id: int) -> str:
+    return f"label votes {chunk_id}"
