@@ -4,7 +4,8 @@ python benchmarks/relations.py --seeds 1,2,3,4 --json benchmarks/results/relatio
 
 The pictures, depth noise, poses, tracking, merging and all rules are those of a build; only which pixels belong to
 which thing is told, so that the geometry and the rules are measured and not the discovery (`benchmarks/simulated.py`
-measures both together). Walls and ceilings do not count, and all floors are one. A thing counts when it was seen in 12 frames and once covered 300 pixels of 320 x 240.
+measures both together). Walls and ceilings do not count, and all floors are one. A thing counts when it was seen in 12
+frames and once covered 300 pixels of 320 x 240.
 The same memory with gravity set to unknown must make no vertical claim.
 """
 

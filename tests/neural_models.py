@@ -32,7 +32,7 @@ MEMORY = {
 ATTENTION = {"memory_attention_feed_forward_hidden_size": 32, "memory_attention_rope_feat_sizes": [8, 8]}
 PERCEIVER = {
     "memory_attention_mlp_hidden_size": 32,
-    "memory_attention_rope_q_sizes": [8, 8],
+    "memory_attention_rope_feat_sizes": [8, 8],
     "memory_attention_rope_k_sizes": [4, 4],
     "perceiver_resampler_num_latents": 16,
     "perceiver_resampler_num_latents_2d": 16,

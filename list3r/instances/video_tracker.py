@@ -71,6 +71,8 @@ class VideoTracker:
             raise OptionError(f"tracker {model} is not known; choose one of reprojection, {', '.join(CLASSES)}")
         self._device = pick_device(device)
         self._network = load_pretrained(CLASSES[model][0], folder, self._device)
+        if model == "edgetam":
+            _even_scores(self._network)
         self._session_class = CLASSES[model][1]
         self._settings = settings or InstanceSettings()
         self._tracker = tracker or VideoTrackerSettings()
@@ -135,6 +137,22 @@ class VideoTracker:
             video_storage_device=self._device,
             dtype=self._network.dtype,
         )
+
+
+def _even_scores(network: Any) -> None:
+    """Give the score of a prompted and of a followed thing one shape.
+
+    EdgeTAM of transformers 5.23 returns them with different numbers of axes, and then cannot join them when both kinds
+    are in one frame.
+    """
+    plain = network._run_single_frame_inference
+
+    def even(*arguments: Any, **options: Any) -> Any:
+        out = plain(*arguments, **options)
+        out["object_score_logits"] = out["object_score_logits"].reshape(1, 1)
+        return out
+
+    network._run_single_frame_inference = even
 
 
 class _State:
