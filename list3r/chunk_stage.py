@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from list3r.association.motion import flag_moving
-from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo, guessed_camera
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
@@ -74,9 +74,17 @@ class ChunkTask:
 
 
 def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
-    """Frames of one chunk to poses, keyframes and a local instance library.
+    """Frames of one chunk to poses, keyframes and a local instance library; the last part of one that falls apart.
 
     A `discoverer` stands in for the one that the settings name.
+    """
+    return process_parts(task, discoverer)[-1]
+
+
+def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tuple[ChunkResult, ...]:
+    """As `process_chunk`, but all parts of a chunk through which the camera could not be followed, in order of time.
+
+    The last part has the number of the span, so that the span is done when that part is stored.
     """
     clock = _Clock()
     source = _source(task.path, task.options)
@@ -88,10 +96,41 @@ def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> Chun
     try:
         if not frames:
             raise TrackingError("no frame of the chunk could be decoded")
-        reconstruction = _model(task.settings, source.info.camera is not None)(frames, camera)
-    except TrackingError:
-        return _without_geometry(task, frames, camera, bad, clock.seconds)
+        parts = _reconstructed(task, source, frames, camera)
+    except TrackingError as error:
+        return (replace(_without_geometry(task, frames, camera, bad, clock.seconds), lost_reason=str(error)),)
     clock.mark("reconstruction")
+    results = []
+    for number, part in enumerate(parts, start=1):
+        here = set(part.frame_indices.tolist())
+        last = number == len(parts)
+        made = _described(task, [f for f in frames if f.index in here], part, bad if last else (), clock, discoverer)
+        results.append(made if last else replace(made, index=task.span.index + number * PART_STEP))
+    return tuple(results)
+
+
+PART_STEP = 1_000_000
+"""The n-th part of a chunk, but for the last, is numbered so much times n beyond its span."""
+
+
+def _reconstructed(
+    task: ChunkTask, source: FrameSource, frames: Sequence[Frame], camera: Camera
+) -> Sequence[Reconstruction]:
+    """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
+    model = _model(task.settings, source.info.camera is not None)
+    parts = getattr(model, "parts", None)
+    return [model(frames, camera)] if parts is None else parts(frames, camera)
+
+
+def _described(
+    task: ChunkTask,
+    frames: Sequence[Frame],
+    reconstruction: Reconstruction,
+    bad: tuple[tuple[int, str], ...],
+    clock: _Clock,
+    discoverer: Discoverer | None,
+) -> ChunkResult:
+    """What is found in a reconstruction, and what is kept of it."""
     named, tracker = _instance_models(task.settings)
     library = build_library(frames, reconstruction, task.settings.instances, discoverer or named, tracker)
     clock.mark("instances")
@@ -102,7 +141,9 @@ def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> Chun
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
-    return _result(task, frames, reconstruction, library, samples, bad, clock.seconds, keyframes)
+    seconds = dict(clock.seconds)
+    clock.seconds.clear()
+    return _result(task, frames, reconstruction, library, samples, bad, seconds, keyframes)
 
 
 def _result(

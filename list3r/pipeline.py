@@ -19,7 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from list3r import __version__
 from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk
+from list3r.calibration_stage import camera_notes, with_camera
+from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_parts
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.cuts import find_cuts
@@ -102,13 +103,14 @@ def build(
         session = _session(target.store, info, settings)
         spans = plan_chunks(info.frame_count, settings.chunks, _cuts(target.store, source, options, settings, scan))
         done = {c.index for c in target.store.chunks(session)}
+        found = with_camera(target.store, session, source, options, settings.reconstruction, info)
         tasks = [
-            ChunkTask(str(source), options, span, settings, None if debug_dir is None else str(debug_dir))
+            ChunkTask(str(source), found, span, settings, None if debug_dir is None else str(debug_dir))
             for span in spans
             if span.index not in done
         ]
         if tasks:
-            pool = OrderedPool(process_chunk, min(workers or usual_workers(settings), len(tasks)))
+            pool = OrderedPool(process_parts, min(workers or usual_workers(settings), len(tasks)))
             try:
                 with threadpool_limits(1):
                     _add_all(target, session, tasks, pool, info, progress)
@@ -135,23 +137,34 @@ def _add_all(
     target: _Target,
     session: int,
     tasks: list[ChunkTask],
-    pool: OrderedPool[ChunkTask, ChunkResult],
+    pool: OrderedPool[ChunkTask, tuple[ChunkResult, ...]],
     info: SourceInfo,
     progress: Progress | None,
 ) -> None:
     """Add the chunks in order, with one thread, so that sums do not depend on the machine."""
-    joint = RgbdJointReconstructor(target.store, {session: tasks[0].options}, joint_model(tasks[0].settings, info))
+    joint = RgbdJointReconstructor(target.store, {session: tasks[0].options}, joint_model(tasks[0]))
     debug_dir = None if tasks[0].debug_dir is None else Path(tasks[0].debug_dir)
     bad: set[int] = {index for s, index, _ in target.store.bad_frames() if s == session}
     if progress is not None:
         progress(len(target.store.frames(session)), info.frame_count)
-    for span, result in zip((t.span for t in tasks), pool.map(tasks), strict=True):
-        bad.update(index for index, _ in result.bad_frames)
+    known = {c.index for c in target.store.chunks(session)}
+    for span, results in zip((t.span for t in tasks), pool.map(tasks), strict=True):
+        bad.update(index for part in results for index, _ in part.bad_frames)
         check_bad_share(len(bad), info.frame_count)
-        add_chunk(target.store, session, result, joint, debug_dir=debug_dir)
+        for part in results:
+            if part.index not in known:
+                add_chunk(target.store, session, part, joint, debug_dir=debug_dir)
+                _note_lost(target.store, part)
         target.keep()
         if progress is not None:
             progress(span.stop, info.frame_count)
+
+
+def _note_lost(store: Store, result: ChunkResult) -> None:
+    """Keep why the camera could not be followed through a chunk."""
+    if result.lost_reason:
+        with store.transaction():
+            store.set_value("lost", [*store.get_value("lost", []), result.lost_reason])
 
 
 def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:
@@ -293,7 +306,8 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings) -> int:
 
 def _scale_kind(info: SourceInfo, settings: BuildSettings) -> str:
     """Whether a unit is a metre; sensor depth says nothing where the model does not look at it."""
-    return "relative" if _scale_source(info, settings) == "none" else info.scale_kind
+    source = _scale_source(info, settings)
+    return {"none": "relative", "given poses": "metric"}.get(source, info.scale_kind)
 
 
 def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:
@@ -326,9 +340,11 @@ def _finish(
     frames = store.frames(session)
     posed = sum(f.state == "posed" for f in frames)
     if posed == 0:
+        why = store.get_value("lost", [])
+        hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
         raise TrackingError(
             f"the camera could not be followed in any of the {len(frames)} frames of {info.path}; "
-            "check the depth scale and intrinsics with `list3r inspect`"
+            + "; ".join(filter(None, (*why[:1], hint)))
         )
     with threadpool_limits(1):
         finish_session(store, session)
@@ -357,7 +373,7 @@ def _finish(
 
 
 def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...]:
-    notes = []
+    notes = [line for session in store.sessions() for line in camera_notes(store, session.session_id)]
     cuts = store.get_value("cuts", [])
     if cuts:
         notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
@@ -367,6 +383,7 @@ def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...
         notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
     elif lost:
         notes.append(f"the camera could not be followed in {_count(lost, 'frame')}; they have no pose")
+    notes += store.get_value("lost", [])
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
     if store.get_value("gravity") == "unknown":

@@ -15,7 +15,8 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk
+from list3r.calibration_stage import with_camera
+from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_parts
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.cuts import find_cuts
@@ -85,7 +86,8 @@ def update(
         session = _session(store, info, settings, resume=resume)
         spans = plan_chunks(info.frame_count, settings.chunks, _cuts(store, session, source, options, settings, scan))
         done = {c.index for c in store.chunks(session)}
-        tasks = [ChunkTask(str(source), options, span, settings) for span in spans if span.index not in done]
+        found = with_camera(store, session, source, options, settings.reconstruction, info)
+        tasks = [ChunkTask(str(source), found, span, settings) for span in spans if span.index not in done]
         with threadpool_limits(1):
             if tasks:
                 _add_all(store, session, tasks, min(workers or usual_workers(settings), len(tasks)), info, progress)
@@ -143,16 +145,19 @@ def _add_all(
     store: Store, session: int, tasks: Sequence[ChunkTask], workers: int, info: SourceInfo, progress: Progress | None
 ) -> None:
     """Place the chunks in order; the library waits for the last one."""
-    joint = RgbdJointReconstructor(store, {session: tasks[0].options}, joint_model(tasks[0].settings, info))
+    joint = RgbdJointReconstructor(store, {session: tasks[0].options}, joint_model(tasks[0]))
     bad = {index for s, index, _ in store.bad_frames() if s == session}
     if progress is not None:
         progress(len(store.frames(session)), info.frame_count)
-    pool = OrderedPool(process_chunk, workers)
+    known = {c.index for c in store.chunks(session)}
+    pool = OrderedPool(process_parts, workers)
     try:
-        for task, result in zip(tasks, pool.map(tasks), strict=True):
-            bad.update(index for index, _ in result.bad_frames)
+        for task, results in zip(tasks, pool.map(tasks), strict=True):
+            bad.update(index for part in results for index, _ in part.bad_frames)
             check_bad_share(len(bad), info.frame_count)
-            add_chunk(store, session, result, joint, library=False)
+            for part in results:
+                if part.index not in known:
+                    add_chunk(store, session, part, joint, library=False)
             if progress is not None:
                 progress(task.span.stop, info.frame_count)
     finally:

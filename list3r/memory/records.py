@@ -187,6 +187,8 @@ class ChunkResult:
     """(Frame.index, reason) of frames that could not be decoded."""
     seconds: dict[str, float] = field(default_factory=dict)
     """CPU seconds by stage."""
+    lost_reason: str = ""
+    """Why the camera could not be followed through any of the frames, one sentence; empty where it could."""
 
 
 # ---------------------------------------------------------------------------------------------- the memory

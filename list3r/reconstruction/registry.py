@@ -35,11 +35,13 @@ class ModelEntry:
     """Works on RGB-D only."""
     needs_camera: bool = False
     """Must be told the intrinsics; the others find the focal length themselves."""
+    calibration: str = ""
+    """Module that estimates an unknown camera before the chunks, which has `calibrate(source) -> Calibration`."""
 
 
 MODELS: dict[str, ModelEntry] = {
     "rgbd": ModelEntry("rgbd", needs_depth=True, needs_camera=True),
-    "sfm": ModelEntry("sfm"),
+    "sfm": ModelEntry("sfm", calibration="sfm_calibration"),
     "pi3": ModelEntry("pi3"),
     "pi3x": ModelEntry("pi3x"),
     "vggt": ModelEntry("vggt"),

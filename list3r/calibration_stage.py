@@ -1,0 +1,62 @@
+"""Before the chunks: the camera of a source that does not say all of it, estimated once and kept in the memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from list3r.frames.base import Camera, SourceInfo
+from list3r.frames.options import SourceOptions
+from list3r.frames.rig import resized
+from list3r.frames.source import open_source
+from list3r.memory.store import Store
+from list3r.reconstruction.registry import entry
+
+_SILENT_ON_DISTORTION = ("images", "video")
+"""Kinds of source that say nothing of their lens but what the user does."""
+
+
+def with_camera(
+    store: Store, session: int, source: str | Path, options: SourceOptions, model: str, info: SourceInfo
+) -> SourceOptions:
+    """The options with the camera that was estimated for a session, for models that leave that to a stage of its own.
+
+    It is estimated where intrinsics or distortion are unknown, once: an interrupted session goes on with the same.
+    """
+    module = entry(model).calibration
+    told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
+    if not module or (info.camera is not None and told):
+        return options
+    known = store.get_value(_name(session))
+    if known is None:
+        with threadpool_limits(1):
+            found = import_module(f"list3r.reconstruction.{module}").calibrate(open_source(source, options))
+        known = {"notes": list(found.notes), **_as_stored(found.camera, source, options)}
+        with store.transaction():
+            store.set_value(_name(session), known)
+    return replace(options, intrinsics=tuple(known["intrinsics"]), distortion=tuple(known["distortion"]))
+
+
+def camera_notes(store: Store, session: int) -> tuple[str, ...]:
+    """What the user should know of the camera that was estimated."""
+    known: dict[str, Any] = store.get_value(_name(session), {})
+    return tuple(known.get("notes", ()))
+
+
+def _as_stored(camera: Camera, source: str | Path, options: SourceOptions) -> dict[str, list[float]]:
+    """Intrinsics and distortion for pictures as stored, which may be larger than the frames handed out."""
+    whole = open_source(source, replace(options, max_side=0)).info
+    size = whole.image_size or (camera.height, camera.width)
+    if whole.camera is not None:
+        size = (whole.camera.height, whole.camera.width)
+    full = resized(camera, size)
+    assert full is not None
+    return {"intrinsics": [full.fx, full.fy, full.cx, full.cy], "distortion": list(camera.distortion)}
+
+
+def _name(session: int) -> str:
+    return f"camera {session}"
