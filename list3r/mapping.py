@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -167,7 +167,8 @@ def place_chunks(
         return
     gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
     upright = world_from_graph(gravity)
-    S_world_graph = settle_scale(store, store.chunks(), graph.S_graph_chunk) @ upright
+    rows = [replace(c, component=graph.components[c.chunk_id]) for c in store.chunks()]
+    S_world_graph = settle_scale(store, rows, graph.S_graph_chunk) @ upright
     store.set_value("T_world_graph", S_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
     store.place_chunks({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
