@@ -1,0 +1,254 @@
+"""A library that grows is the library that is derived as a whole, and a chunk touches nothing that is far away."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from list3r.memory import edits, library_things, summaries
+from list3r.memory.consolidation import consolidate
+from list3r.memory.geometry import Sim3
+from list3r.memory.library_rules import ConsolidationSettings
+from list3r.memory.records import ChunkResult
+from list3r.memory.store import Store
+
+GROW = ConsolidationSettings(whole_chunks=0)
+ORDERS = {
+    "rooms": [0, 1, 2, 3, 4, 5, 6, 7],
+    "there and back": [0, 1, 2, 3, 2, 1, 0, 1],
+    "one room": [0, 1, 0, 1, 0, 1, 0],
+    "jumps": [0, 5, 1, 4, 2, 3],
+}
+
+
+@pytest.fixture(scope="module")
+def walks() -> Iterator[ModuleType]:
+    """`benchmarks/incremental.py`, whose chunks these are."""
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "incremental.py"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(path.parent)
+        spec = importlib.util.spec_from_file_location("incremental", path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        yield module
+
+
+def visit(walks: ModuleType, index: int, place: int, name: str = "rooms") -> ChunkResult:
+    """Chunk `index` of a walk, which sees what lies at a place, each time with other errors."""
+    rng = np.random.default_rng([7, index])
+    made: ChunkResult = walks.chunk(place, name, 1)
+    frames = np.arange(walks.HOP * index, walks.HOP * index + walks.FRAMES)
+    off = rng.normal(0.0, 0.004, 3)
+
+    def seen(found):  # type: ignore[no-untyped-def]
+        points = found.support.points + off + rng.normal(0.0, 0.002, found.support.points.shape)
+        support = dataclasses.replace(found.support, points=points.astype(np.float32))
+        return dataclasses.replace(found, support=support, track=dataclasses.replace(found.track, frames=frames))
+
+    library = dataclasses.replace(made.library, instances=tuple(map(seen, made.library.instances)))
+    return dataclasses.replace(made, index=index, frame_indices=frames, times_s=frames / 30.0, library=library)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.create(tmp_path / "walk.l3r") as opened:
+        begin(opened)
+        yield opened
+
+
+def begin(store: Store) -> None:
+    with store.transaction():
+        store.set_value("scale_kind", "metric")
+        store.set_value("gravity", "estimated")
+        store.add_session("walk", "made up", {}, 999)
+
+
+def add(store: Store, result: ChunkResult, pose: Sim3 | None = None, component: int = 1) -> int:
+    with store.transaction():
+        chunk_id = store.add_chunk(1, result)
+        store.place_chunks({chunk_id: pose or Sim3.identity()}, {chunk_id: component})
+        consolidate(store, chunk_id, GROW)
+    return chunk_id
+
+
+def tables(store: Store) -> dict[str, list[tuple[object, ...]]]:
+    """All that consolidation writes, but for words on colours, whose light may lag behind a little."""
+    columns = "id, label, confidence, observations, first_seen_s, last_seen_s, state, structure, component, view_frame"
+    return {
+        "instances": store._rows(f"SELECT {columns} FROM instances ORDER BY id"),
+        "members": store._rows("SELECT * FROM members ORDER BY chunk_id, local_id"),
+        "observations": store._rows("SELECT * FROM observations ORDER BY chunk_id, local_id"),
+        "relations": store._rows("SELECT * FROM relations ORDER BY subject, predicate, object"),
+        "embeddings": store._rows("SELECT * FROM embeddings ORDER BY instance"),
+        "dropped": store._rows("SELECT chunk_id, dropped FROM settled ORDER BY chunk_id"),
+        "overlaps": store._rows("SELECT * FROM overlaps ORDER BY u, v"),
+        "aliases": store._rows("SELECT * FROM aliases ORDER BY id"),
+    }
+
+
+class _Undone(Exception):
+    """What was derived as a whole is only looked at."""
+
+
+def check(store: Store) -> None:
+    """What has grown is what is derived as a whole, ids and all."""
+    grown, boxes = tables(store), [i.aabb for i in store.instances()]
+    with pytest.raises(_Undone), store.transaction():
+        store.forget_library()
+        report = consolidate(store, settings=GROW)
+        whole, others = tables(store), [i.aabb for i in store.instances()]
+        raise _Undone
+    assert report.new == () and report.merged == ()
+    for name, rows in whole.items():
+        assert grown[name] == rows, name
+    assert np.allclose(boxes, others, atol=1e-9)
+    assert store.verify() == []
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_grown_library_is_the_one_derived_as_a_whole(walks: ModuleType, store: Store, order: str) -> None:
+    for index, place in enumerate(ORDERS[order]):
+        add(store, visit(walks, index, place))
+    check(store)
+
+
+def test_one_floor_goes_on_under_another_id_after_a_while(walks: ModuleType, store: Store) -> None:
+    for index in range(8):
+        add(store, visit(walks, index, index, "corridor"))
+    check(store)
+    floors = store.instances(structure=True)
+    assert len(floors) > 1
+    assert all(np.ptp(i.aabb, axis=0).max() <= 20.0 for i in floors)
+
+
+def test_chunks_that_a_loop_closure_moves_are_followed(walks: ModuleType, store: Store) -> None:
+    for index, place in enumerate(ORDERS["there and back"]):
+        add(store, visit(walks, index, place))
+    for off in (0.03, 0.4, 0.0):
+        with store.transaction():
+            store.place_chunks({4: Sim3.exp(np.array([off, off, 0, 0, 0, 0.1 * off, 0]))}, {4: 1})
+            consolidate(store, settings=GROW)
+        check(store)
+
+
+def test_a_part_that_is_joined_to_another_is_merged_with_it(walks: ModuleType, store: Store) -> None:
+    far = Sim3.exp(np.array([3.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    for index, place in enumerate((0, 1, 2, 3)):
+        add(store, visit(walks, index, place))
+    add(store, visit(walks, 4, 1), far, component=5)
+    check(store)
+    assert {i.component for i in store.instances()} == {1, 5}
+    with store.transaction():
+        store.place_chunks({5: Sim3.identity()}, {5: 1})
+        consolidate(store, settings=GROW)
+    check(store)
+    assert {i.component for i in store.instances()} == {1} and len(store.aliases()) >= 12
+
+
+def test_the_word_of_operators_holds_while_the_library_grows(walks: ModuleType, store: Store) -> None:
+    for index, place in enumerate((0, 1, 2)):
+        add(store, visit(walks, index, place))
+    things = [i.id for i in store.instances(structure=False) if len(store.observations(i.id)) > 1]
+    edits.merge(store, things[0], things[1], "somebody")
+    entry = edits.split(store, things[2], author="somebody").entry
+    edits.label(store, things[3], "cup", "somebody")
+    edits.delete(store, things[4], "somebody")
+    edits.label(store, 1, "first", "somebody")
+    for index, place in enumerate((1, 0, 3), start=3):
+        add(store, visit(walks, index, place))
+        check(store)
+    assert store.instance(things[3]).label == "cup" and store.resolve(things[1]) == things[0]
+    edits.undo(store, entry, "somebody")
+    add(store, visit(walks, 6, 1))
+    check(store)
+
+
+def test_little_is_kept_between_chunks_and_what_is_not_is_read_again(
+    walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(summaries, "_KEPT", 2)
+    monkeypatch.setattr(library_things, "_KEPT", 5)
+    for index, place in enumerate(ORDERS["there and back"]):
+        add(store, visit(walks, index, place))
+        assert len(summaries._cache[store]) <= 2 and len(library_things._derived[store]) <= 5
+    check(store)
+
+
+def test_a_memory_that_was_closed_grows_on(walks: ModuleType, tmp_path: Path) -> None:
+    found = []
+    for name, again in (("one.l3r", False), ("two.l3r", True)):
+        store = Store.create(tmp_path / name)
+        begin(store)
+        for index, place in enumerate(ORDERS["there and back"]):
+            add(store, visit(walks, index, place))
+            if again:
+                store.close()
+                store = Store.open(tmp_path / name, writable=True)
+        found.append(tables(store))
+        store.close()
+    assert found[0] == found[1]
+
+
+def test_a_chunk_that_was_taken_back_leaves_no_trace(walks: ModuleType, store: Store) -> None:
+    for index in range(4):
+        add(store, visit(walks, index, index))
+    before = tables(store)
+    with pytest.raises(_Undone), store.transaction():
+        chunk_id = store.add_chunk(1, visit(walks, 4, 1))
+        store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+        consolidate(store, chunk_id, GROW)
+        raise _Undone
+    assert tables(store) == before
+    add(store, visit(walks, 4, 4))
+    check(store)
+
+
+def rows_of(store: Store, keep: Callable[[int], bool]) -> dict[str, list[tuple[object, ...]]]:
+    """Whole rows of some instances and of what hangs on them."""
+    return {
+        "instances": [r for r in store._rows("SELECT * FROM instances ORDER BY id") if keep(r[0])],
+        "boxes": [r for r in store._rows("SELECT * FROM instance_boxes ORDER BY id") if keep(r[0])],
+        "relations": [r for r in store._rows("SELECT * FROM relations ORDER BY 1, 2, 3") if keep(r[0]) and keep(r[2])],
+        "embeddings": [r for r in store._rows("SELECT * FROM embeddings ORDER BY instance") if keep(r[0])],
+    }
+
+
+def test_a_chunk_changes_no_row_of_what_is_far_away(walks: ModuleType, store: Store) -> None:
+    for index in range(9):
+        add(store, visit(walks, index, index))
+    reach = float(min(i.aabb[0, 0] for i in store.instances() if {o.chunk_id for o in store.observations(i.id)} & {9}))
+    far = {i.id for i in store.instances() if i.aabb[1, 0] < reach - 6.0}
+    assert len(far) > 20
+    before = rows_of(store, far.__contains__)
+    sums = dict(store._rows("SELECT part, crcs FROM sums WHERE name = 'instances'"))
+    add(store, visit(walks, 9, 9))
+    assert rows_of(store, far.__contains__) == before
+    now = dict(store._rows("SELECT part, crcs FROM sums WHERE name = 'instances'"))
+    assert all(now[part] == sums[part] for part in sums if all(n in far for n in range(16 * part, 16 * part + 16)))
+
+
+def test_as_much_is_written_for_a_late_chunk_as_for_an_early_one(walks: ModuleType, store: Store) -> None:
+    counts = []
+    for index in range(16):
+        before, rows = len(store.vectors_touched), store._database.total_changes
+        add(store, visit(walks, index, index))
+        counts.append((len(store.vectors_touched) - before, store._database.total_changes - rows))
+    assert {c for c, _ in counts[6:]} <= {counts[6][0], counts[7][0]}
+    assert max(r for _, r in counts[12:]) <= 1.3 * max(r for _, r in counts[6:8])
+
+
+def test_a_chunk_with_another_feature_space_makes_all_be_derived_anew(walks: ModuleType, store: Store) -> None:
+    for index in range(3):
+        add(store, visit(walks, index, index))
+    other = visit(walks, 3, 1)
+    add(store, dataclasses.replace(other, library=dataclasses.replace(other.library, feature_space="other@1/64")))
+    assert store.get_value("library")["space"] == ""
+    add(store, visit(walks, 4, 2))
+    check(store)
