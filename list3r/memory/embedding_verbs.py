@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from list3r.memory.chunk_verbs import ChunkVerbs
 from list3r.memory.errors import MemoryFileError
+from list3r.memory.word_verbs import WordVerbs
 from list3r.memory.writer_lock import WriterLock
 
 _BATCH = 500
 """Rows asked for by id in one statement."""
 
 
-class EmbeddingVerbs(ChunkVerbs):
+class EmbeddingVerbs(ChunkVerbs, WordVerbs):
     """Vectors in, vectors out. Writing verbs are called inside `transaction()`."""
 
     def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:

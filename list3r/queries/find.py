@@ -14,6 +14,7 @@ from list3r.memory.store import Store
 from list3r.memory.words import split_words, vocabulary
 from list3r.queries.camera import camera_of_frame
 from list3r.queries.free_words import WordEncoder
+from list3r.queries.gather import Gathered, gather
 from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
 from list3r.queries.match import Match, checked_count, checked_instance
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
@@ -47,6 +48,10 @@ class Found(list[Match]):
         return len(self) > 1 and self[0].score - self[1].score < 0.02
 
 
+_Pair = tuple[int, str, float, str]
+"""Subject, predicate, confidence, and where it is seen from, in words."""
+
+
 @dataclass(frozen=True)
 class _Candidate:
     instance: Instance
@@ -63,6 +68,8 @@ class _Search:
     vocabulary: dict[int, dict[str, float]]
     encoder: WordEncoder | None
     viewpoint: Place | None
+    gathered: Gathered | None
+    """What of a large memory is in `things`; None where it is everything."""
     notes: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
 
@@ -82,8 +89,11 @@ def find(
     """
     k = checked_count(k)
     phrase = parse(text)
-    things = {i.id: i for i in store.instances()}
-    search = _Search(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint)
+    gathered = gather(store, phrase)
+    loaded = store.instances() if gathered is None else store.instances_of(sorted(gathered.ids))
+    things = {i.id: i for i in loaded}
+    search = _Search(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
+    search.notes += [] if gathered is None else gathered.notes
     found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
     matches = [Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "a thing") for c in found[:k]]
     out = Found(matches, search.notes, search.unknown)
@@ -107,7 +117,7 @@ def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
     else:
         found = _named(search, phrase)
     if phrase.size is not None:
-        found = _sized(search, found, phrase.size)
+        found = _sized(search, found, phrase)
     for clause in phrase.where:
         if not found:
             # The rest is looked at all the same, so that all words that nothing bears are told.
@@ -127,14 +137,15 @@ def _vocabulary(i: Instance) -> dict[str, float]:
 
 
 def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
-    unknown = [w for w in phrase.words if not any(w in v for v in search.vocabulary.values())]
+    unknown = _unknown(search, phrase.words)
     if unknown:
         by_vector = _by_vector(search, phrase)
         if by_vector is not None:
             return by_vector
         search.unknown += unknown
         bear = ", ".join(repr(w) for w in unknown)
-        names = ", ".join(_names(search.things.values()))
+        named = search.things.values() if search.gathered is None else search.store.instances_of(search.gathered.sample)
+        names = ", ".join(_names(named))
         hint = f"; things here are called: {names}" if names else ""
         search.notes.append(f"nothing in this memory bears the word{'s' if len(unknown) > 1 else ''} {bear}{hint}")
         return []
@@ -151,6 +162,14 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
     if not out and len(phrase.words) > 1:
         search.notes.append("no one thing is all of " + ", ".join(repr(w) for w in phrase.words))
     return out
+
+
+def _unknown(search: _Search, words: Sequence[str]) -> list[str]:
+    """Words that nothing bears."""
+    if search.gathered is not None:
+        known = search.store.known_words(words)
+        return [w for w in words if w not in known]
+    return [w for w in words if not any(w in v for v in search.vocabulary.values())]
 
 
 def _names(things: Iterable[Instance], most: int = 12) -> list[str]:
@@ -173,6 +192,8 @@ def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
     query = np.asarray(encoder.encode(" ".join(phrase.words)), dtype=np.float64)
     lengths = np.linalg.norm(vectors, axis=1) * np.linalg.norm(query)
     cosine = vectors @ query / np.maximum(lengths, 1e-12)
+    if search.gathered is not None:
+        _look_at_too(search, ids[cosine >= encoder.min_cosine].tolist())
     return [
         _Candidate(search.things[n], float(c), (f"like {' '.join(phrase.words)!r}: cosine {c:.2f} in {encoder.space}",))
         for n, c in zip(ids.tolist(), cosine.tolist(), strict=True)
@@ -180,15 +201,24 @@ def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
     ]
 
 
+def _look_at_too(search: _Search, ids: Sequence[int]) -> None:
+    for i in search.store.instances_of([n for n in ids if n not in search.things]):
+        search.things[i.id], search.vocabulary[i.id] = i, _vocabulary(i)
+
+
 # ---------------------------------------------------------------------------------------------- sizes
 
 
-def _sized(search: _Search, found: list[_Candidate], size: str) -> list[_Candidate]:
+def _sized(search: _Search, found: list[_Candidate], phrase: Phrase) -> list[_Candidate]:
     """Those of a size, relative to the others that fit the words, or to all things where those are fewer than four."""
-    among = [c.instance for c in found]
-    if len(among) < 4:
-        among = [i for i in search.things.values() if i.structure is None] or among
-    edges = np.sort([_edge(i) for i in among])
+    size = phrase.size
+    assert size is not None
+    edges = np.array([]) if search.gathered is None else search.gathered.sizes_of(search.store, phrase.words)
+    if len(edges) == 0:
+        among = [c.instance for c in found]
+        if len(among) < 4:
+            among = [i for i in search.things.values() if i.structure is None] or among
+        edges = np.sort([_edge(i) for i in among])
     low, high = SIZES[size]
     out = []
     for c in found:
@@ -253,8 +283,10 @@ def _standing(
 ) -> list[_Candidate]:
     subjects = {c.instance.id: c for c in found}
     best: dict[int, _Candidate] = {}
+    together = _pairs_of_many(search, subjects, objects, predicates) if len(objects) > _MOST_OBJECTS else None
     for object in objects:
-        for subject, predicate, confidence, whence in _pairs(search, subjects, object, predicates):
+        pairs = _pairs(search, subjects, object, predicates) if together is None else together[object.instance.id]
+        for subject, predicate, confidence, whence in pairs:
             c = subjects[subject]
             score = c.score * confidence * (0.5 + 0.5 * object.score)
             if subject not in best or score > best[subject].score:
@@ -265,9 +297,33 @@ def _standing(
     return [best[n] for n in sorted(best)]
 
 
+def _pairs_of_many(
+    search: _Search, subjects: dict[int, _Candidate], objects: list[_Candidate], predicates: Sequence[str]
+) -> dict[int, list[_Pair]] | None:
+    """`_pairs` of many objects, in few questions to the store; None for relations that are not stored."""
+    if set(predicates) & set(VIEWPOINT):
+        return None
+    out: dict[int, list[_Pair]] = {c.instance.id: [] for c in objects}
+    from_objects = len(objects) <= len(subjects)
+    rows = search.store.related(out if from_objects else subjects, predicates, as_object=from_objects)
+    order = {p: n for n, p in enumerate(predicates)}
+    for s, p, o, sure in sorted(rows, key=lambda r: (r[2], order[r[1]], -r[3], r[0])):
+        if s in subjects and o in out and s != o:
+            out[o].append((s, p, sure, ""))
+    for predicate in predicates:
+        held = relations(search.store, None, predicate, objects[0].instance.id)
+        if held.state == "unknown" and predicate in VERTICAL:
+            search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
+    for c in objects if "near" in predicates else []:
+        if c.instance.structure is not None:
+            near = _near_structure(search, subjects, c.instance)
+            out[c.instance.id] += [p for p in near if p[0] != c.instance.id]
+    return out
+
+
 def _pairs(
     search: _Search, subjects: dict[int, _Candidate], object: _Candidate, predicates: Sequence[str]
-) -> list[tuple[int, str, float, str]]:
+) -> list[_Pair]:
     """(subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
     o = object.instance
     out: list[tuple[int, str, float, str]] = []

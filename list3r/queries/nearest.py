@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -13,6 +14,7 @@ from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.best_first import box_gaps, nearest_first
 from list3r.queries.free_words import WordEncoder, named_by_vectors
+from list3r.queries.gather import is_large
 from list3r.queries.match import (
     FilterOptions,
     Filters,
@@ -24,6 +26,9 @@ from list3r.queries.match import (
 )
 from list3r.queries.surfaces import STRAY, distance_between, distance_to_point, surface_of
 from list3r.queries.words import STRUCTURE, wanted_words, word_score
+
+_LOADED = 5_000
+"""Instances that are looked at because of what they are called, in a memory that holds many."""
 
 
 def nearest(
@@ -63,8 +68,15 @@ def nearest(
     if words is None:
         near = _near(store, origin, place, k, max_distance, filters)
         return [_match(i, distance, "", origin, place) for distance, i in near]
-    others = [i for i in filters.select(store.instances()) if origin is None or i.id != origin.id]
-    named = _named(others, words) or _alike(store, others, words, encoder)
+    if is_large(store) and (origin is not None or place is not None) and _common(store, words):
+        filters = replace(filters, label=" ".join([*([filters.label] if filters.label else []), words]))
+        near = _near(store, origin, place, k, max_distance, filters)
+        return [_match(i, distance, f"named {words}", origin, place) for distance, i in near]
+    others = [i for i in filters.select(_bearers(store, words, filters)) if origin is None or i.id != origin.id]
+    named = _named(others, words)
+    if not named and encoder is not None:
+        others = [i for i in filters.select(store.instances()) if origin is None or i.id != origin.id]
+        named = _alike(store, others, words, encoder)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         return [Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]]
@@ -72,6 +84,22 @@ def nearest(
     reasons = {i.id: reason for i, _, reason in named}
     found = _by_distance(bearing, _measure(store, origin, place), _aabb(origin, place), k, max_distance)
     return [_match(i, distance, reasons[i.id], origin, place) for distance, i in found]
+
+
+def _common(store: Store, words: str) -> bool:
+    """Whether so many bear all the words that it is better to look around for them than to look at them all."""
+    return len(store.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
+
+
+def _bearers(store: Store, words: str, filters: Filters) -> list[Instance]:
+    """All instances; of a memory that holds too many those that bear the most of the words and pass the filters."""
+    if not is_large(store):
+        return store.instances()
+    for ids in store.bearing_most(wanted_words(words), 20 * _LOADED):
+        found = filters.select(store.instances_of(ids[:_LOADED]))
+        if _named(found, words):
+            return found
+    return []
 
 
 def _alike(

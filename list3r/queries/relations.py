@@ -13,6 +13,7 @@ from list3r.memory.relation_scene import RelationSettings
 from list3r.memory.relations import PREDICATES
 from list3r.memory.store import Store
 from list3r.queries.camera import Camera, camera_of_frame, last_camera
+from list3r.queries.gather import is_large
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
 from list3r.queries.words import wanted_words, words_of
@@ -20,6 +21,9 @@ from list3r.queries.words import wanted_words, words_of
 VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "under", "attached_to"))
 """Predicates that exist only where gravity is known or estimated."""
 ALL_PREDICATES = (*(p for p in PREDICATES if p != "between"), *VIEWPOINT, "between")
+
+_MOST_NAMED = 20_000
+"""Instances that words may stand for."""
 
 Place = int | str | Sequence[float] | Camera
 """Where to look from: an instance's id, "camera" (where it was last), "camera:FRAME", a point x, y, z, or a camera."""
@@ -116,6 +120,8 @@ def _ids(store: Store, what: int | str | None) -> list[int] | None:
         return None
     if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):
         wanted = set(wanted_words(what))
+        if is_large(store):
+            return sorted(store.bearing(sorted(wanted), _MOST_NAMED))
         return [i.id for i in store.instances() if wanted <= words_of(i)]
     return [checked_instance(store, int(what.removeprefix("#")) if isinstance(what, str) else what).id]
 

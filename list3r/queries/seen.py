@@ -10,7 +10,7 @@ from list3r.memory.records import BestView
 from list3r.memory.store import Store
 from list3r.queries.camera import Camera
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
-from list3r.queries.visibility import Seen, look
+from list3r.queries.visibility import Seen, in_front, look
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def visible(
     filters = Filters(**options)
     followed = _followed(store, camera)
     found = []
-    for s in look(store, camera, store.instances(), max_depth=max_depth, occlusion=occlusion):
+    for s in look(store, camera, in_front(store, camera, max_depth), max_depth=max_depth, occlusion=occlusion):
         if s.visible >= min_visible and filters.passes(s.instance):
             found.append(_match(s, camera, followed))
     return sorted(found, key=lambda m: (-m.score, m.distance_m or 0.0, m.instance.id))

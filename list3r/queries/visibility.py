@@ -28,6 +28,10 @@ _BY_CELLS = 6
 """Points that reach further, few and near, are drawn one by one."""
 _FEW = 9
 """With fewer points than this the box stands for the surface, so many points along each edge."""
+_MANY = 5_000
+"""In memories of more things than this those that would hardly show are not looked at."""
+_LEAST_CELLS = 2.0
+"""Their width."""
 _NOISE = 0.02
 """Depth noise between views over depth."""
 
@@ -92,6 +96,42 @@ def look(
         share, part = float(shows.mean()), float(shows.sum()) / (height * width)
         out.append(Seen(d.instance, d.inside, share, part, float(d.depth[shows].min()), box))
     return out
+
+
+def in_front(store: Store, camera: Camera, max_depth: float | None = None) -> list[Instance]:
+    """What may show or hide in a picture, by id: what the R*Tree finds in the box around the frustum.
+
+    In a memory of more than `_MANY` things those are left out that are narrower there than two cells of the buffer.
+    """
+    bounds = store.world_bounds()
+    if bounds is None:
+        return []
+    step = max(1.0, camera.image_size[1] / _WIDTH)
+    ends = np.abs(bounds - camera.place).max(axis=0)
+    far = float(np.linalg.norm(ends)) if max_depth is None else 1.05 * max_depth
+    many = store.largest_id() > _MANY
+    fx, fy, cx, cy = camera.intrinsics
+    height, width = camera.image_size
+    beside = _MAX_REACH * step
+    u, v = np.array([-beside, width + beside]), np.array([-beside, height + beside])
+    rays = np.array([[(x - cx) / fx, (y - cy) / fy, 1.0] for x in u for y in v]) * far
+    corners = np.vstack([rays @ camera.T_world_cam[:3, :3].T + camera.place, camera.place])
+    slack = 0.05 * far
+    ids, boxes = store.boxes_in_box(corners.min(axis=0) - slack, corners.max(axis=0) + slack)
+    if many:
+        apart = np.maximum(0.0, np.maximum(boxes[:, 0] - camera.place, camera.place - boxes[:, 1]))
+        away = np.linalg.norm(apart, axis=1)
+        wide = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1) * fx >= _LEAST_CELLS * step * away
+        ids = ids[wide & (_depths(boxes, camera).max(axis=1) > 0.0)]
+    return store.instances_of(sorted(ids.tolist()))
+
+
+def _depths(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Depths of the corners of boxes (N, 2, 3). Shape (N, 8)."""
+    ahead = camera.T_world_cam[:3, 2]
+    parts = (boxes - camera.place) * ahead
+    sums = parts[:, :, None, None, 0] + parts[:, None, :, None, 1] + parts[:, None, None, :, 2]
+    return np.asarray(sums.reshape(len(boxes), 8))
 
 
 def _draw(

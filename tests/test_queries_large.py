@@ -1,0 +1,138 @@
+"""Questions to a memory that is too large to look at all of it have the answers that looking at all of it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from list3r.memory.records import Instance, Relation
+from list3r.memory.store import Store
+from list3r.queries import gather, visibility
+from list3r.queries.camera import Camera
+from list3r.queries.find import find
+from list3r.queries.match import Match
+from list3r.queries.nearest import nearest
+from list3r.queries.relations import relations
+from list3r.queries.seen import visible
+from tests.conftest import instance
+
+COUNT = 400
+COLORS, SHAPES, LABELS = (
+    ("red", "blue", "dark green"),
+    ("box", "sheet", "cylinder"),
+    (None, None, "mug", "office chair"),
+)
+
+
+def things(rng: np.random.Generator) -> Iterator[Instance]:
+    for n in range(1, COUNT + 1):
+        center, size = rng.uniform([0, 0, 0], [9, 9, 3]), rng.uniform(0.05, 0.8, 3)
+        yield replace(
+            instance(n, tuple(center), tuple(size), (200, 30, 30)),
+            label=LABELS[n % 4],
+            description=f"small {COLORS[n % 3]} {SHAPES[n % 5 % 3]}, 9 cm",
+            structure="wall" if n % 97 == 0 else None,
+            color_name=COLORS[n % 3],
+            confidence=n % 7 / 7,
+        )
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    rng = np.random.default_rng(0)
+    with Store.create(tmp_path_factory.mktemp("large") / "large.l3r") as made:
+        with made.transaction():
+            made.set_value("gravity", "known")
+            made.put_instances(things(rng))
+            pairs = rng.integers(1, COUNT + 1, (900, 2)).tolist()
+            kinds = ("near", "on", "next_to")
+            made.replace_relations(
+                None, [Relation(a, kinds[k % 3], b, 0.5 + k / 2000, 0.1) for k, (a, b) in enumerate(pairs) if a != b]
+            )
+        yield made
+
+
+def plain(matches: list[Match]) -> list[tuple[object, ...]]:
+    return [(m.instance.id, m.score, m.distance_m, m.reason) for m in matches]
+
+
+@pytest.fixture
+def large(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    monkeypatch.setattr(gather, "EVERYTHING", COUNT)
+    return monkeypatch
+
+
+TEXTS = [
+    "mug",
+    "red mug",
+    "dark green office chair",
+    "red mug on blue box",
+    "box near mug",
+    "mug near the wall",
+    "chair next to 12",
+    "thing on 30",
+    "red thing on a blue sheet near a chair",
+    "the biggest blue cylinder",
+    "wall",
+    "9",
+    "mug between 4 and 8",
+    "zebra",
+    "red zebra on mug",
+    "red blue",
+    "small mug",
+    "large red box near chair",
+]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_find_answers_alike(store: Store, text: str, large: pytest.MonkeyPatch) -> None:
+    wanted = find(store, text, k=30)
+    large.setattr(gather, "EVERYTHING", 0)
+    found = find(store, text, k=30)
+    assert plain(found) == plain(wanted)
+    assert found.unknown_words == wanted.unknown_words and bool(found.notes) == bool(wanted.notes)
+
+
+@pytest.mark.parametrize("words", ["mug", "red mug", "chai", "mug zebra", "zebra"])
+def test_words_stand_for_the_same_things(store: Store, words: str, large: pytest.MonkeyPatch) -> None:
+    def ask() -> list[object]:
+        return [
+            plain(nearest(store, words=words, k=9)),
+            plain(nearest(store, words=words, point=(4.0, 4.0, 1.0), k=9)),
+            plain(nearest(store, words=words, instance_id=7, k=9, color="red")),
+            list(relations(store, words, "near", None)),
+        ]
+
+    wanted = ask()
+    large.setattr(gather, "EVERYTHING", 0)
+    assert ask() == wanted
+
+
+def test_what_is_common_is_looked_for_around_the_place(store: Store, large: pytest.MonkeyPatch) -> None:
+    wanted = nearest(store, words="mug", point=(4.0, 4.0, 1.0), k=9)
+    large.setattr(gather, "EVERYTHING", 0)
+    large.setattr("list3r.queries.nearest._LOADED", 10)
+    found = nearest(store, words="mug", point=(4.0, 4.0, 1.0), k=9)
+    assert [(m.instance.id, m.distance_m) for m in found] == [(m.instance.id, m.distance_m) for m in wanted]
+
+
+@pytest.mark.parametrize("depth", [None, 2.5])
+def test_a_camera_sees_what_it_saw(store: Store, depth: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        pose = np.eye(4)
+        pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        pose[:3, :3] *= np.sign(np.linalg.det(pose[:3, :3]))
+        pose[:3, 3] = rng.uniform(0, 9, 3)
+        camera = Camera(pose, (300.0, 300.0, 159.5, 119.5), (240, 320), 1, 1)
+        found = plain(visible(store, camera, min_visible=0.0, max_depth=depth))
+        with monkeypatch.context() as patch:
+            patch.setattr("list3r.queries.seen.in_front", lambda store, *_: store.instances())
+            assert plain(visible(store, camera, min_visible=0.0, max_depth=depth)) == found
+        with monkeypatch.context() as patch:
+            patch.setattr(visibility, "_MANY", 0)
+            few = {m.instance.id for m in visible(store, camera, min_visible=0.0, max_depth=depth)}
+        assert few <= {row[0] for row in found}
