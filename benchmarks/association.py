@@ -5,7 +5,8 @@ python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FIL
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
 model and the instance tracker are simulated (`list3r.simulation.feedforward`). `baseline` is the split-and-fuse way of
 VGGT-Long: support by confidence alone, adjacent edges, loops by frame similarity of 0.85 without verification, plain
-least squares. Each variant adds to the one before; `iasm-only` is the baseline with instance-aware support alone.
+least squares. Each variant adds to the one before, CWGO the nodes within chunks too; `iasm-only` is the baseline with
+instance-aware support alone.
 """
 
 from __future__ import annotations
@@ -118,6 +119,7 @@ def variant_settings(variant: str) -> Any:
         revisits=loops if aware else replace(loops, window=plain_windows),
         edges=full.edges if aware else plain_edges,
         graph=full.graph if step >= 3 else plain_graph,
+        nodes=full.nodes if step >= 3 else replace(full.nodes, enabled=False),
     )
 
 
@@ -255,10 +257,21 @@ def _moved(S: Any, poses: Array) -> Array:
 
 
 def _points(store: Any) -> Array:
-    parts = []
+    """Points where the frames that saw them lie, the bending of chunks undone."""
+    from list3r.memory.geometry import Sim3
+
+    parts, bends = [], store.bends()
     for chunk in store.chunks():
         samples = store.frame_samples(chunk.chunk_id)
-        parts.append(chunk.S_world_chunk.apply(samples.points[samples.confidence > 0.3][::5]))
+        kept = np.flatnonzero(samples.confidence > 0.3)[::5]
+        points = samples.points[kept].astype(np.float64)
+        if chunk.chunk_id in bends:
+            frames, of_point = np.unique(samples.frame[kept], return_inverse=True)
+            x = bends[chunk.chunk_id].at(frames)
+            for k in range(len(frames)):
+                mine = of_point == k
+                points[mine] = Sim3(x.scale[k], x.rotation[k], x.translation[k]).apply(points[mine])
+        parts.append(chunk.S_world_chunk.apply(points))
     return np.concatenate(parts)
 
 

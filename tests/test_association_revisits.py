@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from list3r.association.frame_search import TRAINED, SearchSettings, choose
 from list3r.association.revisits import find_loops
@@ -28,8 +29,10 @@ GAUGE = Sim3.exp([0.3, -0.2, 0.5, 0.2, 0.4, -0.1, 0.0]).as_matrix()
 class Chunks:
     """A store of chunks with keyframes alone."""
 
-    def __init__(self, done: list[tuple[Keyframe, ...]], scale_kind: str = "metric") -> None:
-        self.done, self.scale_kind = done, scale_kind
+    def __init__(
+        self, done: list[tuple[Keyframe, ...]], scale_kind: str = "metric", known: Sequence[Edge] = ()
+    ) -> None:
+        self.done, self.scale_kind, self.known = done, scale_kind, known
 
     def chunks(self, session_id: int | None = None) -> list[ChunkRow]:
         place = (1.0, 1.0, 0.0, 0.0)
@@ -60,7 +63,7 @@ class Chunks:
         return "test@1/4"
 
     def edges(self) -> list[Edge]:
-        return []
+        return list(self.known)
 
 
 def keyframes_at(start: float, seed: int = 0, first: int = 0, gauge: np.ndarray | None = None) -> tuple[Keyframe, ...]:
@@ -102,6 +105,12 @@ def test_a_revisit_is_verified_with_the_right_pose(here: Keyframe, again: Keyfra
     assert shift[1] < 0.02
     assert turn[1] < 0.5
     assert edge.confidence > 0.7
+    assert edge.covariance is not None
+    off = (Sim3.from_matrix(GAUGE).inverse() @ edge.S_v_u).log()[:6]
+    inside = float(off @ np.linalg.solve(edge.covariance[:6, :6], off))
+    assert 0.0 < inside < chi2.ppf(0.99, 6)
+    assert np.sqrt(np.diag(edge.covariance)[:6]).max() < 0.1
+    assert not edge.covariance[6].any()
 
 
 def test_another_place_is_rejected_with_a_reason(here: Keyframe) -> None:
@@ -127,6 +136,11 @@ def test_a_revisit_of_chunks_without_scale_is_verified_with_its_scale(here: Keyf
     point = np.array([[0.0, 0.0, 2.0]])
     truth = 0.4 * (point @ GAUGE[:3, :3].T + GAUGE[:3, 3])
     assert np.linalg.norm(edge.S_v_u.apply(3.0 * point) - truth) < 0.4 * 0.05
+    true = Sim3(np.asarray(0.4 / 3.0), GAUGE[:3, :3], 0.4 * GAUGE[:3, 3])
+    off = (true.inverse() @ edge.S_v_u).log()
+    assert edge.covariance is not None
+    assert float(off @ np.linalg.solve(edge.covariance, off)) < chi2.ppf(0.99, 7)
+    assert 0.005 < np.sqrt(edge.covariance[6, 6]) < 0.05
     assert not verify_scaled(u, keyframes_at(0.0, seed=9, first=300)[0], 0, 2).accepted
     empty = replace(v, keypoints_xy=v.keypoints_xy[:0], keypoint_descriptors=v.keypoint_descriptors[:0])
     assert not verify_scaled(u, replace(empty, points_cam=v.points_cam[:0]), 0, 2).accepted
@@ -153,6 +167,21 @@ def test_loops_of_chunks_without_scale(here: Keyframe, again: Keyframe) -> None:
     edges = [e for e in find_loops(store, 2) if e.accepted]
     assert [(e.u, e.v) for e in edges] == [(0, 2)]
     assert float(edges[0].S_v_u.scale) == pytest.approx(0.5, rel=0.02)
+
+
+def test_what_fits_two_places_of_a_part_apart_is_not_believed(here: Keyframe, again: Keyframe) -> None:
+    apart = Sim3.exp([4.0, 0, 0, 0, 0, 0, 0])
+    kinds = {"kind": "adjacent", "confidence": 0.9, "weight": 0.9, "inliers": 99, "residual_m": 0.0, "accepted": True}
+    between = Edge(0, 1, S_v_u=apart, reason="", scores={"spread": 3.0}, covariance=1e-6 * np.eye(7), **kinds)
+    twin, elsewhere = replace(here, frame_index=100), keyframes_at(3.0, first=150)
+    edges = find_loops(Chunks([(here,), (twin,), elsewhere, (again,)], known=[between]), 3)
+    assert {e.u for e in edges} == {0, 1} and not any(e.accepted for e in edges)
+    assert all("fits several places" in e.reason for e in edges)
+    tied = Edge(
+        1, 3, S_v_u=Sim3.from_matrix(GAUGE), reason="", scores={"spread": 3.0}, covariance=1e-6 * np.eye(7), **kinds
+    )
+    edges = find_loops(Chunks([(here,), (twin,), elsewhere, (again,)], known=[between, tied]), 3)
+    assert [e.u for e in edges if e.accepted] == [1]
 
 
 def test_chunks_without_keyframes_or_with_broken_descriptors(here: Keyframe, again: Keyframe) -> None:

@@ -65,6 +65,9 @@ class RevisitSettings:
     second_opinion: bool = False
     """Try a joint window also where keyframes with features and depth were compared in vain. For RGB-D that costs
     seconds a candidate and finds little more (redkitchen)."""
+    most_ambiguous: float = 2.0
+    """Relations that agree on where a part of the video lies that nothing tied to the rest before, for each one that
+    says otherwise."""
     layout_pairs: int = 5
     """Instances that must agree on a layout for its scale to count."""
     most_scale_ratio: float = 1.6
@@ -123,7 +126,7 @@ def find_loops(
         if c.s_det < STRICT and look.unlikely(scored):
             who, name = ("frames and instances", "s_loop") if chosen.instance_cues else ("the frames", "s_det")
             edge = look.refused(scored, f"{who} are not alike enough ({name} {scored.score:.2f})")
-        elif chosen.verified and any(e.u == c.u for e in accepted):
+        elif chosen.verified and any(e.u == c.u for e in accepted) and not look.wants_another(c.u, accepted):
             edge = look.refused(scored, "not tried: a better candidate joins the two chunks")
         elif tried >= chosen.verify or len(accepted) >= chosen.enough:
             edge = look.refused(scored, "not tried: enough better candidates of this chunk were")
@@ -131,7 +134,7 @@ def find_loops(
             edge = look.verified(scored, joint, accepted)
             tried += 1
         edges.append(_with_scores(edge, scored))
-    return edges
+    return look.unambiguous(edges) if chosen.verified else edges
 
 
 def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSettings) -> list[_Scored]:
@@ -186,6 +189,7 @@ class _Lookout:
         self._sides: dict[int, Side] = {}
         self._cues: dict[int, InstanceCues] = {}
         self._edges = store.edges()
+        self._tied: set[int] | None = None
 
     def cues(self, u: int) -> InstanceCues:
         """How the instances of a stored chunk agree with those of the new one."""
@@ -211,7 +215,8 @@ class _Lookout:
         """The edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
         c = scored.candidate
         u, v = self._rows[c.u], self._rows[self._id]
-        way = predict([*self._edges, *found], c.u, self._id, self._settings.chain)
+        known = self._edges if self._apart(c.u) else [*self._edges, *found]
+        way = predict(known, c.u, self._id, self._settings.chain)
         objection = partial(self._objection, scored.cues, way)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
@@ -228,6 +233,50 @@ class _Lookout:
         measured = bool(edge.S_v_u.translation.any())
         off = {"way": way.deviations(edge.S_v_u)} if way is not None and measured else {}
         return replace(edge, scores=edge.scores | off)
+
+    def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
+        """Whether a chunk that nothing tied to the new one before hangs on a single pair of frames so far."""
+        return self._apart(u) and len(accepted) == 1
+
+    def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
+        """The edges without those that join what was apart in more than one way.
+
+        Where no way leads from one chunk to the other nothing contradicts a false relation but another relation. Each
+        is therefore found without regard to the others; those that agree speak for each other, and where the places
+        that were found are as many again, none is believed: the new chunk waits for one that tells them apart.
+        """
+        across = [k for k, e in enumerate(edges) if e.accepted and self._apart(e.u)]
+        if len(across) < 2:
+            return list(edges)
+        agree = {k: [n for n in across if n == k or self._agree(edges[k], edges[n])] for k in across}
+        best = max(across, key=lambda k: (len(agree[k]), edges[k].confidence))
+        others = [k for k in across if k not in agree[best]]
+        unsure = len(agree[best]) < self._settings.most_ambiguous * len(others)
+        out = list(edges)
+        for k in across if others and unsure else others:
+            why = "it fits several places as well" if unsure else "more relations say otherwise"
+            out[k] = replace(edges[k], accepted=False, weight=0.0, reason=f"{why} ({edges[k].reason})")
+        return out
+
+    def _agree(self, one: Edge, other: Edge) -> bool:
+        """Whether two relations of the new chunk can both be true; those to places apart from each other can."""
+        way = predict([*self._edges, one], other.u, self._id, self._settings.chain)
+        return way is None or way.deviations(other.S_v_u) <= self._settings.chain.most_deviations
+
+    def _apart(self, u: int) -> bool:
+        """Whether nothing tied a chunk to the new one before."""
+        if self._tied is None:
+            near: dict[int, list[int]] = {}
+            for e in self._edges:
+                if e.accepted:
+                    near.setdefault(e.u, []).append(e.v)
+                    near.setdefault(e.v, []).append(e.u)
+            self._tied, queue = {self._id}, [self._id]
+            while queue:
+                fresh = [k for k in near.get(queue.pop(), []) if k not in self._tied]
+                self._tied.update(fresh)
+                queue += fresh
+        return u not in self._tied
 
     def _objection(self, cues: InstanceCues, way: Prediction | None, S_v_u: Sim3) -> str | None:
         """What the way between the chunks and the layout of their instances say against a relation."""
