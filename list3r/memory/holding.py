@@ -175,21 +175,26 @@ def _held_inside(scene: Scene, a: int, b: int) -> Sure | None:
     if inside >= scene.s.inside:
         if share >= scene.s.enclosed and _rests_on(scene, a, b):
             return inside * min(1.0, 0.5 + share / 2), (share - scene.s.enclosed) * width
-        covered = _between_boards(scene, a, b)
+        covered = _between_boards(scene, a, b, walled=share > 0.5)
         if covered is not None:
             return 0.9 * inside, covered
+    if share < scene.s.around and inside >= scene.s.half_inside:
+        share, uneven = _sides_round(scene, a, b, sunk=True)
     if share >= scene.s.around and uneven < scene.s.uneven and _down_in(scene, a, b):
         return 0.5 + 0.5 * min(share, 0.8), (share - scene.s.around) * width
     return None
 
 
-def _sides_round(scene: Scene, a: int, b: int) -> tuple[float, float]:
+def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> tuple[float, float]:
     """Share of the directions round a in which b has a surface at a's height, above a's lowest part; and how far they
     are from being equally far away, as the deviation of their distances over the mean.
+
+    Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too.
     """
     subject, holder = scene.bodies[a], scene.bodies[b]
     low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
-    brim = low + max(0.3 * (high - low), 2.5 * scene.s.noise_m * scene.unit)
+    noise = 2.5 * scene.s.noise_m * scene.unit
+    brim = low - noise if sunk else low + max(0.3 * (high - low), noise)
     z = holder.points[:, 2]
     sides = holder.points[(z > brim) & (z < max(high, brim) + 0.3 * (high - low))]
     away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
@@ -207,17 +212,22 @@ def _rests_on(scene: Scene, a: int, b: int) -> bool:
     return int((scene.bodies[b].points[:, 2] < low + 0.3 * (high - low)).sum()) >= 3
 
 
-def _between_boards(scene: Scene, a: int, b: int) -> float | None:
-    """How far the board over a is above it, where b has surfaces both under a and over it: a shelf."""
+def _between_boards(scene: Scene, a: int, b: int, *, walled: bool) -> float | None:
+    """How far the board over a is above it, where b has surfaces both under a and over it: a shelf.
+
+    Where b is not round a on more than one side (`walled`), what is over a's border alone is no board: a headboard
+    rises behind a pillow.
+    """
     subject, holder = scene.bodies[a], scene.bodies[b]
     low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
     noise = 2.0 * scene.s.noise_m * scene.unit
-    within = np.all(
-        np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2] <= subject.box.size[:2] / 2 + noise,
-        axis=1,
-    )
-    z = holder.points[within, 2]
-    under, over = z[(z < low + noise) & (z > low - contact_of(scene, a) - noise)], z[z > high + noise]
+    aside = np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2]
+    half = subject.box.size[:2] / 2
+    within = np.all(aside <= half + noise, axis=1)
+    inner = within if walled else np.all(aside <= 0.75 * half, axis=1)
+    z = holder.points[:, 2]
+    under = z[within & (z < low + noise) & (z > low - contact_of(scene, a) - noise)]
+    over = z[inner & (z > high + noise)]
     return float(over.min() - high - noise) if len(under) >= 2 and len(over) >= 2 else None
 
 

@@ -37,6 +37,8 @@ class RelationSettings:
     """Share of directions round a thing in which a container has a side."""
     inside: float = 0.8
     """Share of a thing's points inside its container's box."""
+    half_inside: float = 0.6
+    """The same for what stands out of an open container, of which mostly the upper part is seen."""
     overhead: float = 0.4
     """Share of a thing's points that have something over them, to be under it."""
     most_wider: float = 3.0
