@@ -147,15 +147,18 @@ class ToldMasks:
             rgb = view.rgb[small] if small.any() else np.zeros((1, 3), np.uint8)
             features.append(object_feature(points, rgb, up, views.unit))
         labels = without_spill(labels, view, views.stride)
-        planes = [plane_of_mask(labels == n + 1, views, position) for n in range(len(present))]
+        bounds = [bool(self._truth[k]["structure"]) for k in present]
+        planes = np.full((len(present), 4), np.nan)
+        for n in np.flatnonzero(bounds).tolist():
+            planes[n] = plane_of_mask(labels == n + 1, views, position)
         return Proposals(
             position,
             labels,
             np.ones(len(present), np.float32),
             np.array(features, np.float32).reshape(len(present), -1),
-            np.array(planes).reshape(len(present), 4),
+            planes,
             identity=np.array(present, np.int64),
-            structure=np.array([self._truth[k]["structure"] for k in present], bool),
+            structure=np.array(bounds, bool),
         )
 
 

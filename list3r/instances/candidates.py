@@ -68,10 +68,13 @@ def choose_candidates(
         labels[free] = len(kept)
     labels = without_spill(labels, views.view(position), views.stride)
     features = _unit(masks.features[kept])
-    plane = np.array([plane_of_mask(labels == k + 1, views, position, chosen.flat_rms) for k in range(len(kept))])
     structure = np.array([bool(masks.names) and bounds_the_room(masks.names[n]) for n in kept], bool)
+    plane = np.full((len(kept), 4), np.nan)
+    for k in range(len(kept)):
+        if structure[k] or not masks.names:  # what has the name of a thing is not taken for floor or wall
+            plane[k] = plane_of_mask(labels == k + 1, views, position, chosen.flat_rms)
     names = tuple(masks.names[n] for n in kept) if masks.names else None
-    return Proposals(position, labels, score[kept], features, plane.reshape(-1, 4), structure=structure, names=names)
+    return Proposals(position, labels, score[kept], features, plane, structure=structure, names=names)
 
 
 BORDER = 2
