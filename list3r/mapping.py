@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.camera_edge import better_edge, camera_edge
 from list3r.association.chunk_nodes import NodeSettings
 from list3r.association.edges import EdgeSettings, measure_edge
 from list3r.association.graph_growth import extend
@@ -30,7 +31,7 @@ from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import estimate_gravity, world_from_graph
-from list3r.memory.labels import apply_labels
+from list3r.memory.labels import apply_labels, votes_of
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.scale import settle_scale
 from list3r.memory.store import Store
@@ -76,7 +77,8 @@ def add_chunk(
         place_chunks(store, chosen.graph, chunk_id)
         if library:
             consolidate(store, chunk_id)
-            apply_labels(store)
+            if store.get_value("detected labels") is not None or votes_of(store, chunk_id)[1]:
+                apply_labels(store)
     return chunk_id
 
 
@@ -97,10 +99,14 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
         return []
     u, v = chunks[-2], chunks[-1]
     metric = u.scale_kind == v.scale_kind == "metric"
+    samples_u, samples_v = store.frame_samples(u.chunk_id), store.frame_samples(v.chunk_id)
+    by_cameras = None
+    if not metric and _from_motion(store, session_id):
+        by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id)
     try:
         found = measure_edge(
-            store.frame_samples(u.chunk_id),
-            store.frame_samples(v.chunk_id),
+            samples_u,
+            samples_v,
             u.chunk_id,
             v.chunk_id,
             _camera(v),
@@ -110,13 +116,18 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
             dynamic_v=store.dynamic_locals(v.chunk_id),
         )
     except DegenerateError:
-        return []
+        return [] if by_cameras is None else [by_cameras]
     for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):
         store.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
     if debug_dir is not None:
         pictures = [k for c in (u, v) for k in store.keyframes(c.chunk_id)]
         write_support(found, pictures, _camera(v), debug_dir)
-    return [found.edge]
+    return [better_edge(found.edge, by_cameras) or found.edge]
+
+
+def _from_motion(store: Store, session_id: int) -> bool:
+    """Whether a session's cameras are known better than its surfaces."""
+    return any(s.session_id == session_id and s.settings.get("reconstruction") == "sfm" for s in store.sessions())
 
 
 def _camera(chunk: ChunkRow) -> Camera:

@@ -252,3 +252,26 @@ def test_a_chunk_with_another_feature_space_makes_all_be_derived_anew(walks: Mod
     assert store.get_value("library")["space"] == ""
     add(store, visit(walks, 4, 2))
     check(store)
+
+
+def test_what_moves_is_followed_while_the_library_grows(tmp_path: Path) -> None:
+    """A person passes, pauses and comes back among things that stay; one chunk is only later found to move."""
+    from tests.test_dynamic import FRAMES, STEP, across, chunk, memory, walker
+
+    def back(k: int) -> tuple[float, float, float]:
+        return 1.2, 1.6 - 0.02 * k, 0.85
+
+    steps = [chunk(k, [walker(2, STEP * k, across if k < 3 else back, seed=k)] if k != 4 else []) for k in range(7)]
+    store = memory(tmp_path / "m.l3r", steps[:2])
+    for k, result in enumerate(steps[2:], start=2):
+        with store.transaction():
+            chunk_id = store.add_chunk(1, result)  # type: ignore[arg-type]
+            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            consolidate(store, chunk_id, GROW)
+        check(store)
+        assert any(i.dynamic for i in store.instances()) and FRAMES > 0, k
+    with store.transaction():
+        store.flag_dynamic(3, {0: None})
+        consolidate(store, settings=GROW)
+    check(store)
+    store.close()

@@ -87,6 +87,7 @@ class ChunkVerbs(BendVerbs):
         super().__init__(path, database, lock)
         self._chunk_rows: dict[int, ChunkRow] | None = None
         self._chunk_version = self._edge_version = -1
+        self._crcs: dict[int, int] | None = None
         self._edge_rows: dict[tuple[int, int, str, int, int], Edge] | None = None
         self.touched: set[int] | None = None
         """Chunks that were placed or measured anew since the library was derived; None where that is not known."""
@@ -235,7 +236,7 @@ class ChunkVerbs(BendVerbs):
         """All chunks by id, read again only when another process or a rollback may have changed them."""
         version = int(self._rows("PRAGMA data_version")[0][0])
         if self._chunk_rows is None or self._chunk_version != version:
-            self._chunk_rows, self._chunk_version = self._read_chunks(), version
+            self._chunk_rows, self._chunk_version, self._crcs = self._read_chunks(), version, None
         return self._chunk_rows
 
     def _read_chunks(self, chunk_ids: Sequence[int] = ()) -> dict[int, ChunkRow]:
@@ -292,7 +293,7 @@ class ChunkVerbs(BendVerbs):
 
     def forget_rows(self) -> None:
         """Read chunks and edges again when they are next asked for."""
-        self._chunk_rows = self._edge_rows = None
+        self._chunk_rows = self._edge_rows = self._crcs = None
 
     def _roll_back(self) -> None:
         super()._roll_back()
@@ -335,7 +336,12 @@ class ChunkVerbs(BendVerbs):
 
     def chunk_checksums(self) -> dict[int, int]:
         """A checksum of what each chunk measured, by chunk id: tells whether something derived from it still holds."""
-        return {int(k): int(crc) for k, crc in self._rows("SELECT chunk_id, crc FROM chunks ORDER BY chunk_id")}
+        rows = self._placed()
+        if self._crcs is None or self._crcs.keys() != rows.keys():
+            known = self._crcs or {}
+            query = "SELECT crc FROM chunks WHERE chunk_id = ?"
+            self._crcs = {k: known[k] if k in known else int(self._rows(query, (k,))[0][0]) for k in rows}
+        return dict(self._crcs)
 
     def stage_seconds(self) -> dict[str, float]:
         """CPU seconds spent so far by stage, over all chunks."""

@@ -1,7 +1,7 @@
 """Local instances of all chunks to the global library (paper 3.3): merge, keep ids, derive, relate, log.
 
 A chunk that comes in changes what it touches (`memory.growth`). What holds for the whole memory (the light, the unit,
-which way is up, the word of operators, several sessions, things that move) makes all of it be derived here.
+which way is up, the word of operators, several sessions) makes all of it be derived here.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def consolidate(
     summaries = chunk_summaries(store)
     world = known_world(store, chunks, s)
     report = None
-    if world is not None and len(chunks) > s.whole_chunks and not _is_whole(store, chunks):
+    if world is not None and len(chunks) > s.whole_chunks and not _is_whole(chunks):
         again = len(chunks) <= _LOOKED_AT or chunk_id is None
         if again and len(chunks) >= 2 * world.chunks:
             now = look_at_world(store, chunks, summaries, s)
@@ -77,9 +77,9 @@ _LOOKED_AT = 64
 done when a session ends, for what changes it makes all things be derived anew."""
 
 
-def _is_whole(store: Store, chunks: Sequence[ChunkRow]) -> bool:
-    """Whether there is what ties all of a memory together: several sessions, or things that move."""
-    return len({c.session_id for c in chunks}) > 1 or store.has_moving()
+def _is_whole(chunks: Sequence[ChunkRow]) -> bool:
+    """Whether there is what ties all of a memory together: the changes between several sessions."""
+    return len({c.session_id for c in chunks}) > 1
 
 
 def _derive_whole(store: Store, summaries: Summaries, chunk_id: int, s: ConsolidationSettings) -> ConsolidationReport:

@@ -30,7 +30,8 @@ from list3r.memory.library_rules import ConsolidationReport, ConsolidationSettin
 from list3r.memory.library_things import eye_level, measured_before, thing_of
 from list3r.memory.library_verbs import Anchor, SettledRow
 from list3r.memory.merging import Edge, Key, Nodes, PairScores, form_groups, local_edges, pair_scores
-from list3r.memory.records import MergeDecision, Observation
+from list3r.memory.moving import Mover, Tracks, join_movers, tied_movers, without_moving
+from list3r.memory.records import MergeDecision, MotionTrack, Observation
 from list3r.memory.relation_scene import Measured
 from list3r.memory.relations import relations
 from list3r.memory.settling import neighbours, settle
@@ -48,7 +49,7 @@ def grow(
 ) -> ConsolidationReport | None:
     """Bring the library up to date with the chunks that are new or have moved; None where that would be most of them.
 
-    For memories of one session in which nothing moves. `exact` also puts the things of chunks that trembled where they
+    For memories of one session. `exact` also puts the things of chunks that trembled where they
     lie to the last digit.
     """
     known = store.settled()
@@ -126,6 +127,9 @@ class _Growth:
         self._known: set[int] = set()
         self._dropped: dict[int, np.ndarray] = {}
         self._things: dict[int, Thing] = {}
+        self._moving = store.has_moving()
+        self._movers: dict[Group, Mover] = {}
+        self._spans: dict[int, tuple[float, float]] = {}
         self.written: set[int] = set()
         """Instances that were written anew."""
 
@@ -188,7 +192,8 @@ class _Growth:
         missing = sorted(wanted - self._paired)
         for pair, blob in self._store.overlaps(missing).items() if missing else ():
             if pair not in self._pairs:
-                self._pairs[pair] = unpack_scores(blob)
+                shapes = {k: self._shapes(k) for k in pair}
+                self._pairs |= without_moving({pair: unpack_scores(blob)}, shapes, self._motions(pair))
         self._paired |= wanted
         return {p: self._pairs[p] for p in sorted(self._pairs) if p[0] in wanted or p[1] in wanted}
 
@@ -210,6 +215,60 @@ class _Growth:
             for n in self._shapes(k).local_id.tolist():
                 self._home.setdefault((k, n), ((k, n),))
 
+    # ------------------------------------------------------------------ things that move
+
+    def _motions(self, chunks: Iterable[int]) -> dict[Key, MotionTrack | None]:
+        """The local instances of chunks that move."""
+        return {(k, n): track for k in chunks for n, track in self._summaries[k].motions.items()}
+
+    def _tracks(self, chunks: Iterable[int]) -> Tracks:
+        chunks = sorted(set(chunks))
+        times = {f: t for k in chunks for f, t in self._store.frame_times(self._store.chunk(k)).items()}
+        return Tracks(self._motions(chunks), times)
+
+    def _at_that_time(self, chunks: Collection[int]) -> set[int]:
+        """Chunks seen so shortly before or after one of these that what moves may be the same."""
+        rows = sorted((c for c in self._store.chunks() if c.chunk_id in self._rows), key=lambda c: c.first_frame)
+        at = {c.chunk_id: n for n, c in enumerate(rows)}
+        out = set(chunks)
+        for k in chunks:
+            low, high = self._span_s(k)
+            for way in (range(at[k] - 1, -1, -1), range(at[k] + 1, len(rows))):
+                for n in way:
+                    other = self._span_s(rows[n].chunk_id)
+                    if max(other[0] - high, low - other[1]) > self._s.moving.most_gap_s:
+                        break
+                    out.add(rows[n].chunk_id)
+        return {k for k in out if any(self._rows[k].component == self._rows[j].component for j in chunks)}
+
+    def _span_s(self, chunk_id: int) -> tuple[float, float]:
+        if chunk_id not in self._spans:
+            times = list(self._store.frame_times(self._store.chunk(chunk_id)).values()) or [0.0]
+            self._spans[chunk_id] = min(times), max(times)
+        return self._spans[chunk_id]
+
+    def _along(self, keys: Collection[Key], inside: Collection[Key]) -> set[Key]:
+        """Local instances outside that one of these may be, because one of the two moves."""
+        if not self._moving:
+            return set()
+        chunks = self._at_that_time({k for k, _ in keys})
+        moving = self._motions(chunks)
+        if not moving:
+            return set()
+        others = {(k, n) for k in chunks for n in self._shapes(k).local_id.tolist()} - set(inside)
+        if moving.keys().isdisjoint(keys):
+            others &= moving.keys()
+        shapes, placed = {k: self._shapes(k) for k in chunks}, {k: self._pose(k) for k in chunks}
+        return tied_movers(sorted(keys), sorted(others), shapes, placed, self._tracks(chunks), self._s.moving)
+
+    def _mover(self, group: Group) -> Mover | None:
+        """What is known of a group that moves."""
+        if not self._moving or self._motions({k for k, _ in group}).keys().isdisjoint(group):
+            return None
+        if group not in self._movers:
+            self._form(set(group))
+        return self._movers.get(group)
+
     # ------------------------------------------------------------------ groups
 
     def _partition(self) -> tuple[list[Group], list[MergeDecision]]:
@@ -217,11 +276,11 @@ class _Growth:
         region = {(k, n) for k in self._dirty for n in self._shapes(k).local_id.tolist()}
         region |= {k for k in (*self._word.touched, *(k for d in self._word.deletions for k in d.keys))}
         region = self._closed(region)
-        region = self._closed(region | self._across(region, region))
+        region = self._closed(region | self._across(region, region) | self._along(region, region))
         while True:
             groups, decisions = self._form(region)
             changed = {k for g in groups if self._has_changed(g) for k in g}
-            left = self._closed(self._across(changed, region)) - region
+            left = self._closed(self._across(changed, region) | self._along(changed, region)) - region
             if not left:
                 return groups, decisions
             region |= left
@@ -271,7 +330,17 @@ class _Growth:
         nodes = Nodes.join([self._nodes_of(k) for k in chunks]).only(region)
         found_groups, decisions = form_groups(nodes, edges, overlap, links, self._s.merging, self._word)
         components = {k: self._rows[k].component for k in chunks}
-        joined, _ = self._word.joined(found_groups, components, {})
+        movers: dict[Key, Mover] = {}
+        motions = self._motions(chunks) if self._moving else {}
+        if motions:
+            shapes, placed = {k: self._shapes(k) for k in chunks}, {k: self._pose(k) for k in chunks}
+            apart, tracks = links + self._word.pairs_apart(motions), self._tracks(chunks)
+            found_groups, movers, joins = join_movers(
+                found_groups, shapes, placed, components, apart, tracks, self._s.moving
+            )
+            decisions = decisions + joins
+        joined, movers = self._word.joined(found_groups, components, movers)
+        self._movers |= {tuple(g): movers[g[0]] for g in joined if g[0] in movers}
         return [tuple(g) for g in joined], decisions
 
     # ------------------------------------------------------------------ evidence and ids
@@ -406,7 +475,8 @@ class _Growth:
         """A thing, with its agreement still to be said."""
         chunks = {k: (self._shapes(k), self._pose(k), self._dropped_of(k)) for k in {k for k, _ in group}}
         component = self._rows[group[0][0]].component
-        thing = thing_of(self._store, instance_id, group, group, chunks, component, self._s, self._world)
+        mover = self._mover(group)
+        thing = thing_of(self._store, instance_id, group, group, chunks, component, self._s, self._world, mover)
         return replace(thing, body=replace(thing.body, structure=structure))
 
     def _stored(self, ids: Iterable[int]) -> list[Body]:
@@ -493,7 +563,7 @@ class _Growth:
         near = {m for n in ids for m in self._near(_around(self._things[n].body.aabb, before.get(n)), reach)}
         changed = []
         for body in self._stored(near | set(ids)):
-            kind = self._kind(body, reach)
+            kind = None if self._things[body.id].dynamic else self._kind(body, reach)
             if kind != body.structure:
                 changed.append(body.id)
                 thing = self._things[body.id]
@@ -505,7 +575,8 @@ class _Growth:
             return flagged_only([body])[0]
         if body.normal is None:
             return None
-        around = [b for b in self._stored(self._near(body.aabb, reach)) if b.component == body.component]
+        near = [b for b in self._stored(self._near(body.aabb, reach)) if b.component == body.component]
+        around = [b for b in near if not self._things[b.id].dynamic]
         return classify_structure(
             [body], self._world.floor, self._eye_level, self._world.unit, self._s.structure, around
         )[0]
@@ -531,7 +602,7 @@ class _Growth:
             scene |= ring
         cache = Measured(measured_before.get(self._store, {}))
         found = []
-        bodies = self._stored(scene)
+        bodies = [b for b in self._stored(scene) if self._things[b.id].resting]
         for component in sorted({b.component for b in bodies}):
             inside = [b for b in bodies if b.component == component]
             vertical = self._world.upright and component == self._world.first

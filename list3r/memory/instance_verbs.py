@@ -232,13 +232,12 @@ class InstanceVerbs(EmbeddingVerbs):
 
     def node_checksum(self, chunk_id: int) -> int:
         """The same of one chunk; another one after a rollback, when its id may stand for another chunk."""
-        row = self._rows("SELECT crc FROM chunks WHERE chunk_id = ?", (int(chunk_id),))
         moving = self._rows(
             "SELECT local_id, length(motion) FROM local_instances WHERE dynamic AND chunk_id = ? ORDER BY local_id",
             (int(chunk_id),),
         )
         count = self._rows("SELECT count(*) FROM local_instances WHERE chunk_id = ?", (int(chunk_id),))
-        return hash((self.rollbacks, row[0][0] if row else 0, count[0][0], *moving))
+        return hash((self.rollbacks, self.chunk_checksums().get(int(chunk_id), 0), count[0][0], *moving))
 
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a moving instance was: seconds of shape (V,) and places in the world of shape (V, 3), in order of time.

@@ -7,7 +7,7 @@ begins.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,6 +144,27 @@ def join_movers(
         if any(nodes[n].moves for n in members):
             movers[keys[0]] = scene.now([nodes[n] for n in members])
     return sorted(joined), movers, decisions
+
+
+def tied_movers(
+    here: Collection[Key],
+    there: Collection[Key],
+    shapes: Mapping[int, ChunkShapes],
+    S_world_chunk: Mapping[int, Sim3],
+    tracks: Tracks,
+    settings: MovingSettings | None = None,
+) -> set[Key]:
+    """The local instances of `there` that `join_movers` would compare with one of `here`, of one session and frame of
+    reference all."""
+    scene = _Scene(shapes, S_world_chunk, tracks, settings or MovingSettings())
+    out = set()
+    for b in there:
+        moves = b in tracks.motions
+        for a in here:
+            if a[0] != b[0] and (moves or a in tracks.motions) and scene.edge(scene.node((a,)), scene.node((b,))):
+                out.add(b)
+                break
+    return out
 
 
 class _Scene:
