@@ -58,8 +58,10 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "hub"
 
 
-def put(repository: str, commit: str = COMMIT, branch: str = "main") -> Path:
-    """Weights in the cache, as the hub's package lays them; the folder."""
+def put(repository: str, branch: str = "main") -> Path:
+    """Weights in the cache, as the hub's package lays them, at the card's commit where it has one; the folder."""
+    pinned = (w.revision for c in CARDS for w in c.weights if w.repository == repository and w.pinned)
+    commit = next(pinned, COMMIT)
     base = cache_folder() / f"models--{repository.replace('/', '--')}"
     folder = base / "snapshots" / commit
     folder.mkdir(parents=True)
@@ -75,7 +77,7 @@ def card(code: Licence = APACHE, *weights: Weights) -> ModelCard:
 
 def test_every_adapter_has_a_card_and_every_card_an_adapter() -> None:
     known = {("geometry", m) for m in MODELS if m not in ("rgbd", "sfm", "precomputed")}
-    known |= {("discovery", d) for d in DISCOVERERS if d != "geometric"}
+    known |= {("discovery", d) for d in DISCOVERERS if d not in ("geometric", "precomputed")}
     known |= {("tracking", t) for t in TRACKERS if t != "reprojection"}
     known |= {("features", f) for f in FEATURES if f not in ("geometric", "own")}
     carded = {(c.part, c.name) for c in CARDS}
@@ -150,8 +152,8 @@ def test_what_is_in_the_cache_needs_no_network(monkeypatch: pytest.MonkeyPatch) 
     pi3 = find_card("pi3", "geometry")
     assert pi3 is not None
     name = resolve(None, pi3.weights[0], "--reconstruction pi3")
-    assert name == f"yyfz233/Pi3@{COMMIT}" and locate(name) == folder
-    assert resolve("yyfz233/Pi3", None, "x") == name and resolve(f"yyfz233/Pi3@{COMMIT}", None, "x") == name
+    assert name == f"yyfz233/Pi3@{pi3.weights[0].revision}" and locate(name) == folder
+    assert resolve("yyfz233/Pi3", None, "x") == name == resolve(name, None, "x")
     assert resolve(str(folder), None, "x") == str(folder.resolve())
 
 
@@ -241,6 +243,13 @@ def test_fetched_once_used_from_then_on(hub: type[_Hub]) -> None:
     asked = len(hub.asked)
     assert resolve("a/b", None, "x") == cached.name
     assert len(hub.asked) == asked, "the branch stands for what was fetched, and nobody is asked again"
+
+
+def test_old_files_are_fetched_where_there_is_nothing_newer(hub: type[_Hub]) -> None:
+    hub.files = {"config.json": b"{}", "pytorch_model.bin": b"x" * 2000, "tf_model.h5": b"no"}
+    cached = fetch(Weights("a/b", APACHE))
+    assert {p.name for p in cached.folder.iterdir()} == {"pytorch_model.bin", "config.json"}
+    check_weights(cached.folder)
 
 
 def test_gated_weights_say_so(hub: type[_Hub]) -> None:

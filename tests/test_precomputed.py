@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera, Frame
+from list3r.instances.library import build_library
+from list3r.instances.registry import check_choice, make_discoverer
+from list3r.instances.settings import InstanceSettings
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.geometry import Sim3
 from list3r.reconstruction.precomputed_files import (
@@ -233,3 +237,45 @@ def test_a_folder_must_be_given_and_be_one(tmp_path: Path) -> None:
     write_manifest(tmp_path, Manifest())
     with pytest.raises(OptionError, match=r"holds no \.npz files"):
         reader(tmp_path)
+
+
+def with_things(whole: Piece, features: np.ndarray | None) -> Piece:
+    """Two things beside each other; the first leaves the view at frame 6."""
+    masks = np.zeros(whole.depth.shape, np.int32)
+    masks[:6, 10:30, 5:20] = 1
+    masks[:, 10:30, 30:50] = 2
+    return Piece(whole.frames, whole.T_world_cam, whole.intrinsics, whole.depth, whole.confidence, masks, features)
+
+
+def test_masks_become_candidates_that_know_what_they_are(tmp_path: Path) -> None:
+    features = np.array([[3.0, 4.0], [0.0, 2.0]], np.float32)
+    write_piece(tmp_path / "a.npz", with_things(piece(), features))
+    write_manifest(tmp_path, Manifest("relative", "some model", 10, 3))
+    made = reader(tmp_path)(frames(0, 10), CAMERA)  # type: ignore[operator]
+    settings = InstanceSettings()
+    check_choice("precomputed", "reprojection", "own")
+    find = make_discoverer("precomputed", "own", (("discovery/precomputed", str(tmp_path)),), "cpu", settings)
+    assert find.feature_space == "precomputed-some-model@1/2"
+    both, one = find(frames(0, 10), made, 2), find(frames(0, 10), made, 8)
+    assert both.labels.shape == (84, 112) and both.labels[40, 20] == 1 and both.labels[40, 80] == 2
+    assert np.allclose(both.features, [[0.6, 0.8], [0.0, 1.0]])
+    assert one.identity is not None and both.identity is not None
+    assert one.identity.tolist() == both.identity.tolist()[1:]
+    library = build_library(frames(0, 10), made, settings, find)
+    assert len(library.instances) == 2 and library.feature_space == find.feature_space
+    lengths = sorted(len(i.track.frames) for i in library.instances)
+    assert lengths[1] == 10
+    outside = find(frames(0, 10), replace(made, frame_indices=made.frame_indices + 50), 0)
+    assert len(outside.score) == 0
+
+
+@pytest.mark.parametrize(
+    ("features", "words"), [(None, "no masks and features"), (np.eye(1, dtype=np.float32), "features has 1 rows")]
+)
+def test_masks_without_their_features_are_refused(features: np.ndarray | None, words: str, tmp_path: Path) -> None:
+    write_piece(tmp_path / "a.npz", with_things(piece(), features))
+    write_manifest(tmp_path, Manifest())
+    with pytest.raises(OptionError, match=words):
+        make_discoverer("precomputed", "own", (("discovery/precomputed", str(tmp_path)),), "cpu", InstanceSettings())
+    with pytest.raises(OptionError, match="--weights discovery=DIR"):
+        make_discoverer("precomputed", "own", (), "cpu", InstanceSettings())

@@ -36,7 +36,7 @@ Preset = Annotated[
 ]
 Discovery = Annotated[
     str | None,
-    typer.Option("--discovery", help="geometric, eomt, mask2former, sam2 or sam3: what finds things."),
+    typer.Option("--discovery", help="geometric, eomt, mask2former, sam2, sam3 or precomputed: what finds things."),
 ]
 Tracking = Annotated[
     str | None,
@@ -113,6 +113,8 @@ def build_settings(
     check_profile(words["licence"])
     selection = _selection(info, words)
     asked = parse_weights(words["weights"])
+    if selection.discovery == selection.reconstruction == "precomputed" and "reconstruction" in asked:
+        asked.setdefault("discovery", asked["reconstruction"])
     chosen = check_allowed(selection, asked, words["licence"])
     notes = [f"note: {selection.why}"] if selection.why else []
     notes += _terms(selection, chosen)

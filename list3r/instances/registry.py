@@ -11,7 +11,7 @@ from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking import ReprojectionTracker
 from list3r.memory.errors import OptionError
 
-DISCOVERERS = ("geometric", "eomt", "mask2former", "sam2", "sam3")
+DISCOVERERS = ("geometric", "eomt", "mask2former", "sam2", "sam3", "precomputed")
 TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
 FEATURES = ("geometric", "own", "dinov2", "dinov3")
 """`own` are those of a neural discoverer; geometric ones belong to the geometric discoverer."""
@@ -45,6 +45,12 @@ def make_discoverer(
         from list3r.instances.query_segmenter import QuerySegmenter
 
         found = QuerySegmenter(discovery, where[f"discovery/{discovery}"], device, settings)
+    elif discovery == "precomputed":
+        from list3r.instances.precomputed_masks import PrecomputedMasks
+
+        if "discovery/precomputed" not in where:
+            raise OptionError("--discovery precomputed needs a folder: --weights discovery=DIR (docs/precomputed.md)")
+        found = PrecomputedMasks(where["discovery/precomputed"], settings)
     else:
         from list3r.instances.sam_masks import SamMasks
 

@@ -19,6 +19,8 @@ from list3r.models.cards import UNPINNED, Weights
 
 CONFIG = "config.json"
 SINGLE_FILES = (".safetensors", ".pt", ".pth", ".bin")
+OLD_FILES = ("*.bin", "*.pt", "*.pth")
+"""Fetched only where there is nothing newer; read without running what they hold."""
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _MAX_HEADER = 100 * 2**20
@@ -118,6 +120,8 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
     why = ""
     try:
         folder = Path(snapshot_download(name, revision=wanted, allow_patterns=list(weights.files)))
+        if find_cached(name, folder.name) is None:  # an old repository, from before .safetensors
+            snapshot_download(name, revision=folder.name, allow_patterns=list(OLD_FILES))
     except GatedRepoError:
         why = f"its owner must grant access first: ask on its page ({name}), then `hf auth login`"
     except (LocalEntryNotFoundError, OfflineModeIsEnabled, ConnectionError, TimeoutError):

@@ -1,8 +1,8 @@
 """What every neural model is: its licence, where its weights lie, what it needs, how much memory it is said to take.
 
 A card names facts that others published; nothing here loads a model. Code and weights have licences of their own, and
-both count. A revision that no public page states is not made up: such weights are `unpinned`, and what was fetched is
-used from then on (`cache`).
+both count. A revision is a commit that public pages name; where none does the weights are `unpinned`, and what was
+fetched is used from then on (`cache`).
 """
 
 from __future__ import annotations
@@ -105,14 +105,25 @@ class ModelCard:
         return all(t.kind == "permissive" for t in terms) and not any(w.gated for w in self.weights[:1])
 
 
+SAM2_COMMIT = "de431c4043854a71d8101e17995dfe596bf101a5"
+SAM3_COMMIT = "3c879f39826c281e95690f02c7821c4de09afae7"
 _TRANSFORMERS = ("transformers",)
 _MODELS_EXTRA = "pip install 'list3r[models]'"
 _GIT = "pip install git+https://github.com"
 
 
-def _hub(name: str, part: str, repository: str, licence: Licence, about: str, *, gated: bool = False) -> ModelCard:
+def _hub(
+    name: str,
+    part: str,
+    repository: str,
+    licence: Licence,
+    about: str,
+    *,
+    gated: bool = False,
+    revision: str = UNPINNED,
+) -> ModelCard:
     """A model that the package transformers runs."""
-    weights = (Weights(repository, licence, gated),)
+    weights = (Weights(repository, licence, gated, revision),)
     return ModelCard(name, part, APACHE, weights, _TRANSFORMERS, _MODELS_EXTRA, about=about)
 
 
@@ -121,7 +132,7 @@ CARDS: tuple[ModelCard, ...] = (
         "pi3",
         "geometry",
         BSD3,
-        (Weights("yyfz233/Pi3", CC_BY_NC),),
+        (Weights("yyfz233/Pi3", CC_BY_NC, revision="ae722e7039287d0c8fde9f11f197f804f44b510c"),),
         ("pi3",),
         f"{_GIT}/yyfz/Pi3",
         MemoryFigures(3658, 212, "its authors' capacity table, A800, bfloat16"),
@@ -132,7 +143,7 @@ CARDS: tuple[ModelCard, ...] = (
         "pi3x",
         "geometry",
         BSD3,
-        (Weights("yyfz233/Pi3X", CC_BY_NC),),
+        (Weights("yyfz233/Pi3X", CC_BY_NC, revision="bb1deea4d7423de5b30691739cb451a3f57dc1d5"),),
         ("pi3",),
         f"{_GIT}/yyfz/Pi3",
         MemoryFigures(3658, 212, "taken from pi3"),
@@ -144,7 +155,7 @@ CARDS: tuple[ModelCard, ...] = (
         "geometry",
         VGGT_LICENCE,
         (
-            Weights("facebook/VGGT-1B", CC_BY_NC),
+            Weights("facebook/VGGT-1B", CC_BY_NC, revision="860abec7937da0a4c03c41d3c269c366e82abdf9"),
             Weights("facebook/VGGT-1B-Commercial", VGGT_LICENCE, gated=True),
         ),
         ("vggt",),
@@ -157,7 +168,10 @@ CARDS: tuple[ModelCard, ...] = (
         "mapanything",
         "geometry",
         APACHE,
-        (Weights("facebook/map-anything-apache", APACHE), Weights("facebook/map-anything", CC_BY_NC)),
+        (
+            Weights("facebook/map-anything-apache", APACHE, revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a"),
+            Weights("facebook/map-anything", CC_BY_NC),
+        ),
         ("mapanything",),
         f"{_GIT}/facebookresearch/map-anything",
         MemoryFigures(3000, 345, "its README: 2,000 views in 140 GB, memory-efficient mode"),
@@ -169,7 +183,7 @@ CARDS: tuple[ModelCard, ...] = (
         "geometry",
         APACHE,
         (
-            Weights("depth-anything/DA3-BASE", APACHE),
+            Weights("depth-anything/DA3-BASE", APACHE, revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e"),
             Weights("depth-anything/DA3-SMALL", APACHE),
             Weights("depth-anything/DA3-LARGE-1.1", CC_BY_NC),
             Weights("depth-anything/DA3-GIANT-1.1", CC_BY_NC),
@@ -183,15 +197,36 @@ CARDS: tuple[ModelCard, ...] = (
     ),
     _hub("eomt", "discovery", "tue-mps/coco_panoptic_eomt_large_640", MIT, "masks, query embeddings and labels"),
     _hub("mask2former", "discovery", "facebook/mask2former-swin-tiny-coco-panoptic", OTHER, "masks and labels"),
-    _hub("sam2", "discovery", "facebook/sam2.1-hiera-tiny", APACHE, "masks of everything, no labels"),
-    _hub("sam3", "discovery", "facebook/sam3", SAM_LICENCE, "masks of everything, no labels", gated=True),
-    _hub("sam2", "tracking", "facebook/sam2.1-hiera-tiny", APACHE, "video tracker"),
-    _hub("sam3", "tracking", "facebook/sam3", SAM_LICENCE, "video tracker", gated=True),
+    _hub("sam2", "discovery", "facebook/sam2.1-hiera-tiny", APACHE, "masks of everything", revision=SAM2_COMMIT),
+    _hub("sam3", "discovery", "facebook/sam3", SAM_LICENCE, "masks of everything", gated=True, revision=SAM3_COMMIT),
+    _hub("sam2", "tracking", "facebook/sam2.1-hiera-tiny", APACHE, "video tracker", revision=SAM2_COMMIT),
+    _hub("sam3", "tracking", "facebook/sam3", SAM_LICENCE, "video tracker", gated=True, revision=SAM3_COMMIT),
     _hub("edgetam", "tracking", "yonigozlan/EdgeTAM-hf", APACHE, "small video tracker"),
-    _hub("dinov2", "features", "facebook/dinov2-small", APACHE, "appearance"),
+    _hub(
+        "dinov2",
+        "features",
+        "facebook/dinov2-small",
+        APACHE,
+        "appearance",
+        revision="150c8e7bb7cef2d30ec31b13a517af14840ee3f7",
+    ),
     _hub("dinov3", "features", "facebook/dinov3-vits16-pretrain-lvd1689m", DINOV3_LICENCE, "appearance", gated=True),
-    _hub("siglip2", "text", "google/siglip2-base-patch16-224", APACHE, "free words in find and nearest"),
-    _hub("clip", "text", "openai/clip-vit-base-patch32", MIT, "free words in find and nearest"),
+    _hub(
+        "siglip2",
+        "text",
+        "google/siglip2-base-patch16-224",
+        APACHE,
+        "free words in find and nearest",
+        revision="75de2d55ec2d0b4efc50b3e9ad70dba96a7b2fa2",
+    ),
+    _hub(
+        "clip",
+        "text",
+        "openai/clip-vit-base-patch32",
+        MIT,
+        "free words in find and nearest",
+        revision="3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268",
+    ),
     ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of things"),
     ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", about="learned local features"),
     ModelCard(
