@@ -8,15 +8,13 @@ import numpy as np
 
 from list3r.association.alignment import align
 from list3r.association.balance import balanced_support
+from list3r.association.shared_points import Pairs, shared_pairs, shared_samples
 from list3r.association.support import (
     Mask,
-    Pairs,
     SupportSettings,
     confident,
     divide,
     inconsistency,
-    shared_pairs,
-    shared_samples,
     static_support,
 )
 from list3r.frames.base import Camera

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from list3r.association.shared_points import Pairs
 from list3r.association.support import (
     Floats,
     Ints,
     Mask,
-    Pairs,
     Regions,
     StaticSupport,
     SupportSettings,

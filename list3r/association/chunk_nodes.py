@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.edge_information import about
-from list3r.association.support import shared_samples
+from list3r.association.shared_points import shared_samples
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
 

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from list3r.association.alignment import Alignment, AlignmentSettings, align
 from list3r.association.balance import BalancedSupport, balanced_support
 from list3r.association.plain_alignment import plain_align
+from list3r.association.shared_points import Pairs, shared_pairs
 from list3r.association.support import (
     Fit,
     Mask,
-    Pairs,
     StaticSupport,
     SupportSettings,
     confident,
-    shared_pairs,
     static_support,
 )
 from list3r.frames.base import Camera

@@ -18,7 +18,7 @@ from list3r.association.alignment import align
 from list3r.association.chain import adjoint
 from list3r.association.cross_check import CrossSettings, Side, cross_check, shared_view
 from list3r.association.edges import EdgeSettings, measure_edge
-from list3r.association.support import shared_samples
+from list3r.association.shared_points import shared_samples
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, JointWindow

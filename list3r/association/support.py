@@ -20,15 +20,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.shared_points import Pairs, moved
 from list3r.frames.base import Camera
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-Fit = Callable[["Pairs", Mask], Sim3]
+Fit = Callable[[Pairs, Mask], Sim3]
 """A robust similarity S_v_u from the pairs that a mask of shape (N,) chooses; raises `DegenerateError`."""
 
 
@@ -67,42 +67,6 @@ class SupportSettings:
     """Most correspondences handed to the alignment."""
     least_deviation: float = 0.001
     """Disagreement, as a share of the depth, below which chunks are not told to disagree."""
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """N surface points that two chunks both hold."""
-
-    p_u: Floats
-    """In u. Shape (N, 3)."""
-    p_v: Floats
-    """In v. Shape (N, 3)."""
-    confidence_u: Floats
-    """Shape (N,)."""
-    confidence_v: Floats
-    """Shape (N,)."""
-    frame: Ints
-    """Frame.index. Shape (N,)."""
-    pixel: Ints
-    """Row-major number in the colour image. Shape (N,)."""
-    instance_u: Ints
-    """Local id in u, -1 for none. Shape (N,)."""
-    instance_v: Ints
-    """Local id in v, -1 for none. Shape (N,)."""
-    T_cam_u: Floats
-    """From chunk u to the camera of each pair's frame. Shape (N, 3, 4)."""
-    T_cam_v: Floats
-    """From chunk v to the camera of each pair's frame. Shape (N, 3, 4)."""
-    cam_v: Floats
-    """p_v in the camera of its frame. Shape (N, 3)."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @property
-    def weight(self) -> Floats:
-        """Geometric mean of the two confidences. Shape (N,)."""
-        return np.asarray(np.sqrt(self.confidence_u * self.confidence_v))
 
 
 @dataclass(frozen=True)
@@ -156,54 +120,6 @@ class StaticSupport:
     """Those of chunk v that plainly move."""
     delta_max_px: float
     """Largest delta of a region that stays."""
-
-
-def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
-    """The samples at the same pixel of the same frame, finite, with confidence, seen from posed cameras.
-
-    Raises `DegenerateError` when there is none, naming what is missing.
-    """
-    pick_u, pick_v = shared_samples(u, v)
-    if not len(pick_u):
-        frames = np.intersect1d(u.frame, v.frame)
-        raise DegenerateError(
-            f"the chunks share {len(frames)} frames and 0 points; chunks that overlap share posed frames"
-        )
-    row_u, row_v = _camera_rows(u, u.frame[pick_u]), _camera_rows(v, v.frame[pick_v])
-    p_u, p_v = u.points[pick_u].astype(np.float64), v.points[pick_v].astype(np.float64)
-    posed = (row_u >= 0) & (row_v >= 0)
-    finite = np.isfinite(p_u).all(axis=1) & np.isfinite(p_v).all(axis=1)
-    sure = (u.confidence[pick_u] > 0) & (v.confidence[pick_v] > 0)
-    for kept, what in (
-        (posed, "lies in a frame whose camera both chunks placed"),
-        (posed & finite, "has finite coordinates in both chunks"),
-        (posed & finite & sure, "has a confidence above zero in both chunks"),
-    ):
-        if not kept.any():
-            raise DegenerateError(f"of {len(pick_u)} shared points none {what}")
-    keep = np.flatnonzero(posed & finite & sure)
-    T_cam_u, T_cam_v = _cameras(u, row_u[keep]), _cameras(v, row_v[keep])
-    return Pairs(
-        p_u=p_u[keep],
-        p_v=p_v[keep],
-        confidence_u=u.confidence[pick_u[keep]].astype(np.float64),
-        confidence_v=v.confidence[pick_v[keep]].astype(np.float64),
-        frame=u.frame[pick_u[keep]],
-        pixel=u.pixel[pick_u[keep]].astype(np.int64),
-        instance_u=u.instance[pick_u[keep]].astype(np.int64),
-        instance_v=v.instance[pick_v[keep]].astype(np.int64),
-        T_cam_u=T_cam_u,
-        T_cam_v=T_cam_v,
-        cam_v=_moved(T_cam_v, p_v[keep]),
-    )
-
-
-def shared_samples(u: FrameSamples, v: FrameSamples) -> tuple[Ints, Ints]:
-    """Positions in u and v of the samples at the same pixel of the same frame, by frame and pixel."""
-    key_u = (u.frame.astype(np.int64) << np.int64(32)) + u.pixel
-    key_v = (v.frame.astype(np.int64) << np.int64(32)) + v.pixel
-    _, pick_u, pick_v = np.intersect1d(key_u, key_v, assume_unique=True, return_indices=True)
-    return pick_u, pick_v
 
 
 def confident(pairs: Pairs, settings: SupportSettings) -> Mask:
@@ -279,7 +195,7 @@ def inconsistency(
     the camera of their frame, each chunk's by its own pose, after the frame's common change of scale is taken out;
     where the poses of the two chunks agree worse than their points do, in chunk v.
     """
-    off_world = _moved(pairs.T_cam_v, S_v_u.apply(pairs.p_u)) - pairs.cam_v
+    off_world = moved(pairs.T_cam_v, S_v_u.apply(pairs.p_u)) - pairs.cam_v
     depth = np.maximum(pairs.cam_v[:, 2], 1e-9)
     delta = np.linalg.norm(_pixels(off_world + pairs.cam_v, camera) - _pixels(pairs.cam_v, camera), axis=1)
     delta = np.minimum(delta, np.hypot(camera.width, camera.height))
@@ -306,7 +222,7 @@ def inconsistency(
 
 def relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:
     """Points of u against those of v in the camera of their frame, each by its own chunk's pose. Shape (N, 3)."""
-    cam_u = _moved(pairs.T_cam_u, pairs.p_u)
+    cam_u = moved(pairs.T_cam_u, pairs.p_u)
     ratio = np.log(np.maximum(pairs.cam_v[:, 2], 1e-9) / np.maximum(cam_u[:, 2], 1e-9))
     frames, which = np.unique(pairs.frame, return_inverse=True)
     common = np.full(len(frames), np.log(float(S_v_u.scale)))
@@ -382,27 +298,6 @@ def _limit(
 
 def _ids(regions: Regions, found: Inconsistency, excess: float) -> frozenset[int]:
     return frozenset(int(k) for k in regions.label[found.excess > excess] if k >= 0)
-
-
-def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
-    """Row of each frame's camera, -1 where it has none that is finite."""
-    if not len(samples.camera_frames):
-        return np.full(len(frame), -1, np.int64)
-    order = np.argsort(samples.camera_frames, kind="stable")
-    row = order[np.minimum(np.searchsorted(samples.camera_frames[order], frame), len(order) - 1)]
-    good = np.asarray(np.isfinite(samples.T_chunk_cam).all(axis=(1, 2)))
-    return np.where((samples.camera_frames[row] == frame) & good[row], row, -1)
-
-
-def _cameras(samples: FrameSamples, row: Ints) -> Floats:
-    """From the chunk to the cameras of rows. Shape (N, 3, 4)."""
-    used, which = np.unique(row, return_inverse=True)
-    return np.asarray(np.linalg.inv(samples.T_chunk_cam[used])[which.ravel(), :3], np.float64)
-
-
-def _moved(T: Floats, points: Floats) -> Floats:
-    """Each point by its own transform. Shapes (N, 3, 4), (N, 3) -> (N, 3)."""
-    return np.asarray(np.einsum("nij,nj->ni", T[:, :, :3], points) + T[:, :, 3])
 
 
 def _pixels(cam: Floats, camera: Camera) -> Floats:
