@@ -22,6 +22,7 @@ from list3r.association.graph_growth import extend
 from list3r.association.joint_window import JointReconstructor
 from list3r.association.node_graph import bend_chunks
 from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.reprojection_edge import refine_loop
 from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.frames.base import Camera
 from list3r.instances.changed_places import add_changed_places
@@ -73,7 +74,8 @@ def add_chunk(
         else:
             store.add_edges(_adjacent_edge(store, session_id, chosen.edges, debug_dir))
         if not given or len(store.sessions()) > 1:
-            store.add_edges(find_loops(store, chunk_id, joint, chosen.revisits))
+            loops = find_loops(store, chunk_id, joint, chosen.revisits)
+            store.add_edges(_refined(store, e) if e.accepted else e for e in loops)
         place_chunks(store, chosen.graph, chunk_id)
         if library:
             consolidate(store, chunk_id)
@@ -123,6 +125,18 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
         pictures = [k for c in (u, v) for k in store.keyframes(c.chunk_id)]
         write_support(found, pictures, _camera(v), debug_dir)
     return [better_edge(found.edge, by_cameras) or found.edge]
+
+
+def _refined(store: Store, edge: Edge) -> Edge:
+    """A loop between chunks of structure from motion, refined by where features are seen."""
+    if edge.frames is None:
+        return edge
+    owner = {c.chunk_id: c for c in store.chunks()}
+    u, v = owner[edge.u], owner[edge.v]
+    if "metric" in (u.scale_kind, v.scale_kind) or not all(_from_motion(store, c.session_id) for c in (u, v)):
+        return edge
+    keyframes = store.keyframe(u.chunk_id, edge.frames[0]), store.keyframe(v.chunk_id, edge.frames[1])
+    return refine_loop(edge, *keyframes, _camera(u), _camera(v))
 
 
 def _from_motion(store: Store, session_id: int) -> bool:
