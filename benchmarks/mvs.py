@@ -1,0 +1,141 @@
+"""Dense depth from colour alone, held against a depth sensor: how much, how right, how sure, how fast.
+
+    python benchmarks/mvs.py --source PATH [--start 0 320 600] [--frames 100] [--poses sfm|rgbd|given]
+                             [--device cuda] [--json FILE]
+
+The sensor's depth is used for comparing only, after one scale for each run of frames; `--poses rgbd` takes the camera's
+poses from it too, which leaves the stereo as the only source of error. Prints the share of pixels with depth, the
+median relative error, the error by tenths of confidence and CPU seconds for each frame. `--device cuda` runs the same
+frames on the CPU and on the GPU and compares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from machine import write_json
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+from list3r.frames.options import SourceOptions, parse_intrinsics
+from list3r.frames.source import open_source
+from list3r.reconstruction.mvs import dense_depth
+from list3r.reconstruction.registry import ModelOptions, make_reconstructor
+
+Poses = NDArray[np.float64]
+
+
+def poses_of(frames: list[Frame], camera: Camera, kind: str) -> tuple[NDArray[np.bool_], Poses, Camera]:
+    """Which frames have a pose, the poses, and the camera."""
+    if kind == "given":
+        known = [f.T_source_cam is not None and bool(np.isfinite(f.T_source_cam).all()) for f in frames]
+        T = [
+            f.T_source_cam if ok and f.T_source_cam is not None else np.eye(4)
+            for f, ok in zip(frames, known, strict=True)
+        ]
+        return np.array(known), np.stack(T), camera
+    found = make_reconstructor(kind, ModelOptions())(frames, camera)
+    return found.posed, found.T_chunk_cam, found.camera
+
+
+def against_sensor(depth: NDArray[np.float32], confidence: NDArray[np.float16], frames: list[Frame]) -> dict[str, Any]:
+    """Coverage and errors after one scale, on every third pixel."""
+    sensor = np.stack([np.zeros(depth.shape[1:], np.float32) if f.depth is None else f.depth for f in frames])
+    d, c, s = (a[:, 1::3, 1::3].astype(np.float64) for a in (depth, confidence, sensor))
+    both = (d > 0) & (s > 0)
+    out: dict[str, Any] = {"coverage": round(float((d > 0).mean()), 4)}
+    if not both.any():
+        return out
+    ratio = d[both] / s[both]
+    scale = float(np.median(ratio))
+    error = np.abs(ratio / scale - 1.0)
+    order = np.argsort(c[both], kind="stable")
+    tenths = [
+        {"confidence": round(float(c[both][k].mean()), 3), "median_error": round(float(np.median(error[k])), 4)}
+        for k in np.array_split(order, 10)
+    ]
+    return {
+        **out,
+        "coverage_where_sensor_reads": round(float((d > 0)[s > 0].mean()), 4),
+        "scale": round(scale, 4),
+        "median_error": round(float(np.median(error)), 4),
+        "share_above_10_percent": round(float((error > 0.1).mean()), 4),
+        "by_confidence": tenths,
+    }
+
+
+def compare_devices(frames: list[Frame], posed: NDArray[np.bool_], T: Poses, camera: Camera) -> dict[str, Any]:
+    """The same frames on CPU and GPU: seconds, and how far the depths are apart."""
+    if not torch.cuda.is_available():
+        return {"skipped": "no CUDA device here"}
+    seconds, depths = {}, {}
+    for device in ("cuda", "cpu", "cuda"):  # the first run loads the kernels
+        begin = time.perf_counter()
+        depths[device], _ = dense_depth(frames, posed, T, camera, None, None, device)
+        torch.cuda.synchronize()
+        seconds[device] = round((time.perf_counter() - begin) / len(frames), 4)
+    both = (depths["cpu"] > 0) & (depths["cuda"] > 0)
+    apart = np.abs(depths["cuda"][both] / depths["cpu"][both] - 1.0)
+    return {
+        "gpu": torch.cuda.get_device_name(),
+        "wall_s_per_frame": seconds,
+        "same_coverage": round(float(((depths["cpu"] > 0) == (depths["cuda"] > 0)).mean()), 5),
+        "share_within_0_1_percent": round(float((apart < 1e-3).mean()), 5),
+    }
+
+
+def run(path: str, options: SourceOptions, starts: list[int], count: int, kind: str, device: str) -> dict[str, Any]:
+    """Measure each run of frames."""
+    source = open_source(path, options)
+    camera = source.info.camera
+    if camera is None:
+        raise SystemExit("the intrinsics of the source are unknown; give --intrinsics fx,fy,cx,cy")
+    rows = []
+    for start in starts:
+        frames = [f for f in source.read(start, min(start + count, source.info.frame_count)) if isinstance(f, Frame)]
+        posed, T, found = poses_of(frames, camera, kind)
+        begin = time.process_time()
+        depth, confidence = dense_depth(frames, posed, T, found)
+        spent = time.process_time() - begin
+        row = {"start": start, "frames": len(frames), "posed": int(posed.sum())}
+        row |= {"cpu_s_per_frame": round(spent / len(frames), 3), **against_sensor(depth, confidence, frames)}
+        if device == "cuda":
+            row["devices"] = compare_devices(frames, posed, T, found)
+        print(json.dumps(row))
+        rows.append(row)
+    mean = {
+        name: round(float(np.mean([row[name] for row in rows])), 4)
+        for name in ("coverage", "median_error", "cpu_s_per_frame")
+        if all(name in row for row in rows)
+    }
+    return {"source": path, "poses": kind, "mean": mean, "runs": rows}
+
+
+def main() -> None:
+    """Parse arguments, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--source", required=True, help="folder of RGB-D frames that `list3r inspect` recognises")
+    parser.add_argument("--start", type=int, nargs="+", default=[0], help="first frame of each run")
+    parser.add_argument("--frames", type=int, default=100, help="frames of a run")
+    parser.add_argument("--poses", choices=("sfm", "rgbd", "given"), default="sfm", help="where the poses come from")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cuda compares CPU and GPU")
+    parser.add_argument("--intrinsics", help="fx,fy,cx,cy of the colour camera where the source does not tell")
+    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    options = SourceOptions(intrinsics=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
+    figures = run(given.source, options, given.start, given.frames, given.poses, given.device)
+    print(json.dumps(figures["mean"]))
+    write_json(given.json, figures)
+
+
+if __name__ == "__main__":
+    main()
