@@ -215,6 +215,12 @@ def _thumbnail_likeness(a: Gray | None, b: Gray | None) -> float:
     return best
 
 
+_AHEAD = 5
+"""Frames to either side that are decoded with one that is looked at."""
+_KEPT = 64
+"""Frames whose local features are kept: suspects are looked at in order, so older ones are not asked for again."""
+
+
 class _Looks:
     """Local features of the few frames round suspects."""
 
@@ -223,6 +229,7 @@ class _Looks:
         self._sift = cv2.SIFT.create(nfeatures=settings.features, contrastThreshold=0.015)
         self._count = source.info.frame_count
         self._known: dict[int, tuple[Floats, Floats]] = {}
+        self._grays: dict[int, Gray | None] = {}
         self._agreeing: dict[tuple[int, int], int] = {}
 
     def same_place(self, a: int, b: int) -> bool:
@@ -260,6 +267,8 @@ class _Looks:
     def _features(self, position: int) -> tuple[Floats, Floats]:
         """Positions (N, 2), px, and RootSIFT descriptors (N, 128)."""
         if position not in self._known:
+            while len(self._known) >= _KEPT:
+                del self._known[next(iter(self._known))]
             gray = self._gray(position)
             points, found = ((), None) if gray is None else self._sift.detectAndCompute(gray, None)
             if found is None:
@@ -274,5 +283,9 @@ class _Looks:
         if read_gray is not None:
             found: Gray | None = read_gray(position, 1)
             return found
-        frame = next(iter(self._source.read(position, position + 1)), None)
-        return _grey(frame) if isinstance(frame, Frame) else None
+        if position not in self._grays:
+            # A video decodes from a key frame on, so the neighbours that will be asked for next come with it.
+            first, last = max(0, position - _AHEAD), min(self._count, position + _AHEAD)
+            read = enumerate(self._source.read(first, max(last, position + 1)), first)
+            self._grays = {k: _grey(f) if isinstance(f, Frame) else None for k, f in read}
+        return self._grays.get(position)
