@@ -1,0 +1,155 @@
+"""Colour video without weights: `--reconstruction sfm` beside plain pycolmap of the whole sequence, in one run.
+
+    python benchmarks/sfm.py --source ../shared/data/redkitchen --intrinsics 525,525,320,240 --json FILE
+
+Depth and poses of the source are left aside: a folder of its colour pictures alone is built, and the poses serve as
+truth. Plain pycolmap (SIFT, sequential matching, incremental mapping, its own defaults) maps every n-th of the same
+frames with the same freedom: the focal length held where it is given, the distortion free. Times are wall and CPU
+seconds, of the whole program for ours, of features, matching and mapping for the other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from machine import machine, run_list3r, write_json
+
+from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory
+from list3r.frames.base import Camera, Frame
+from list3r.frames.options import parse_intrinsics
+from list3r.frames.source import SourceOptions, open_source
+from list3r.memory.store import Store
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--source", type=Path, required=True, help="folder that `list3r inspect` recognises, with poses"
+    )
+    parser.add_argument("--intrinsics", help="fx,fy,cx,cy of the colour camera; estimated where left out")
+    parser.add_argument("--frames", type=int, help="only the first so many")
+    parser.add_argument("--plain-every", type=int, default=8, help="plain pycolmap maps every n-th frame")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    truth, names = _truth(words.source, words.frames)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = _colour_only(Path(scratch) / "colour", names)
+        ours = _ours(folder, Path(scratch), words, truth)
+        print(ours)
+        plain = _plain(folder, Path(scratch), words, truth)
+        print(plain)
+    ratio = ours["ate_sim3_m"] / plain["ate_sim3_m"] if plain["posed"] else float("nan")
+    print(f"ATE ours by plain {ratio:.3f}", machine())
+    write_json(words.json, {"source": words.source.name, "list3r": ours, "pycolmap": plain, "ratio": round(ratio, 4)})
+
+
+def _truth(source: Path, count: int | None) -> tuple[Trajectory, list[Path]]:
+    """Given poses of the colour camera, at index / 30 s, and the colour pictures in order."""
+    opened = open_source(source, SourceOptions(stop=count))
+    poses = {index: T for index, _, T in opened.read_poses()}  # type: ignore[attr-defined]
+    rows = sorted(poses)
+    names = [file.color for file in opened._layout.files][: opened.info.frame_count]  # type: ignore[attr-defined]
+    return Trajectory(np.array(rows) / 30.0, np.stack([poses[k] for k in rows])), names
+
+
+def _colour_only(folder: Path, names: list[Path]) -> Path:
+    """A folder of links to the colour pictures, with names that say nothing of their camera."""
+    folder.mkdir()
+    for number, name in enumerate(names):
+        (folder / f"{number:06d}{name.suffix}").symlink_to(name.resolve())
+    return folder
+
+
+def _ours(folder: Path, scratch: Path, words: argparse.Namespace, truth: Trajectory) -> dict[str, Any]:
+    memory = scratch / "memory.l3r"
+    options = ["--reconstruction", "sfm", "--workers", str(words.workers)]
+    options += ["--intrinsics", words.intrinsics] if words.intrinsics else []
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    report, usage = run_list3r("build", str(folder), "-m", str(memory), *options)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with Store.open(memory) as store:
+        rows = [(f.frame_index, S.rotation, S.translation) for f, S in store.camera_poses()]
+        focal = store.chunks()[0].intrinsics[0]
+    return {
+        "frames": report["frames"],
+        "posed": report["posed"],
+        "components": report["components"],
+        "loops": report["loops"],
+        "instances": report["instances"],
+        "focal_px": round(focal, 1),
+        **usage,
+        "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
+        "frames_per_s": round(report["frames"] / usage["wall_s"], 2),
+        "ate_sim3_m": _ate(truth, {k: (R, t) for k, R, t in rows}),
+        "stage_cpu_seconds": report["stage_seconds"],
+    }
+
+
+def _plain(folder: Path, scratch: Path, words: argparse.Namespace, truth: Trajectory) -> dict[str, Any]:
+    """Whole-sequence incremental mapping by pycolmap on every n-th frame."""
+    import pycolmap
+
+    pictures, database = scratch / "pictures", scratch / "plain.db"
+    camera = _write_frames(folder, pictures, words)
+    wall, cpu = time.monotonic(), time.process_time()
+    pycolmap.set_random_seed(1)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "SIMPLE_RADIAL"
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 1
+    if camera is not None:
+        reader.camera_params = f"{(camera.fx + camera.fy) / 2},{camera.cx + 0.5},{camera.cy + 0.5},0"
+        options.ba_refine_focal_length = False
+    device = pycolmap.Device.cpu
+    pycolmap.extract_features(
+        database, pictures, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader, device=device
+    )
+    pycolmap.match_sequential(database, device=device)
+    (scratch / "plain").mkdir()
+    made = pycolmap.incremental_mapping(database, pictures, scratch / "plain", options)
+    wall, cpu = time.monotonic() - wall, time.process_time() - cpu
+    poses: dict[int, tuple[Any, Any]] = {}
+    for image in max(made.values(), key=lambda m: m.num_reg_images()).images.values() if made else ():
+        if image.has_pose:
+            T = image.cam_from_world().matrix()
+            poses[int(Path(image.name).stem)] = T[:, :3].T, -T[:, :3].T @ T[:, 3]
+    return {
+        "every": words.plain_every,
+        "frames": len(list(pictures.iterdir())),
+        "posed": len(poses),
+        "wall_s": round(wall, 1),
+        "cpu_s": round(cpu, 1),
+        "ate_sim3_m": _ate(truth, poses),
+    }
+
+
+def _write_frames(folder: Path, pictures: Path, words: argparse.Namespace) -> Camera | None:
+    """Every n-th frame as it is handed out."""
+    pictures.mkdir()
+    intrinsics = parse_intrinsics(words.intrinsics) if words.intrinsics else None
+    source = open_source(folder, SourceOptions(intrinsics=intrinsics, every=words.plain_every))
+    for frame in source.read(0, source.info.frame_count):
+        if isinstance(frame, Frame):
+            cv2.imwrite(str(pictures / f"{frame.index:06d}.png"), frame.color[..., ::-1])
+    return source.info.camera
+
+
+def _ate(truth: Trajectory, poses: dict[int, tuple[Any, Any]]) -> float:
+    rows = sorted(poses)
+    if len(rows) < 3:
+        return float("nan")
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = [poses[k][0] for k in rows], [poses[k][1] for k in rows]
+    return round(float(evaluate_trajectory(truth, Trajectory(np.array(rows) / 30.0, T)).ate_sim3_m.rmse), 5)
+
+
+if __name__ == "__main__":
+    main()
