@@ -24,6 +24,7 @@ from list3r.association.node_graph import bend_chunks
 from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.reprojection_edge import refine_loop
 from list3r.association.revisits import RevisitSettings, find_loops
+from list3r.association.session_ties import hold_back
 from list3r.frames.base import Camera
 from list3r.instances.changed_places import add_changed_places
 from list3r.instances.overlays import write_support
@@ -174,7 +175,8 @@ def place_chunks(
     With `nodes` it is also found how each chunk bends.
     """
     chunks = store.chunks()
-    edges = store.edges()
+    measured = store.edges()
+    edges = hold_back(measured, {c.chunk_id: c.session_id for c in chunks}, _metre(chunks))
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
     fitted = new is not None and len(chunks) > SOLVED_WHOLE
@@ -182,7 +184,7 @@ def place_chunks(
         graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, settings)
     else:
         graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=settings)
-    store.add_edges(after for before, after in zip(edges, graph.edges, strict=True) if after is not before)
+    store.add_edges(after for before, after in zip(measured, graph.edges, strict=True) if after is not before)
     if nodes is not None:
         graph = _straightened(store, graph, chunks, metric, settings, nodes)
     known = {} if store.get_value("poses") == "given" else graph.covariances
@@ -229,6 +231,11 @@ def _straightened(
         graph, bends = bend_chunks(store.frame_samples, graph, rigid, metric, nodes, settings)
     store.set_bends(bends)
     return graph
+
+
+def _metre(chunks: Sequence[ChunkRow]) -> float:
+    """What a metre is in the graph's units, where that is known; else nothing is asked of lengths."""
+    return 1.0 if all(c.scale_kind == "metric" for c in chunks) else float("inf")
 
 
 def finish_session(

@@ -222,6 +222,12 @@ def _chain(
     return placed, Tree(parent, by, np.array(order, np.int64))
 
 
+def chain_poses(ids: Sequence[int], edges: Sequence[Edge]) -> tuple[dict[int, Sim3], dict[int, int]]:
+    """Poses of chunks along a spanning tree of the edges, from the first of each component, and the components."""
+    component = _components(ids, edges)
+    return _chain(ids, edges, component, {})[0], component
+
+
 def across(S_world_here: Sim3, edge: Edge, here: int) -> Sim3:
     """Pose of the chunk at the other end of an edge."""
     S_here_there = edge.S_v_u.inverse() if here == edge.u else edge.S_v_u

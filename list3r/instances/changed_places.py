@@ -55,16 +55,17 @@ class ChangedPlaceSettings:
     """Diagonal of the largest; what is larger is a door, a curtain, or an error of placing."""
     explained: float = 0.5
     """Share of an instance that must be seen through for it to stand for what is gone there."""
+    replaced_m: float = 0.03
+    """Within this of what the other session shows to be new, a thing was replaced;"""
+    mixed: float = 0.2
+    """elsewhere, share of a found thing that lies on another instance of the chunk, of which most stayed, for the two
+    to be kept apart."""
     scrap: float = 0.35
     """Share of a cluster up to which what stands for it is a scrap of the thing, which is found anew as a whole."""
     part: float = 0.3
     """Share of a cluster that its unexplained rest must have, to be a thing of its own."""
     least_mask_px: int = 12
     """Pixels of the small depth image in which a keyframe must see it."""
-    foot_m: float = 0.12
-    """How far below what is seen through the rest of a thing may reach,"""
-    rim_m: float = 0.01
-    """this far inside its outline."""
     block_m: float = 0.5
     """Edge of the cells by which a frame is asked only about what it may see."""
     max_points: int = 2500
@@ -100,29 +101,31 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         return 0
     keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
     upright = store.get_value("gravity", "unknown") != "unknown"
-    first = min(c.component for c in chunks)
-    added = 0
+    asked: list[tuple[ChunkRow, list[View], float, Array]] = []
     for chunk in near:
-        others = [
-            c for c in near if c.component == chunk.component and (c.session_id == session_id) != _is(chunk, session_id)
-        ]
-        if not others or store.feature_space(chunk.chunk_id) != FEATURE_SPACE:
-            continue
-        unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
-        views = views_of(others, keyframes, unit)
-        own = views_of([chunk], keyframes, unit)
-        seen = _ask(own, views, unit, s)
+        others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
+        if others and store.feature_space(chunk.chunk_id) == FEATURE_SPACE:
+            unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
+            own = views_of([chunk], keyframes, unit)
+            asked.append((chunk, own, unit, _gone(_ask(own, views_of(others, keyframes, unit), unit, s), s)))
+    added = 0
+    for chunk, own, unit, gone in asked:
+        came = [g for c, _, _, g in asked if _is(c, session_id) != _is(chunk, session_id) and len(g)]
         nodes = store.local_nodes([chunk.chunk_id])
-        clusters = _unexplained(_gone(seen, s), nodes, chunk, unit, s)
-        if upright and chunk.component == first:
-            clusters = [_down_to_its_foot(c, seen.points, unit, s) for c in clusters]
+        clusters = _unexplained(gone, nodes, chunk, unit, s)
+        if not clusters:
+            continue
         frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
         maker = _Maker(chunk, keyframes[chunk.chunk_id], own, frames, unit, upright, s)
+        in_chunk = unit / float(chunk.S_world_chunk.scale)
         following = 1 + max((n.local_id for n in nodes), default=-1)
         for cluster in clusters:
             thing = maker.make(following, cluster)
             if thing is not None:
                 store.add_local_instance(chunk.chunk_id, thing)
+                # Where a thing stands in the place of another, each hides part of the other's absence: no mixture.
+                if all(float(np.min(cKDTree(g).query(cluster)[0])) > s.replaced_m * unit for g in came):
+                    store.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, in_chunk, s))
                 following += 1
                 added += 1
     return added
@@ -231,7 +234,8 @@ def _unexplained(
     points: Array, nodes: Sequence[LocalNode], chunk: ChunkRow, unit: float, s: ChangedPlaceSettings
 ) -> list[Array]:
     """Clusters of surfaces that are gone and that no instance of the chunk stands for. Shapes (N, 3)."""
-    if len(points) == 0:
+    clusters = _clusters(points, unit, s)
+    if not clusters:
         return []
     tree, reach = cKDTree(points), 1.5 * s.voxel_m * unit
     stood_for = np.zeros(len(points), bool)
@@ -243,25 +247,29 @@ def _unexplained(
         if float(np.mean(inside)) >= s.explained:
             stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
     out = []
-    for rows in _clusters(points, unit, s):
+    for rows in clusters:
         left = rows[~stood_for[rows]]
-        share = len(left) / len(rows)
-        if share >= 1.0 - s.scrap:
+        if len(left) >= (1.0 - s.scrap) * len(rows):
             out.append(points[rows])
         else:
             out += [points[left[r]] for r in _clusters(points[left], unit, s) if len(r) >= s.part * len(rows)]
     return out
 
 
-def _down_to_its_foot(cluster: Array, cells: Array, unit: float, s: ChangedPlaceSettings) -> Array:
-    """A cluster with what its chunk sees right below it: a thing hides what it stands on, and near its foot the other
-    session's frames see a surface that is too near to be told from it. z is up. Shapes (N, 3), (M, 3) -> (K, 3).
-    """
-    low, high = cluster.min(axis=0), cluster.max(axis=0)
-    rim = s.rim_m * unit
-    over = np.all((cells[:, :2] > low[:2] + rim) & (cells[:, :2] < high[:2] - rim), axis=1)
-    below = cells[over & (cells[:, 2] < low[2]) & (cells[:, 2] > low[2] - s.foot_m * unit)]
-    return np.concatenate([cluster, below])
+def _mixed_with(
+    thing: LocalInstance, nodes: Sequence[LocalNode], unit: float, s: ChangedPlaceSettings
+) -> list[tuple[int, int]]:
+    """Pairs of a thing with the chunk's instances that hold part of it beside what stayed: they are not this thing."""
+    tree, reach = cKDTree(thing.support.points), 1.5 * s.voxel_m * unit
+    out = []
+    for node in nodes:
+        if len(node.support.points) == 0:
+            continue
+        inside = np.asarray(tree.query(node.support.points, distance_upper_bound=reach)[0] < np.inf)
+        covered = cKDTree(node.support.points).query(thing.support.points, distance_upper_bound=reach)[0] < np.inf
+        if float(np.mean(inside)) < s.explained and float(np.mean(covered)) >= s.mixed:
+            out.append((node.local_id, thing.local_id))
+    return out
 
 
 # ---------------------------------------------------------------------------------------------- what becomes of it

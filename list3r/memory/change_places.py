@@ -32,11 +32,12 @@ class Looks:
     """Unit length. Shape (D,)."""
 
 
-def difference(a: Looks, b: Looks, s: ChangeSettings) -> float:
+def difference(a: Looks, b: Looks, s: ChangeSettings, unit: float = 1.0) -> float:
     """Sum of squared deviations between two looks; infinite for two that cannot be one thing."""
-    sides = np.log(np.maximum(a.extent, 1e-3) / np.maximum(b.extent, 1e-3)) / s.moved_sides
+    deviation = np.array(s.moved_share) * (a.extent + b.extent) / 2 + s.moved_m * unit
+    sides = np.minimum(((a.extent - b.extent) / deviation) ** 2, s.moved_side_most)
     cosine = float(a.feature @ b.feature)
-    total = float(np.minimum(sides**2, s.moved_side_most).sum()) + (1.0 - cosine) / s.moved_feature
+    total = float(sides.sum()) + (1.0 - cosine) / s.moved_feature
     return total if cosine >= s.moved_cosine and total <= s.moved_most else float("inf")
 
 

@@ -78,9 +78,9 @@ class Story:
                     thing.state = "removed"
                 else:
                     self._remove(thing, session, found)
+        came = {n: box for n, box in came.items() if looks[n].verdict == "gone" or n in replaced}
         for n in fresh:
-            new = looks[n].verdict == "gone" or n in replaced
-            if new and not self._scrap(n, came, session, before=False):
+            if n in came and not self._scrap(n, came, session, before=False):
                 self._add(n, session, looks[n])
 
     def _replaces(self, n: int, left: dict[int, OrientedBox], session: int) -> bool:
@@ -205,13 +205,15 @@ class Story:
                     and not taken.intersection(p.sessions[n])
                     and not self._word.forbids(own, list(p.groups[n]))
                 ):
-                    cost[i, j] = min(difference(old, new[j], self._s), _NEVER)
-        # A pair that cannot be costs so much that as many pairs as possible are made of those that can.
-        rows, columns = linear_sum_assignment(cost)
+                    cost[i, j] = min(difference(old, new[j], self._s, p.unit), _NEVER)
+        # For every thing that is gone there is one more column: that it was not found, at the price of the limit.
+        rest = np.full((len(gone), len(gone)), _NEVER)
+        np.fill_diagonal(rest, self._s.moved_most)
+        rows, columns = linear_sum_assignment(np.hstack([cost, rest]))
         return [
             _Move(gone[i][0], fresh[j], float(cost[i, j]), _chance(cost, i, j, self._s.moved_most))
             for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
-            if cost[i, j] < _NEVER
+            if j < len(fresh) and cost[i, j] < _NEVER
         ]
 
     def result(self) -> Changes:

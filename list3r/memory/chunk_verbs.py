@@ -330,6 +330,13 @@ class ChunkVerbs(BendVerbs):
         blob = self._rows("SELECT cannot_link FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0]
         return np.frombuffer(blob, "<i4").reshape(-1, 2).astype(np.int32)
 
+    def add_cannot_links(self, chunk_id: int, pairs: Sequence[tuple[int, int]]) -> None:
+        """Say of pairs of a chunk's local instances that they are two things; call inside `transaction()`."""
+        rows = self._rows("SELECT cannot_link, overlap FROM chunks WHERE chunk_id = ?", (chunk_id,))
+        links = rows[0][0] + np.array(pairs, "<i4").reshape(-1, 2).tobytes()
+        crc = checksum(links, rows[0][1])
+        self._database.execute("UPDATE chunks SET cannot_link = ?, crc = ? WHERE chunk_id = ?", (links, crc, chunk_id))
+
     def feature_space(self, chunk_id: int) -> str:
         """The embedding space of a chunk's local features."""
         return str(self._rows("SELECT feature_space FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0])
