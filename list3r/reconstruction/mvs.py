@@ -7,7 +7,8 @@ every frame gets the depth of the keyframes around it. Depth without parallax or
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import cv2
@@ -109,7 +110,7 @@ def dense_depth(
     depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float16)
     if int(posed.sum()) < 3:
         return depth, confidence
-    with torch.inference_mode():
+    with torch.inference_mode(), _one_thread():
         chunk = _prepare(frames, posed, T_chunk_cam, camera, sparse, settings, device)
         if chunk is None:
             return depth, confidence
@@ -120,6 +121,17 @@ def dense_depth(
                 continue
             depth[position], confidence[position] = _full_size(chunk, small, frames[position], camera)
     return depth, confidence
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch with one thread: where work is cut into pieces decides the last bits of vectorised functions."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def stereo_noise(
