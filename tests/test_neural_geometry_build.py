@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import list3r
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
+from list3r.association.joint_rgbd import RgbdJointReconstructor
+from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk
 from list3r.cli import model_options
 from list3r.cli.app import run
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
@@ -18,6 +19,7 @@ from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
+from list3r.memory.records import Session
 from list3r.models.device import Gpu
 from tests import neural_scenes
 
@@ -158,3 +160,34 @@ def test_chunks_are_as_long_as_the_gpu_holds(monkeypatch: pytest.MonkeyPatch) ->
     assert length(1_000, chunk=40) == ChunkSettings(40, 12)
     with pytest.raises(OptionError, match=r"pi3 needs about .* GB for 16 frames and a GPU has 3\.9 GB free"):
         length(4_000)
+
+
+def test_windows_of_two_places_are_made_by_the_chunks_own_network(
+    upstream: None, pictures: Path, tmp_path: Path
+) -> None:
+    weights = neural_scenes.weights("pi3", tmp_path / "weights", neural_scenes.film())
+    settings = BuildSettings(reconstruction="pi3", device="cpu", weights=str(weights))
+    task = ChunkTask(str(pictures), SourceOptions(), ChunkSpan(0, 0, 12), settings)
+
+    class Sessions:
+        def sessions(self) -> list[Session]:
+            return [Session(1, str(pictures), "", {}, 12, "complete")]
+
+    joint = RgbdJointReconstructor(Sessions(), {1: SourceOptions()}, joint_model(task))
+    made = joint(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
+    assert made is not None and made.scale_kind == "relative"
+    assert set(made.u.camera_frames) == {0, 1, 2, 3} and set(made.v.camera_frames) == {8, 9, 10, 11}
+
+
+def test_an_update_and_a_resumed_build_take_the_same_options(
+    upstream: None, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    neural_scenes.weights("pi3", tmp_path / "weights", neural_scenes.film())
+    assert run(arguments(tmp_path, "pi3", "--json")) == 0
+    assert run(arguments(tmp_path, "pi3", "--json", "--resume")) == 0
+    again = neural_scenes.write_pictures(tmp_path / "again", neural_scenes.film()[2:])
+    options = ["--reconstruction", "pi3", "--weights", str(tmp_path / "weights"), "--device", "cpu", "--json"]
+    capsys.readouterr()
+    assert run(["update", str(tmp_path / "m.l3r"), str(again), *options]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["posed"] == 10
