@@ -119,7 +119,7 @@ def to_reconstruction(frames: Sequence[Frame], camera: Camera, output: WindowOut
 def network_camera(camera: Camera, output: WindowOutput, posed: NDArray[np.bool_]) -> Camera:
     """The camera of the frames with the median of the focal lengths that the network found, px of the frames."""
     height, width = output.depth.shape[1:]
-    fx, fy = np.median(output.focal[posed], axis=0)
+    fx, fy = (float(f) for f in np.median(output.focal[posed], axis=0))
     middle = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0
     return Camera(camera.width, camera.height, fx * camera.width / width, fy * camera.height / height, *middle)
 
