@@ -1,13 +1,13 @@
 """What one more chunk costs as a memory grows, and what memory it takes.
 
-python benchmarks/incremental.py --chunks 1000 --json benchmarks/results/incremental.json
+python benchmarks/incremental.py --json benchmarks/results/incremental.json
 
 The chunks are made up (things, floors, samples, keyframes of a walk) and go through `mapping.add_chunk` like those of a
 build: edge to the chunk before, revisits, pose graph, library. Three walks: `rooms`, on into new rooms for ever;
 `corridor`, along one floor; `stay`, to and fro in one room, where every chunk touches all that is there. Every chunk
-sees 12 things and a floor. Printed are medians over nine chunks round the 10th, 100th, 1,000th: user seconds of
-processor time of placing (edges, revisits, graph) and of the library, things written anew, resident memory then and its
-peak so far.
+sees 12 things and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by
+turn. Printed are medians: user seconds of processor time of placing (edges, revisits, graph) and of the library, things
+written anew; what the process had grown by when the memory was made, and its peak then.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import cProfile
 import pstats
 import resource
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ import numpy as np
 from machine import machine, write_json
 
 from list3r import mapping
-from list3r.memory.consolidation import consolidate
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.memory.store import Store
 
@@ -44,77 +44,89 @@ SAMPLES, KEYFRAMES, WORDS = 150, 2, 384
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--chunks", type=int, default=1000)
+    parser.add_argument("--chunks", default="10,100,1000", help="sizes of memories to which a chunk is added")
     parser.add_argument("--walks", default="rooms,corridor,stay", help="some of rooms, corridor, stay")
     parser.add_argument("--stay-chunks", type=int, default=100, help="most chunks of the walk that stays")
+    parser.add_argument("--repeat", type=int, default=15, help="chunks that are added to each memory and timed")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--profile", action="store_true", help="where the last ten chunks' time went")
+    parser.add_argument("--profile", action="store_true", help="where the time of the largest memory went")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
     found = {}
     print(machine())
     for name in words.walks.split(","):
-        count = min(words.chunks, words.stay_chunks) if name == "stay" else words.chunks
-        with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "walk.l3r") as store:
-            rows = walk(store, name, count, words.seed, profile=words.profile)
-            size_mb = round((Path(scratch) / "walk.l3r").stat().st_size / 1e6, 1)
-        found[name] = [mark(rows, n) for n in (10, 30, 100, 300, 1000, 3000) if n <= count]
-        print(f"{name}: {count} chunks, {size_mb} MB")
+        sizes = [int(n) for n in words.chunks.split(",") if name != "stay" or int(n) <= words.stay_chunks]
+        found[name] = measure(name, sizes, words)
         for row in found[name]:
-            print("  " + "  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
-    write_json(words.json, {"walks": found})
+            print(f"{name}  " + "  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+        write_json(words.json, {"walks": found})
 
 
-def walk(store: Store, name: str, count: int, seed: int, *, profile: bool = False) -> list[dict[str, float]]:
-    """All chunks, one after the other: what each cost."""
+def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict[str, Any]]:
+    """Medians of chunks added to memories of several sizes, turn by turn, so that all of them meet the same machine."""
+    watched = cProfile.Profile()
+    with tempfile.TemporaryDirectory() as scratch, ExitStack() as stack:
+        stores: dict[int, Store] = {}
+        resident: dict[int, float] = {}
+        peak: dict[int, float] = {}
+        size_mb: dict[int, float] = {}
+        for n in sizes:
+            path = Path(scratch) / f"{n}.l3r"
+            stores[n] = stack.enter_context(Store.create(path))
+            before = resident_mb()
+            begin(stores[n], n + words.repeat)
+            for k in range(n):
+                add(stores[n], chunk(k, name, words.seed))
+            resident[n], peak[n] = round(resident_mb() - before, 1), peak_mb()
+            size_mb[n] = round(path.stat().st_size / 1e6, 1)
+        rows: dict[int, list[dict[str, float]]] = {n: [] for n in sizes}
+        for turn in range(words.repeat):
+            for n in sizes:
+                result = chunk(n + turn, name, words.seed)
+                if words.profile and n == sizes[-1]:
+                    watched.enable()
+                rows[n].append(add(stores[n], result))
+                watched.disable()
+        if words.profile:
+            pstats.Stats(watched).sort_stats("cumtime").print_stats(60)
+        out = []
+        for n in sizes:
+            row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instance_count())}
+            for key in ("placing_s", "library_s", "all_s"):
+                row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
+            row["written"] = int(np.median([r["written"] for r in rows[n]]))
+            out.append({**row, "memory_mb": resident[n], "peak_mb": peak[n], "file_mb": size_mb[n]})
+    return out
+
+
+def begin(store: Store, chunks: int) -> None:
+    """A session of so many chunks."""
     with store.transaction():
         store.set_value("scale_kind", "metric")
-        session = store.add_session("walk", "synthetic", {}, HOP * count + FRAMES)
-    rows, watched, spent = [], cProfile.Profile(), {"library_s": 0.0}
+        store.add_session("walk", "synthetic", {}, HOP * chunks + FRAMES)
+
+
+def add(store: Store, result: ChunkResult) -> dict[str, float]:
+    """Add one chunk as a build does: user seconds of placing it and of the library, things written."""
+    library_s = 0.0
+    consolidate = mapping.consolidate
 
     def timed(*arguments: Any) -> Any:
+        nonlocal library_s
         started = user_s()
         report = consolidate(*arguments)
-        spent["library_s"] = user_s() - started
+        library_s = user_s() - started
         return report
 
-    for k in range(count + 4):
-        result = chunk(k, name, seed)
-        if profile and k >= count - 6:
-            watched.enable()
-        before = len(store.vectors_touched)
-        started = user_s()
-        mapping.consolidate, kept = timed, mapping.consolidate  # type: ignore[assignment]
-        try:
-            mapping.add_chunk(store, session, result)
-        finally:
-            mapping.consolidate = kept
-        taken = user_s() - started
-        watched.disable()
-        rows.append(
-            {
-                "placing_s": taken - spent["library_s"],
-                "library_s": spent["library_s"],
-                "all_s": taken,
-                "written": len(store.vectors_touched) - before,
-                "instances": sum(store.instance_count()),
-                "resident_mb": resident_mb(),
-                "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            }
-        )
-    if profile:
-        pstats.Stats(watched).sort_stats("cumtime").print_stats(60)
-    return rows
-
-
-def mark(rows: list[dict[str, float]], n: int) -> dict[str, Any]:
-    """Medians round the n-th chunk."""
-    part = rows[n - 5 : n + 4]
-    out: dict[str, Any] = {"chunk": n, "instances": int(rows[n - 1]["instances"])}
-    for key in ("placing_s", "library_s", "all_s"):
-        out[key] = round(float(np.median([r[key] for r in part])), 4)
-    out["written"] = int(np.median([r["written"] for r in part]))
-    return {**out, "resident_mb": rows[n - 1]["resident_mb"], "peak_mb": rows[n - 1]["peak_mb"]}
+    before, started = len(store.vectors_touched), user_s()
+    mapping.consolidate = timed  # type: ignore[assignment]
+    try:
+        mapping.add_chunk(store, 1, result)
+    finally:
+        mapping.consolidate = consolidate
+    taken = user_s() - started
+    written = len(store.vectors_touched) - before
+    return {"placing_s": taken - library_s, "library_s": library_s, "all_s": taken, "written": written}
 
 
 def place_of(k: int, name: str) -> int:
@@ -269,6 +281,11 @@ def local(
 def user_s() -> float:
     """User seconds of processor time of this process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_utime
+
+
+def peak_mb() -> float:
+    """Largest resident set of this process so far."""
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
 def resident_mb() -> float:

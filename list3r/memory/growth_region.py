@@ -1,0 +1,239 @@
+"""The local instances that new or moved chunks touch, and their groups, formed anew (`memory.growth` says why that
+is enough).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+import numpy as np
+
+from list3r.memory.geometry import Sim3
+from list3r.memory.library_rows import pack_scores, unpack_scores
+from list3r.memory.library_rules import ConsolidationSettings, World
+from list3r.memory.merging import Edge, Key, Nodes, PairScores, form_groups, local_edges, pair_scores
+from list3r.memory.moving import Mover, Tracks, join_movers, tied_movers, without_moving
+from list3r.memory.records import MergeDecision, MotionTrack
+from list3r.memory.settling import neighbours
+from list3r.memory.shapes import ChunkShapes
+from list3r.memory.store import Store
+from list3r.memory.summaries import Summaries
+
+Group = tuple[Key, ...]
+
+
+class Region:
+    """What is touched, read as far as it is asked for."""
+
+    def __init__(
+        self, store: Store, summaries: Summaries, world: World, s: ConsolidationSettings, dirty: Collection[int]
+    ) -> None:
+        self._store, self._summaries, self._world, self._s = store, summaries, world, s
+        self._dirty = sorted(dirty)
+        self._rows = store.settled()
+        self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+        self._word = store.constraints()
+        self._placed: dict[int, Sim3] = {}
+        self._pairs: dict[tuple[int, int], PairScores] = {}
+        self._paired: set[int] = set()
+        self._edges: dict[tuple[int, int], tuple[list[Edge], dict[tuple[Key, Key], float]]] = {}
+        self._nodes: dict[int, Nodes] = {}
+        self._left: set[Key] = set()
+        """Local instances that lay on, or under, one of a chunk that has moved."""
+        self._home: dict[Key, Group] = {}
+        """The group of each local instance of the chunks that were looked up, as it is now."""
+        self._old: dict[Key, Group] = {}
+        """The same before."""
+        self._old_shown: dict[Group, bool] = {}
+        self._known: set[int] = set()
+        self._moving = store.has_moving()
+        self._movers: dict[Group, Mover] = {}
+        self._spans: dict[int, tuple[float, float]] = {}
+
+    # ------------------------------------------------------------------ what is known of chunks
+
+    def _shapes(self, chunk_id: int) -> ChunkShapes:
+        return self._summaries[chunk_id].shapes
+
+    def _pose(self, chunk_id: int) -> Sim3:
+        """Settled, in the world."""
+        if chunk_id not in self._placed:
+            self._placed[chunk_id] = self._T_world_graph @ self._rows[chunk_id].S_graph_chunk
+        return self._placed[chunk_id]
+
+    def _compare(self) -> None:
+        """Score the pairs of the chunks that are new or moved with those near them, and forget the others of theirs."""
+        stored = self._store.overlaps(self._dirty)
+        fresh: dict[tuple[int, int], bytes] = {}
+        for k in self._dirty:
+            for other in neighbours(self._rows, k):
+                u, v = sorted((k, other))
+                if (u, v) not in fresh:
+                    S_u_v = self._rows[u].S_graph_chunk.inverse() @ self._rows[v].S_graph_chunk
+                    S_u_v = S_u_v if u != v else Sim3.identity()
+                    fresh[u, v] = pack_scores(pair_scores(self._shapes(u), self._shapes(v), S_u_v))
+        self._store.drop_overlaps(stored.keys() - fresh.keys())
+        self._store.put_overlaps(fresh)
+        self._look_up({*self._dirty, *(k for pair in stored for k in pair)})
+        for (u, v), blob in stored.items():
+            p = unpack_scores(blob)
+            most = np.maximum(p.i_on_j, p.j_on_i) >= self._s.evidence.swallowed
+            self._left.update((u, int(self._shapes(u).local_id[i])) for i in p.i[most])
+            self._left.update((v, int(self._shapes(v).local_id[j])) for j in p.j[most])
+
+    def _pairs_of(self, chunks: Iterable[int]) -> dict[tuple[int, int], PairScores]:
+        """Scores of all pairs of which one is among these chunks, in order."""
+        wanted = set(chunks)
+        missing = sorted(wanted - self._paired)
+        for pair, blob in self._store.overlaps(missing).items() if missing else ():
+            if pair not in self._pairs:
+                shapes = {k: self._shapes(k) for k in pair}
+                self._pairs |= without_moving({pair: unpack_scores(blob)}, shapes, self._motions(pair))
+        self._paired |= wanted
+        return {p: self._pairs[p] for p in sorted(self._pairs) if p[0] in wanted or p[1] in wanted}
+
+    def _look_up(self, chunks: Iterable[int]) -> None:
+        """Read how the local instances of chunks were grouped before; new ones stand alone."""
+        missing = sorted(set(chunks) - self._known)
+        if not missing:
+            return
+        self._known.update(missing)
+        found = self._store.members_in(missing)
+        for first, shown in sorted({v for v in found.values()}):
+            group = tuple(self._store.group_of(first))
+            if group and group[0] not in self._old:
+                self._old.update(dict.fromkeys(group, group))
+                self._old_shown[group] = shown
+                for key in group:
+                    self._home.setdefault(key, group)
+        for k in missing:
+            for n in self._shapes(k).local_id.tolist():
+                self._home.setdefault((k, n), ((k, n),))
+
+    # ------------------------------------------------------------------ things that move
+
+    def _motions(self, chunks: Iterable[int]) -> dict[Key, MotionTrack | None]:
+        """The local instances of chunks that move."""
+        return {(k, n): track for k in chunks for n, track in self._summaries[k].motions.items()}
+
+    def _tracks(self, chunks: Iterable[int]) -> Tracks:
+        chunks = sorted(set(chunks))
+        times = {f: t for k in chunks for f, t in self._store.frame_times(self._store.chunk(k)).items()}
+        return Tracks(self._motions(chunks), times)
+
+    def _at_that_time(self, chunks: Collection[int]) -> set[int]:
+        """Chunks seen so shortly before or after one of these that what moves may be the same."""
+        rows = sorted((c for c in self._store.chunks() if c.chunk_id in self._rows), key=lambda c: c.first_frame)
+        at = {c.chunk_id: n for n, c in enumerate(rows)}
+        out = set(chunks)
+        for k in chunks:
+            low, high = self._span_s(k)
+            for way in (range(at[k] - 1, -1, -1), range(at[k] + 1, len(rows))):
+                for n in way:
+                    other = self._span_s(rows[n].chunk_id)
+                    if max(other[0] - high, low - other[1]) > self._s.moving.most_gap_s:
+                        break
+                    out.add(rows[n].chunk_id)
+        return {k for k in out if any(self._rows[k].component == self._rows[j].component for j in chunks)}
+
+    def _span_s(self, chunk_id: int) -> tuple[float, float]:
+        if chunk_id not in self._spans:
+            times = list(self._store.frame_times(self._store.chunk(chunk_id)).values()) or [0.0]
+            self._spans[chunk_id] = min(times), max(times)
+        return self._spans[chunk_id]
+
+    def _along(self, keys: Collection[Key], inside: Collection[Key]) -> set[Key]:
+        """Local instances outside that one of these may be, because one of the two moves."""
+        if not self._moving:
+            return set()
+        chunks = self._at_that_time({k for k, _ in keys})
+        moving = self._motions(chunks)
+        if not moving:
+            return set()
+        others = {(k, n) for k in chunks for n in self._shapes(k).local_id.tolist()} - set(inside)
+        if moving.keys().isdisjoint(keys):
+            others &= moving.keys()
+        shapes, placed = {k: self._shapes(k) for k in chunks}, {k: self._pose(k) for k in chunks}
+        return tied_movers(sorted(keys), sorted(others), shapes, placed, self._tracks(chunks), self._s.moving)
+
+    def _mover(self, group: Group) -> Mover | None:
+        """What is known of a group that moves."""
+        if not self._moving or self._motions({k for k, _ in group}).keys().isdisjoint(group):
+            return None
+        if group not in self._movers:
+            self._form(set(group))
+        return self._movers.get(group)
+
+    # ------------------------------------------------------------------ groups
+
+    def _partition(self) -> tuple[list[Group], list[MergeDecision]]:
+        """The groups of all local instances that the chunks touch, formed anew, and the decisions."""
+        region = {(k, n) for k in self._dirty for n in self._shapes(k).local_id.tolist()}
+        region |= {k for k in (*self._word.touched, *(k for d in self._word.deletions for k in d.keys))}
+        region = self._closed(region)
+        region = self._closed(region | self._across(region, region) | self._along(region, region))
+        while True:
+            groups, decisions = self._form(region)
+            changed = {k for g in groups if self._has_changed(g) for k in g}
+            left = self._closed(self._across(changed, region) | self._along(changed, region)) - region
+            if not left:
+                return groups, decisions
+            region |= left
+
+    def _closed(self, keys: Collection[Key]) -> set[Key]:
+        """All local instances that were in one group with any of these."""
+        self._look_up({k for k, _ in keys})
+        return {m for key in keys for m in (*self._old.get(key, ()), key) if m[0] in self._rows}
+
+    def _has_changed(self, group: Group) -> bool:
+        return self._old.get(group[0]) != group or any(k in self._dirty for k, _ in group)
+
+    def _across(self, keys: Collection[Key], inside: Collection[Key]) -> set[Key]:
+        """Local instances outside that an edge ties to one of these."""
+        chunks = {k for k, _ in keys}
+        pairs = self._pairs_of(chunks)
+        self._look_up({k for pair in pairs for k in pair})
+        out = set()
+        for edges, _ in (self._edges_of(p) for p in pairs):
+            for e in edges:
+                for here, there in ((e.a, e.b), (e.b, e.a)):
+                    if here in keys and there not in inside:
+                        out.add(there)
+        return out
+
+    def _edges_of(self, pair: tuple[int, int]) -> tuple[list[Edge], dict[tuple[Key, Key], float]]:
+        if pair not in self._edges:
+            u, v = (self._nodes_of(k) for k in pair)
+            self._edges[pair] = local_edges(u, v, self._pairs[pair], self._s.merging)
+        return self._edges[pair]
+
+    def _nodes_of(self, chunk_id: int) -> Nodes:
+        if chunk_id not in self._nodes:
+            self._nodes[chunk_id] = Nodes.of([self._shapes(chunk_id)], {chunk_id: self._pose(chunk_id)})
+        return self._nodes[chunk_id]
+
+    def _form(self, region: Collection[Key]) -> tuple[list[Group], list[MergeDecision]]:
+        chunks = sorted({k for k, _ in region})
+        edges: list[Edge] = []
+        overlap: dict[tuple[Key, Key], float] = {}
+        for pair in self._pairs_of(chunks):
+            if pair[0] in chunks and pair[1] in chunks:
+                found = self._edges_of(pair)
+                edges += [e for e in found[0] if e.a in region and e.b in region]
+                overlap |= found[1]
+        links = [((k, int(a)), (k, int(b))) for k in chunks for a, b in self._summaries[k].cannot_link]
+        nodes = Nodes.join([self._nodes_of(k) for k in chunks]).only(region)
+        found_groups, decisions = form_groups(nodes, edges, overlap, links, self._s.merging, self._word)
+        components = {k: self._rows[k].component for k in chunks}
+        movers: dict[Key, Mover] = {}
+        motions = self._motions(chunks) if self._moving else {}
+        if motions:
+            shapes, placed = {k: self._shapes(k) for k in chunks}, {k: self._pose(k) for k in chunks}
+            apart, tracks = links + self._word.pairs_apart(motions), self._tracks(chunks)
+            found_groups, movers, joins = join_movers(
+                found_groups, shapes, placed, components, apart, tracks, self._s.moving
+            )
+            decisions = decisions + joins
+        joined, movers = self._word.joined(found_groups, components, movers)
+        self._movers |= {tuple(g): movers[g[0]] for g in joined if g[0] in movers}
+        return [tuple(g) for g in joined], decisions
