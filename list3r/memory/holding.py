@@ -189,7 +189,8 @@ def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> tuple[f
     """Share of the directions round a in which b has a surface at a's height, above a's lowest part; and how far they
     are from being equally far away, as the deviation of their distances over the mean.
 
-    Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too.
+    Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too, of which
+    the farthest are the rim.
     """
     subject, holder = scene.bodies[a], scene.bodies[b]
     low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
@@ -203,8 +204,9 @@ def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> tuple[f
         return 0.0, np.inf
     sector = np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 12).astype(int) % 12
     distance = np.linalg.norm(away, axis=1)
-    least = np.array([distance[sector == n].min() for n in np.unique(sector)])
-    return len(least) / 12, float(least.std() / least.mean())
+    side = np.max if sunk else np.min
+    away = np.array([side(distance[sector == n]) for n in np.unique(sector)])
+    return len(away) / 12, float(away.std() / away.mean())
 
 
 def _rests_on(scene: Scene, a: int, b: int) -> bool:
