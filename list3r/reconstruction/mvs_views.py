@@ -20,6 +20,8 @@ class ViewSettings:
 
     stride: int = 8
     """Most frames from one keyframe to the next; the sharpest of each run is taken."""
+    least_keyframes: int = 6
+    """Short chunks have shorter runs, so that there are about so many."""
     step: float = 0.06
     """A run also ends when the camera has moved by this share of the depth,"""
     turn_deg: float = 8.0
@@ -55,8 +57,9 @@ def choose_keyframes(
 ) -> list[int]:
     """Positions of the sharpest frame of each run that sees nearly the same. `depth` (F,) is the typical one."""
     runs: list[list[int]] = []
+    stride = max(1, min(settings.stride, int(posed.sum()) // settings.least_keyframes))
     for position in np.flatnonzero(posed).tolist():
-        if runs and len(runs[-1]) < settings.stride and _near(T_chunk_cam, runs[-1][0], position, depth, settings):
+        if runs and len(runs[-1]) < stride and _near(T_chunk_cam, runs[-1][0], position, depth, settings):
             runs[-1].append(position)
         else:
             runs.append([position])
