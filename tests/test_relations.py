@@ -245,3 +245,29 @@ def test_a_rug_is_next_to_nothing_but_a_magazine_on_the_table_is() -> None:
     low, high = beside.aabb
     mug = body(3, Piece("mug", (high[0] + 0.08, (low[1] + high[1]) / 2, low[2] + 0.05), (0.08, 0.08, 0.1), round=True))
     assert (3, "next_to", 6) in facts([beside, mug])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pillow_against_the_headboard_is_on_the_bed(seed: int) -> None:
+    mattress = Piece("mattress", (0, 0, 0.28), (1.4, 2.0, 0.38), points=2500)
+    headboard = Piece("headboard", (0, -1.02, 0.5), (1.4, 0.06, 0.95), points=1500)
+    pillow = Piece("pillow", (0.2, -0.8, 0.53), (0.6, 0.38, 0.12), points=400)
+    found = facts([body(1, FLOOR, structure="floor"), body(2, mattress, headboard, seed=seed), body(3, pillow)])
+    assert (3, "on", 2) in found
+    assert not {p for s, p, o in found if (s, o) == (3, 2)} & {"in"}
+
+
+def test_a_ball_of_which_only_the_top_looks_out_of_a_bowl_is_in_it() -> None:
+    rng = np.random.default_rng(3)
+    bowl = rng.normal(size=(1500, 3))
+    bowl = 0.14 * bowl / np.linalg.norm(bowl, axis=1, keepdims=True) * [1, 1, 1] + [0, 1.0, 0.89]
+    bowl = bowl[(bowl[:, 2] < 0.88) & (rng.random(len(bowl)) < np.where(bowl[:, 1] > 1.0, 1.0, 0.3))]
+    ball = rng.normal(size=(900, 3))
+    ball = 0.06 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + [0.01, 1.0, 0.84]
+    ball = ball[ball[:, 2] > 0.83]
+    parts = []
+    for id, points in ((2, bowl), (3, ball)):
+        rgb = np.tile(np.uint8([90, 90, 200]), (len(points), 1))
+        corners = np.stack([points.min(axis=0), points.max(axis=0)])
+        parts.append(Body(id, points, rgb, fit_box(points, upright=True), corners, None, None))
+    assert (3, "in", 2) in facts(parts)
