@@ -102,6 +102,10 @@ class StoredWords:
         """Unit vector of words (D,). Raises `OptionError` when the weights are no longer there or are others."""
         return self._loaded().encode(text)
 
+    def encode_picture(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Unit vector of a picture (H, W, 3), (D,). Raises `OptionError` as `encode` does."""
+        return np.asarray(self._loaded().encode_pictures([picture])[0], np.float32)
+
     def _loaded(self) -> TextImageModel:
         if self._model is None:
             from list3r.models.cache import locate

@@ -230,6 +230,26 @@ class SceneMemory(MemoryEdits):
         return similar(self.store, vector=target, space=space, k=k, **filters)
 
     @_alone
+    def similar_to_picture(
+        self,
+        image: str | Path | NDArray[np.uint8],
+        k: int = 5,
+        *,
+        box_xyxy: tuple[float, float, float, float] | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """The things that look most like a picture (a file, or RGB of shape (H, W, 3)), or like what is in its box.
+
+        By the model that `list3r embed` was run with; by colours alone where it was not: the reason says which.
+
+            >>> memory.similar_to_picture("mug.jpg", box_xyxy=(120, 80, 180, 150))
+        """
+        from list3r.picture_query import picture_query
+
+        asked = picture_query(self.store, image, box_xyxy)
+        return similar(self.store, vector=asked.vector, space=asked.space, part=asked.part, k=k, **filters)
+
+    @_alone
     def find(
         self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
     ) -> Found:

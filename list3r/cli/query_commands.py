@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -171,7 +172,13 @@ def relations(
 
 def similar(
     memory: MemoryArgument,
-    id: Annotated[int, typer.Option("--id", metavar="ID", help="Things like this one.")],
+    id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Things like this one.")] = None,
+    image: Annotated[
+        Path | None, typer.Option("--image", metavar="FILE", help="Things like what this picture shows.")
+    ] = None,
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only what is in this box of the picture, px.")
+    ] = None,
     k: Count = 5,
     label: Label = None,
     color: Color = None,
@@ -181,10 +188,12 @@ def similar(
     structure: Structure = False,
     json: JsonOption = False,
 ) -> None:
-    """The things that look most like one.
+    """The things that look most like one of them, or like a picture.
 
-    Example: list3r query similar house.l3r --id 12
+    Example: list3r query similar house.l3r --image mug.jpg --box 120,80,180,150
     """
+    from list3r.memory.errors import OptionError
+
     filters: dict[str, Any] = {
         "label": label,
         "color": color,
@@ -194,7 +203,26 @@ def similar(
         "structure": structure,
     }
     with open_memory(memory) as scene:
-        print_matches(scene.similar(id, k=k, **filters), scene.units, json)
+        if (id is None) == (image is None) or (box is not None and image is None):
+            raise OptionError("say what to compare with: --id ID, or --image FILE, with --box for a part of it")
+        if image is not None:
+            corners = None if box is None else _parse_box(box)
+            found = scene.similar_to_picture(image, k, box_xyxy=corners, **filters)
+        else:
+            assert id is not None
+            found = scene.similar(id, k=k, **filters)
+        print_matches(found, scene.units, json)
+
+
+def _parse_box(text: str) -> tuple[float, float, float, float]:
+    """`120,80,180,150`. Raises `OptionError`."""
+    from list3r.memory.errors import OptionError
+
+    try:
+        x0, y0, x1, y1 = (float(part) for part in text.split(","))
+    except ValueError:
+        raise OptionError(f"--box {text!r}: four numbers x0,y0,x1,y1 are needed, such as 120,80,180,150") from None
+    return x0, y0, x1, y1
 
 
 def find(

@@ -30,6 +30,17 @@ def object_feature(
     return feature / max(float(np.linalg.norm(feature)), 1e-9)
 
 
+COLOR_PART = _CHROMA_BINS + _LIGHT_BINS
+"""The first numbers of a feature tell the colours, the rest the shape."""
+
+
+def color_feature(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The colour part of `object_feature`, of unit length: all that a picture without depth tells. (N, 3) -> (36,)."""
+    lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255.0, cv2.COLOR_RGB2Lab)[0]
+    part = np.concatenate([_chroma_histogram(lab), np.sqrt(0.5) * _soft_histogram(lab[:, 0] / 100.0, _LIGHT_BINS)])
+    return np.asarray(part / max(float(np.linalg.norm(part)), 1e-9), dtype=np.float32)
+
+
 def mean_feature(features: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
     """z of the paper: the normalised weighted mean of unit features. Shape (N, D) -> (D,)."""
     mean = (features * weights[:, None]).sum(axis=0)

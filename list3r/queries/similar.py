@@ -8,11 +8,14 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.memory.vectors import VectorIndex
 from list3r.queries.match import FilterOptions, Filters, Match, checked_count, checked_instance
+
+_BATCH = 500
+"""Instances that are loaded at once."""
 
 
 def similar(
@@ -21,12 +24,14 @@ def similar(
     instance_id: int | None = None,
     vector: ArrayLike | None = None,
     space: str | None = None,
+    part: int | None = None,
     k: int = 5,
     **options: Unpack[FilterOptions],
 ) -> list[Match]:
     """The k things whose features are most like those of an instance, or like a `vector` of a named `space`.
 
-    The score is the cosine. Raises `SpaceMismatchError` for vectors of another space, `OptionError` and
+    The score is the cosine; with `part` of the first so many numbers, which is all that `vector` then holds. Raises
+    `SpaceMismatchError` for vectors of another space, `OptionError` and
     `UnknownIdError` for arguments that make no sense.
     """
     k = checked_count(k)
@@ -34,11 +39,15 @@ def similar(
         raise OptionError("give an instance or a vector to compare with, one of the two")
     if vector is not None and space is None:
         raise OptionError("a vector needs the name of its embedding space, model@revision/dim")
+    if part is not None and (vector is None or np.shape(vector) != (part,)):
+        raise OptionError(f"a part of {part} numbers needs a vector of as many")
     filters = Filters(**options)
     origin = None if instance_id is None else checked_instance(store, instance_id)
     index = VectorIndex.of(store, space)
     query = index.vector(store, origin.id) if origin is not None else vector
     assert query is not None
+    if part is not None:
+        return _similar_in_part(store, index.space, query, part, k, filters)
     found: dict[int, Instance] = {}
 
     def passing(ids: Sequence[int]) -> set[int]:
@@ -51,3 +60,29 @@ def similar(
         reason = f"cosine {cosine:.3f} in {index.space}"
         out.append(Match(found[other], round(cosine, 4), None, away, reason))
     return out
+
+
+def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: int, filters: Filters) -> list[Match]:
+    """By the first `part` numbers of all vectors, of which there is no index."""
+    query = np.asarray(vector, np.float64)
+    length = float(np.linalg.norm(query))
+    if not np.isfinite(length) or length == 0.0:
+        raise OptionError("the vector to compare with must be finite and not zero")
+    ids, cosines = [], []
+    for some, vectors in store.embedding_batches(space):
+        if vectors.shape[1] < part:
+            raise SpaceMismatchError(f"{part} numbers cannot be compared in the space {space}, which has fewer")
+        head = vectors[:, :part].astype(np.float64)
+        ids.append(some)
+        cosines.append(head @ query / np.maximum(np.linalg.norm(head, axis=1) * length, 1e-12))
+    order = np.lexsort((np.concatenate(ids), -np.concatenate(cosines))) if ids else np.zeros(0, np.int64)
+    out: list[Match] = []
+    for start in range(0, len(order), _BATCH):
+        at = order[start : start + _BATCH]
+        score = dict(zip(np.concatenate(ids)[at].tolist(), np.concatenate(cosines)[at].tolist(), strict=True))
+        for i in filters.select(store.instances_of(list(score))):
+            reason = f"cosine {score[i.id]:.3f} of colours alone, the first {part} numbers of {space}"
+            out.append(Match(i, round(score[i.id], 4), None, None, reason))
+        if len(out) >= k:
+            break
+    return out[:k]
