@@ -27,6 +27,7 @@ from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.association.session_ties import hold_back
 from list3r.frames.base import Camera
 from list3r.instances.changed_places import add_changed_places
+from list3r.instances.loop_overlays import write_loop
 from list3r.instances.overlays import write_support
 from list3r.memory.bends import Bend
 from list3r.memory.consolidation import consolidate
@@ -64,7 +65,8 @@ def add_chunk(
     """Add one chunk to the memory, all of it or nothing; its id.
 
     `joint` makes joint windows of frames of two places, for revisits of chunks without metric scale. Without `library`
-    the chunks are only placed. What the edge to the chunk before stands on is drawn into `debug_dir`/edges.
+    the chunks are only placed. What the edge to the chunk before and the loops stand on is drawn into
+    `debug_dir`/edges.
     """
     chosen = settings or AssociationSettings()
     with store.transaction():
@@ -78,6 +80,8 @@ def add_chunk(
             loops = find_loops(store, chunk_id, joint, chosen.revisits)
             store.add_edges(_refined(store, e) if e.accepted else e for e in loops)
         place_chunks(store, chosen.graph, chunk_id)
+        if debug_dir is not None:
+            _draw_loops(store, chunk_id, debug_dir)
         if library:
             consolidate(store, chunk_id)
             if store.get_value("detected labels") is not None or votes_of(store, chunk_id)[1]:
@@ -143,6 +147,19 @@ def _refined(store: Store, edge: Edge) -> Edge:
 def _from_motion(store: Store, session_id: int) -> bool:
     """Whether a session's cameras are known better than its surfaces."""
     return any(s.session_id == session_id and s.settings.get("reconstruction") == "sfm" for s in store.sessions())
+
+
+def _draw_loops(store: Store, chunk_id: int, debug_dir: Path) -> None:
+    """Pictures of the revisits of a chunk that geometry measured."""
+    rows = {c.chunk_id: c for c in store.chunks()}
+    for edge in store.edges():
+        if edge.kind != "loop" or edge.v != chunk_id or edge.frames is None or not edge.S_v_u.translation.any():
+            continue
+        ends = [
+            (store.frame_samples(chunk), store.keyframe(chunk, frame), _camera(rows[chunk]))
+            for chunk, frame in zip((edge.u, edge.v), edge.frames, strict=True)
+        ]
+        write_loop(edge, ends[0], ends[1], debug_dir)
 
 
 def _camera(chunk: ChunkRow) -> Camera:
