@@ -242,3 +242,22 @@ def test_the_surest_thing_takes_the_pixel(chunk) -> None:
     things.keep(3, {0: np.full(shape, 1.0, np.float32), 1: np.full(shape, 2.0, np.float32)})
     things.keep(3, {2: np.full(shape, -1.0, np.float32)})
     assert (things.labels(3) == 2).all()
+
+
+def test_names_of_a_discoverer_become_labels(tmp_path: Path) -> None:
+    from list3r.mapping import add_chunk
+    from list3r.memory.store import Store
+    from tests.conftest import box_points, chunk_result, local_instance
+
+    mug = local_instance(0, box_points((0, 0, 2), (0.1, 0.1, 0.1), 300, 1), (200, 200, 200), np.arange(20))
+    mug = replace(mug, names=(("cup", 0.8), ("cup", 0.7), ("bowl", 0.4), ("cup", 0.75)))
+    once = local_instance(1, box_points((1, 0, 2), (0.2, 0.1, 0.1), 300, 2), (10, 200, 20), np.arange(20))
+    once = replace(once, names=(("vase", 0.35),))
+    with Store.create(tmp_path / "m.l3r") as store:
+        with store.transaction():
+            store.set_value("scale_kind", "metric")
+            store.set_value("poses", "given")
+            session = store.add_session("walk", "", {"poses": "given"}, 40)
+        add_chunk(store, session, chunk_result(0, 0, 40, (mug, once)))
+        labels = {i.label for i in store.instances(structure=False)}
+    assert "cup" in labels and "vase" not in labels

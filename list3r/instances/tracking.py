@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -125,7 +125,9 @@ class LabelledChunk:
                 size,
             )
             feature = _joined_feature(proposals, joined, number)
-            instances.append(LocalInstance(len(instances), mask_track, feature, support, stability, plane, structure))
+            names = () if structure else _names(proposals, joined, number)
+            instance = LocalInstance(len(instances), mask_track, feature, support, stability, plane, structure)
+            instances.append(replace(instance, names=names))
         pairs = cannot_link_pairs(instances, self.settings.track.cannot_link_frames, views.unit)
         return LocalLibrary(tuple(instances), pairs, feature_space)
 
@@ -277,6 +279,18 @@ def _bases(
             known = np.isfinite(candidates.base).all(axis=1) & np.isnan(out[owner, 0])
             out[owner[known]] = candidates.base[known] @ np.linalg.inv(views.pose(candidates.position))
     return out
+
+
+def _names(
+    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
+) -> tuple[tuple[str, float], ...]:
+    """What an instance's candidates were called, with their scores, in order of the anchors."""
+    return tuple(
+        (p.names[n], float(p.score[n]))
+        for p, owner in zip(proposals, joined, strict=True)
+        if p.names is not None
+        for n in np.flatnonzero(owner == number).tolist()
+    )
 
 
 def _joined_feature(

@@ -70,6 +70,19 @@ def put_votes(store: Store, chunk_id: int, detector: str, votes: Mapping[int, Vo
     store.set_value(_key(chunk_id), {"detector": detector, "locals": rows})
 
 
+def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
+    """What a discoverer with class names says of a local instance, from its names and scores on the anchors.
+
+    A score is taken for the probability of the class; anchors that follow one another see nearly the same view with the
+    same mistakes, so each has half a voice.
+    """
+    classes: dict[str, tuple[float, float]] = {}
+    for name, score in names:
+        p = min(max(score, 0.02), 0.98)
+        classes[name] = _plus(classes.get(name, (0.0, 0.0)), (0.5, 0.5 * (math.log(p / (1.0 - p)) - PRIOR_ODDS)))
+    return Votes(0.0, classes)
+
+
 def votes_of(store: Store, chunk_id: int) -> tuple[str, dict[int, Votes]]:
     """The detector and its votes by local id; nothing where none looked at the chunk."""
     told: dict[str, Any] | None = store.get_value(_key(chunk_id))

@@ -75,6 +75,8 @@ class LocalInstance:
     """True when it was seen to move against the rest."""
     motion: MotionTrack | None = None
     """Where it was while it moved, for dynamic ones."""
+    names: tuple[tuple[str, float], ...] = ()
+    """What the discoverer called it on each anchor, with its score in (0, 1); empty where it has no names."""
 
 
 @dataclass(frozen=True)
