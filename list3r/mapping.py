@@ -34,7 +34,7 @@ from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import estimate_gravity, world_from_graph
-from list3r.memory.labels import apply_labels, votes_of
+from list3r.memory.labels import apply_labels, put_votes, votes_of, votes_of_names
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.scale import settle_scale
 from list3r.memory.store import Store
@@ -71,6 +71,9 @@ def add_chunk(
     chosen = settings or AssociationSettings()
     with store.transaction():
         chunk_id = store.add_chunk(session_id, result)
+        named = {i.local_id: votes_of_names(i.names) for i in result.library.instances if i.names}
+        if named:
+            put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named)
         given = _poses_given(store, session_id)
         if given:
             store.add_edges(_edge_of_given_poses(store, session_id))
