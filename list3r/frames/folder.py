@@ -167,7 +167,7 @@ class FolderSource:
         guess = self._camera_guess()
         missing = list(layout.missing)
         if not self._has_depth:
-            missing.append("there is no depth: --reconstruction with a model for colour images")
+            missing.append("there is no depth: build takes colour alone (--reconstruction sfm or a network)")
         if rig.camera is None:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
         if rig.color_size != rig.stored_size:

@@ -149,7 +149,7 @@ class VideoSource:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
         if self._chosen.sharpest:
             notes.append("of each so many frames the sharpest is taken; --no-sharpest takes the first")
-        missing = ["there is no depth: --reconstruction with a model for colour images"]
+        missing = ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
         if rig.camera is None:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
         focal = None if rig.camera is not None else self._stamps.focal_35mm
