@@ -21,7 +21,7 @@ from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Session
 from list3r.models.device import Gpu
-from tests import neural_scenes
+from tests import neural_models, neural_scenes
 
 
 @pytest.fixture
@@ -191,3 +191,20 @@ def test_an_update_and_a_resumed_build_take_the_same_options(
     assert run(["update", str(tmp_path / "m.l3r"), str(again), *options]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["posed"] == 10
+
+
+def test_every_part_can_be_a_network(
+    upstream: None, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    neural_scenes.weights("da3", tmp_path / "weights", neural_scenes.film())
+    parts = {"discovery": "eomt", "tracking": "sam2", "features": "dinov2"}
+    options = ["--chunk", "12"]
+    for part, name in parts.items():
+        folder = neural_models.save(f"{part}/{name}", tmp_path / part)
+        options += [f"--{part}", name, "--weights", f"{part}={folder}"]
+    assert run(arguments(tmp_path, "da3", *options, "--json")) == 0
+    assert json.loads(capsys.readouterr().out)["posed"] == 12
+    with list3r.open(tmp_path / "m.l3r") as scene:
+        said = scene.store.sessions()[0].settings
+        assert [said[part] for part in parts] == list(parts.values())
+        assert [name for name, _ in said["instance_weights"]] == ["discovery/eomt", "features/dinov2", "tracking/sam2"]  # type: ignore[attr-defined]
