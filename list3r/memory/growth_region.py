@@ -169,7 +169,8 @@ class Region:
     def _partition(self) -> tuple[list[Group], list[MergeDecision]]:
         """The groups of all local instances that the chunks touch, formed anew, and the decisions."""
         region = {(k, n) for k in self._dirty for n in self._shapes(k).local_id.tolist()}
-        region |= {k for k in (*self._word.touched, *(k for d in self._word.deletions for k in d.keys))}
+        said = {*self._word.touched, *(k for d in self._word.deletions for k in d.keys)}
+        region |= {k for k in said if k[0] in self._rows}
         region = self._closed(region)
         region = self._closed(region | self._across(region, region) | self._along(region, region))
         while True:

@@ -20,6 +20,9 @@ _REFERENCES = (
     ("relations", "object", "instances", "id"),
     ("embeddings", "instance", "instances", "id"),
     ("frames", "chunk_id", "chunks", "chunk_id"),
+    ("placements", "chunk_id", "chunks", "chunk_id"),
+    ("chunks", "chunk_id", "placements", "chunk_id"),
+    ("anchors", "instance", "instances", "id"),
 )
 
 
