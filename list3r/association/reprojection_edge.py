@@ -32,8 +32,8 @@ class ReprojectionSettings:
     """Error of a feature whose point was projected, in px of a picture 640 wide."""
     depth_sigma: float = 0.06
     """Error of a depth, share of it."""
-    gate: float = 8.0
-    """A pair that the first estimate leaves farther off, in deviations, has no say."""
+    gates: tuple[float, ...] = (40.0, 12.0, 6.0)
+    """Pairs farther off, in deviations, have no say in the rounds of refinement."""
     least_pairs: int = 12
     correlated: float = 4.0
     """So many pairs tell as much as one: their depths err together."""
@@ -67,29 +67,32 @@ def refine_loop(
         a, b, u.keypoints_xy[rows[:, 0]].astype(float), v.keypoints_xy[rows[:, 1]].astype(float), camera_u, camera_v
     )
     far = float(np.median(a[:, 2]))
-    near = np.abs(pairs.off(start, s)).max(axis=1) < s.gate
-    if near.sum() < s.least_pairs:
-        return edge
-    kept = pairs.where(near)
     unit = np.array([far] * 3 + [1.0] * 4)
-
-    def residual(x: Array) -> Array:
-        return kept.off(start @ Sim3.exp(x * unit), s).ravel()
-
-    found = least_squares(residual, np.zeros(7), loss="soft_l1", max_nfev=40)
-    S = start @ Sim3.exp(found.x * unit)
-    off = kept.off(S, s)
-    inside = np.abs(off).max(axis=1) < 4.0
+    S, jacobian = start, np.zeros((0, 7))
+    for gate in s.gates:
+        kept = pairs.where(np.abs(pairs.off(S, s)).max(axis=1) < gate)
+        if len(kept.a) < s.least_pairs:
+            return edge
+        S, jacobian = _refined(S, kept, unit, s)
+    inside = np.abs(pairs.off(S, s)).max(axis=1) < s.gates[-1]
     if inside.sum() < s.least_pairs:
         return edge
-    return _refined_edge(
-        edge, T_v @ S @ T_u.inverse(), _covariance(np.asarray(found.jac), far, s), T_u, int(inside.sum())
-    )
+    covariance = _covariance(jacobian, unit, s)
+    return _refined_edge(edge, T_v @ S @ T_u.inverse(), covariance, T_u, int(inside.sum()))
 
 
-def _covariance(jacobian: Array, far: float, s: ReprojectionSettings) -> Array:
+def _refined(start: Sim3, pairs: _Pairs, unit: Array, s: ReprojectionSettings) -> tuple[Sim3, Array]:
+    """The camera of v from that of u, and the Jacobian of its weighted residuals."""
+
+    def residual(x: Array) -> Array:
+        return pairs.off(start @ Sim3.exp(x * unit), s).ravel()
+
+    found = least_squares(residual, np.zeros(7), loss="soft_l1", max_nfev=40)
+    return start @ Sim3.exp(found.x * unit), np.asarray(found.jac)
+
+
+def _covariance(jacobian: Array, unit: Array, s: ReprojectionSettings) -> Array:
     """Of the tangent in u's camera, u's units."""
-    unit = np.array([far] * 3 + [1.0] * 4)
     floor = np.array([s.least_shift] * 3 + [s.least_turn_rad] * 3 + [s.least_scale]) ** 2
     information = jacobian.T @ jacobian / s.correlated + 1e-9 * np.eye(7)
     return np.asarray((np.linalg.inv(information) + np.diag(floor)) * unit[:, None] * unit)

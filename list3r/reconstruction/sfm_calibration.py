@@ -67,31 +67,46 @@ def calibrate(source: FrameSource, settings: CalibrationSettings | None = None) 
     info = source.info
     known = info.camera is not None
     start = info.camera or guessed_camera(info)
-    looked = (_window(source, a, b, start, chosen) for a, b in _spans(info.frame_count, chosen))
-    windows = [w for w in looked if w is not None]
-    if not windows:
+    found = _estimated(source, start, chosen)
+    if found is None and known:
+        found = _estimated(source, guessed_camera(info), chosen)
+    if found is None:
         return _nothing(start, known)
-    focals = np.array([found.camera.fx for _, found in windows])
-    middle = float(np.exp(np.median(np.log(focals))))
-    agree = np.abs(np.log(focals / middle)) < np.log(chosen.most_window_ratio)
-    windows = [w for w, kept in zip(windows, agree.tolist(), strict=True) if kept]
-    free, k1 = _adjust_together(windows, replace(start, fx=middle, fy=middle), True, chosen)
-    low, high = (share * max(start.width, start.height) for share in chosen.focal_range)
-    if not low < free.fx < high or abs(k1) > chosen.distortion_range:
-        return _nothing(start, known)
+    windows, free, k1 = found
     if not known:
         said = f"the camera was estimated from the pictures: focal length {free.fx:.0f} px, distortion k1 {k1:.3f}"
         return Calibration(_lens(free, k1, chosen), len(windows), free.fx, (said,))
-    notes: tuple[str, ...] = ()
     if abs(np.log(free.fx / start.fx)) > np.log(chosen.most_focal_ratio):
-        notes = (
+        said = (
             f"the given focal length {start.fx:.0f} px does not fit the pictures, which say about {free.fx:.0f} px; "
-            "check --intrinsics, or leave it out",
+            "check --intrinsics, or leave it out"
         )
-    fixed, k1 = _adjust_together(windows, start, False, chosen)
-    if abs(k1) > chosen.distortion_range:
-        return Calibration(start, len(windows), free.fx, notes)
-    return Calibration(_lens(fixed, k1, chosen), len(windows), free.fx, notes)
+        return Calibration(start, len(windows), free.fx, (said,))
+    _, k1 = _adjust_together(windows, start, False, chosen)
+    lens = start if abs(k1) > chosen.distortion_range else _lens(start, k1, chosen)
+    return Calibration(lens, len(windows), free.fx)
+
+
+_Windows = list[tuple[MapProblem, SparseMap]]
+
+
+def _estimated(
+    source: FrameSource, start: Camera, settings: CalibrationSettings
+) -> tuple[_Windows, Camera, float] | None:
+    """The windows that could be mapped and agree, and their camera and k1; None where they make no sense."""
+    looked = (_window(source, a, b, start, settings) for a, b in _spans(source.info.frame_count, settings))
+    windows = [w for w in looked if w is not None]
+    if not windows:
+        return None
+    focals = np.array([found.camera.fx for _, found in windows])
+    middle = float(np.exp(np.median(np.log(focals))))
+    agree = np.abs(np.log(focals / middle)) < np.log(settings.most_window_ratio)
+    windows = [w for w, kept in zip(windows, agree.tolist(), strict=True) if kept]
+    if not windows:
+        return None
+    free, k1 = _adjust_together(windows, replace(start, fx=middle, fy=middle), True, settings)
+    low, high = (share * max(start.width, start.height) for share in settings.focal_range)
+    return (windows, free, k1) if low < free.fx < high and abs(k1) <= settings.distortion_range else None
 
 
 def _nothing(start: Camera, known: bool) -> Calibration:
