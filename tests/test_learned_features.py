@@ -100,3 +100,14 @@ def test_wrong_weights_are_one_line(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     with pytest.raises(OptionError, match="junk"):
         make_detector("xfeat", tmp_path / "junk.pth")
+
+
+def test_wrong_words_for_local_features_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from list3r.cli.app import run
+
+    (tmp_path / "walk").mkdir()
+    cv2.imwrite(str(tmp_path / "walk" / "a.png"), np.zeros((48, 64, 3), np.uint8))
+    for words, said in (("magic", "choose sift"), ("aliked", "needs its weights"), ("aliked=none.pth", "do not exist")):
+        options = ["-m", str(tmp_path / "m.l3r"), "--intrinsics", "60,60,32,24", "--local-features", words]
+        assert run(["build", str(tmp_path / "walk"), *options]) == 2
+        assert said in capsys.readouterr().err

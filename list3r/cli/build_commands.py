@@ -80,6 +80,7 @@ def build(
     features: mod.Features = None,
     device: mod.Device = "auto",
     weights: mod.WeightsWords = None,
+    local_features: mod.LocalFeatures = "sift",
     licence: mod.LicenceProfile = "research",
     poses: Annotated[
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")

@@ -57,6 +57,14 @@ WeightsWords = Annotated[
         show_default=False,
     ),
 ]
+LocalFeatures = Annotated[
+    str,
+    typer.Option(
+        "--local-features",
+        metavar="KIND[=FILE]",
+        help="What finds a keyframe again: sift, or aliked=FILE or xfeat=FILE with their weights.",
+    ),
+]
 LicenceProfile = Annotated[
     str,
     typer.Option(
@@ -87,6 +95,7 @@ WORDS = (
     "features",
     "device",
     "weights",
+    "local_features",
     "licence",
     "chunk",
     "overlap",
@@ -118,7 +127,10 @@ def build_settings(
     chosen = check_allowed(selection, asked, words["licence"])
     notes = [f"note: {selection.why}"] if selection.why else []
     notes += _terms(selection, chosen)
+    kind, file = _local_features(words["local_features"])
     settings = BuildSettings(
+        local_features=kind,
+        feature_weights=file,
         reconstruction=selection.reconstruction,
         poses=poses,
         device=words["device"],
@@ -135,6 +147,23 @@ def build_settings(
     chunks = None if resumed is None or length is not None else _recorded(resumed)
     chunks = chunks or _cut(settings, length, overlap)
     return replace(settings, chunks=chunks), notes
+
+
+def _local_features(words: str) -> tuple[str, str | None]:
+    """Kind and file of `--local-features`. Raises `OptionError` for what is not known or cannot be loaded."""
+    from list3r.memory.errors import OptionError
+    from list3r.reconstruction.learned import KINDS, make_detector
+
+    kind, _, file = words.partition("=")
+    if kind == "sift" and not file:
+        return kind, None
+    if kind not in KINDS:
+        raise OptionError(f"--local-features {words}: choose sift, {', '.join(f'{k}=FILE' for k in KINDS)}")
+    if not file:
+        raise OptionError(f"--local-features {kind} needs its weights: --local-features {kind}=FILE")
+    path = Path(file).expanduser().resolve()
+    make_detector(kind, path)
+    return kind, str(path)
 
 
 def _selection(info: SourceInfo, words: Mapping[str, Any]) -> Selection:

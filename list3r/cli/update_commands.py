@@ -13,7 +13,7 @@ from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
-from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
+from list3r.cli.common import JsonOption, MemoryArgument, note, print_json, with_at
 from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector, run_detector
 from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
 
@@ -27,6 +27,9 @@ def register(app: typer.Typer) -> None:
     for group in app.registered_groups:
         if group.name == "query" and group.typer_instance is not None:
             group.typer_instance.command("changes")(changes)
+            for command in group.typer_instance.registered_commands:
+                if command.callback is not None:
+                    command.callback = with_at(command.callback)
 
 
 def update(
@@ -39,6 +42,7 @@ def update(
     features: mod.Features = None,
     device: mod.Device = "auto",
     weights: mod.WeightsWords = None,
+    local_features: mod.LocalFeatures = "sift",
     licence: mod.LicenceProfile = "research",
     poses: Annotated[
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
