@@ -334,3 +334,31 @@ def test_thumbnails_tell_a_cut_in_one_pass(tmp_path: Path) -> None:
     heard: list[tuple[int, int]] = []
     assert find_cuts(source, progress=lambda done, total: heard.append((done, total))) == (20,)
     assert heard == [(k + 1, 40) for k in range(40)]
+
+
+def test_a_clip_as_phones_write_it(tmp_path: Path) -> None:
+    """Uneven times, stored lying, shown upright, with the lens's 35 mm equivalent beside it."""
+    path = tmp_path / "IMG_1.mov"
+    stamps = np.cumsum([0, 33, 33, 50, 17, 33, 100, 33, 33, 33])
+    tags = {"movflags": "use_metadata_tags"}
+    with av.open(str(path), "w", options=tags) as container:
+        container.metadata["com.apple.quicktime.camera.focal_length.35mm_equivalent"] = "26"
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        stream.options = {"bf": "2", "g": "4"}
+        stream.set_display_rotation(-90)
+        for k, stamp in enumerate(stamps.tolist()):
+            picture = np.full((64, 96, 3), 10 + 20 * k, np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = stamp, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    source = open_source(path)
+    frames = [f for f in source.read(0, 99) if isinstance(f, Frame)]
+    np.testing.assert_allclose([f.time_s for f in frames], stamps / 1000.0, atol=1e-3)
+    assert all(f.color.shape == (96, 64, 3) for f in frames) and source.info.image_size == (96, 64)
+    assert [round((float(f.color.mean()) - 10) / 20) for f in frames] == list(range(10))
+    guess = source.info.camera_guess
+    assert source.info.camera is None and guess is not None
+    assert guess.fx == pytest.approx(26 * np.hypot(64, 96) / np.hypot(36, 24)) and (guess.cx, guess.cy) == (31.5, 47.5)
