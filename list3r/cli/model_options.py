@@ -127,7 +127,7 @@ def build_settings(
     chosen = check_allowed(selection, asked, words["licence"])
     notes = [f"note: {selection.why}"] if selection.why else []
     notes += _terms(selection, chosen)
-    kind, file = _local_features(words["local_features"])
+    kind, file = _local_features(words["local_features"] or "sift")
     settings = BuildSettings(
         local_features=kind,
         feature_weights=file,
