@@ -4,13 +4,16 @@ is enough).
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Collection, Iterable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.library_rows import pack_scores, unpack_scores
 from list3r.memory.library_rules import ConsolidationSettings, World
+from list3r.memory.library_verbs import SettledRow
 from list3r.memory.merging import Edge, Key, Nodes, PairScores, form_groups, local_edges, pair_scores
 from list3r.memory.moving import Mover, Tracks, join_movers, tied_movers, without_moving
 from list3r.memory.records import MergeDecision, MotionTrack
@@ -20,6 +23,14 @@ from list3r.memory.store import Store
 from list3r.memory.summaries import Summaries
 
 Group = tuple[Key, ...]
+Edges = tuple[list[Edge], dict[tuple[Key, Key], float]]
+"""What argues for local instances of a pair of chunks being one thing, and how far they overlap."""
+
+_KEPT = 2000
+"""Pairs of chunks whose edges are kept: a walk that stays in one room comes to the same pairs again."""
+_edges_before: WeakKeyDictionary[
+    Store, OrderedDict[tuple[int, int], tuple[tuple[SettledRow, SettledRow], int, Edges]]
+] = WeakKeyDictionary()
 
 
 class Region:
@@ -36,7 +47,7 @@ class Region:
         self._placed: dict[int, Sim3] = {}
         self._pairs: dict[tuple[int, int], PairScores] = {}
         self._paired: set[int] = set()
-        self._edges: dict[tuple[int, int], tuple[list[Edge], dict[tuple[Key, Key], float]]] = {}
+        self._edges: dict[tuple[int, int], Edges] = {}
         self._nodes: dict[int, Nodes] = {}
         self._left: set[Key] = set()
         """Local instances that lay on, or under, one of a chunk that has moved."""
@@ -202,11 +213,24 @@ class Region:
                         out.add(there)
         return out
 
-    def _edges_of(self, pair: tuple[int, int]) -> tuple[list[Edge], dict[tuple[Key, Key], float]]:
+    def _edges_of(self, pair: tuple[int, int]) -> Edges:
         if pair not in self._edges:
-            u, v = (self._nodes_of(k) for k in pair)
-            self._edges[pair] = local_edges(u, v, self._pairs[pair], self._s.merging)
+            self._edges[pair] = self._known_edges(pair)
         return self._edges[pair]
+
+    def _known_edges(self, pair: tuple[int, int]) -> Edges:
+        """The same, from the chunks before where neither of the two has been settled anew since."""
+        kept = _edges_before.setdefault(self._store, OrderedDict())
+        here = (self._rows[pair[0]], self._rows[pair[1]])
+        found = kept.get(pair)
+        if found is None or found[0][0] is not here[0] or found[0][1] is not here[1] or found[1] != self._world.stamp:
+            u, v = (self._nodes_of(k) for k in pair)
+            edges = local_edges(u, v, self._pairs[pair], self._s.merging)
+            found = kept[pair] = (here, self._world.stamp, edges)
+        kept.move_to_end(pair)
+        while len(kept) > _KEPT:
+            kept.popitem(last=False)
+        return found[2]
 
     def _nodes_of(self, chunk_id: int) -> Nodes:
         if chunk_id not in self._nodes:
