@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.exporters.registry import export as export_memory
 from list3r.memory.errors import OptionError
 from list3r.memory.history import world_at
+from list3r.memory.past import store_at
 from list3r.memory.records import Instance, Support
 from list3r.memory.store import Store
 from list3r.memory_edits import MemoryEdits
@@ -53,12 +54,20 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
     return guarded
 
 
-def open(path: str | Path, *, writable: bool = False) -> SceneMemory:
+def open(path: str | Path, *, writable: bool = False, at: int | None = None) -> SceneMemory:
     """Open a memory, for reading or for editing too. Raises `MemoryFileError` for anything that is not one.
 
-    Many may read while one writes; a second writer is refused.
+    Many may read while one writes; a second writer is refused. With `at` every question is about the world as it was
+    after that session, and nothing can be written; `OptionError` for a session that there is not.
+
+    >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
     """
-    return SceneMemory(Store.open(path, writable=writable))
+    if at is None:
+        return SceneMemory(Store.open(path, writable=writable))
+    if writable:
+        raise OptionError(f"{path} as it was after session {at} can only be read")
+    with Store.open(path) as store:
+        return SceneMemory(store_at(store, at))
 
 
 def build(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -32,11 +35,36 @@ def parse_point(text: str, option: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+_AT: ContextVar[int | None] = ContextVar("at", default=None)
+"""The session after which the world is asked about, for the command that runs."""
+
+
 def open_memory(path: Path) -> SceneMemory:
-    """The memory behind a path, for reading."""
+    """The memory behind a path, for reading: as it is, or as it was after the session of `--at`."""
     from list3r.scene_memory import open as open_scene
 
-    return open_scene(path)
+    return open_scene(path, at=_AT.get())
+
+
+def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The same command with `--at SESSION`, which `open_memory` obeys while it runs."""
+    signature = inspect.signature(command, eval_str=True)
+    option = Annotated[
+        int | None, typer.Option("--at", metavar="SESSION", help="The world as it was after this session.")
+    ]
+    added = inspect.Parameter("at", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
+
+    @functools.wraps(command)
+    def asked(*args: Any, at: int | None = None, **words: Any) -> Any:
+        before = _AT.set(at)
+        try:
+            return command(*args, **words)
+        finally:
+            _AT.reset(before)
+
+    asked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
+    asked.__annotations__ = {**get_type_hints(command, include_extras=True), "at": option}
+    return asked
 
 
 def print_json(value: object) -> None:

@@ -26,7 +26,9 @@ Label = Annotated[str | None, typer.Option("--label", metavar="WORDS", help="Onl
 Color = Annotated[str | None, typer.Option("--color", help="Only things of this colour.")]
 MinSize = Annotated[float | None, typer.Option("--min-size", help="Longest edge at least this.")]
 MaxSize = Annotated[float | None, typer.Option("--max-size", help="Longest edge at most this.")]
-State = Annotated[str | None, typer.Option("--state", help="present, moved, removed, added or unseen.")]
+State = Annotated[
+    str | None, typer.Option("--state", help="present, moved, removed, added, unseen, any; else all but removed.")
+]
 Component = Annotated[int | None, typer.Option("--component", help="Only this part of a memory in parts.")]
 View = Annotated[int | None, typer.Option("--view", metavar="FRAME", help="What the camera of this frame sees.")]
 Time = Annotated[float | None, typer.Option("--time", metavar="S", help="The posed frame nearest to this second.")]

@@ -336,6 +336,7 @@ class ChunkVerbs(BendVerbs):
         links = rows[0][0] + np.array(pairs, "<i4").reshape(-1, 2).tobytes()
         crc = checksum(links, rows[0][1])
         self._database.execute("UPDATE chunks SET cannot_link = ?, crc = ? WHERE chunk_id = ?", (links, crc, chunk_id))
+        self._crcs = None
 
     def feature_space(self, chunk_id: int) -> str:
         """The embedding space of a chunk's local features."""

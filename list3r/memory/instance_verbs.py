@@ -192,7 +192,8 @@ class InstanceVerbs(EmbeddingVerbs):
             np.concatenate([s.confidence for _, s in parts]) if parts else np.zeros(0, np.float32),
             np.concatenate([s.rgb for _, s in parts]) if parts else np.zeros((0, 3), np.uint8),
         )
-        if not instance.dynamic and instance.state != "moved":
+        moves = "SELECT 1 FROM events WHERE instance = ? AND kind = 'moved' LIMIT 1"
+        if not instance.dynamic and not self._rows(moves, (instance.id,)):
             return found
         slack = 0.05 * float(np.linalg.norm(np.ptp(instance.aabb, axis=0)))
         here = np.all((found.points >= instance.aabb[0] - slack) & (found.points <= instance.aabb[1] + slack), axis=1)

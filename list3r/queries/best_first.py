@@ -53,7 +53,7 @@ def nearest_first(
             aabb[1] + reach,
             structure=filters.structure,
             min_confidence=filters.min_confidence,
-            state=filters.state,
+            state=filters.stored_state,
             component=component,
             limit=most,
         )

@@ -91,7 +91,7 @@ def find(
     phrase = parse(text)
     gathered = gather(store, phrase)
     loaded = store.instances() if gathered is None else store.instances_of(sorted(gathered.ids))
-    things = {i.id: i for i in loaded}
+    things = {i.id: i for i in loaded if i.state != "removed"}
     search = _Search(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
     search.notes += [] if gathered is None else gathered.notes
     found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
@@ -202,7 +202,8 @@ def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
 
 
 def _look_at_too(search: _Search, ids: Sequence[int]) -> None:
-    for i in search.store.instances_of([n for n in ids if n not in search.things]):
+    fresh = search.store.instances_of([n for n in ids if n not in search.things])
+    for i in (i for i in fresh if i.state != "removed"):
         search.things[i.id], search.vocabulary[i.id] = i, _vocabulary(i)
 
 

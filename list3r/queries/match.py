@@ -14,7 +14,8 @@ from list3r.memory.records import BestView, Instance
 from list3r.memory.store import Store
 from list3r.queries.words import is_colored, is_named, wanted_words
 
-STATES = ("present", "moved", "removed", "added", "unseen")
+STATES = ("present", "moved", "removed", "added", "unseen", "any")
+"""What may be asked for; without a state all things answer but those that are known to be gone."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Filters:
     """Whether floor, walls and the like may answer."""
     min_confidence: float = 0.0
     state: str | None = None
-    """present, moved, removed, added or unseen."""
+    """present, moved, removed, added, unseen, or any; None for all that are not known to be gone."""
     label: str | None = None
     """Words that the label or the description must all bear."""
     color: str | None = None
@@ -90,6 +91,11 @@ class Filters:
             if length is not None:
                 checked_length(length, name)
 
+    @property
+    def stored_state(self) -> str | None:
+        """The one state that may answer, None for several."""
+        return None if self.state == "any" else self.state
+
     def select(self, instances: Iterable[Instance]) -> list[Instance]:
         """Those that pass."""
         return [i for i in instances if self.passes(i)]
@@ -100,7 +106,7 @@ class Filters:
         return (
             (self.structure or i.structure is None)
             and i.confidence >= self.min_confidence
-            and (self.state is None or i.state == self.state)
+            and (i.state != "removed" if self.state is None else self.state in ("any", i.state))
             and (self.label is None or is_named(i, self.label))
             and (self.color is None or is_colored(i, self.color))
             and (self.min_size is None or size >= self.min_size)

@@ -123,7 +123,7 @@ def in_front(store: Store, camera: Camera, max_depth: float | None = None) -> li
         away = np.linalg.norm(apart, axis=1)
         wide = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1) * fx >= _LEAST_CELLS * step * away
         ids = ids[wide & (_depths(boxes, camera).max(axis=1) > 0.0)]
-    return store.instances_of(sorted(ids.tolist()))
+    return [i for i in store.instances_of(sorted(ids.tolist())) if i.state != "removed"]
 
 
 def _depths(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -47,7 +47,7 @@ def within(
         raise OptionError("a largest depth needs the view of a camera")
     low, high, middle, reach = _box(lower, upper) if box else _sphere(center, radius)
     ids, _ = store.boxes_in_box(
-        low, high, structure=filters.structure, min_confidence=filters.min_confidence, state=filters.state
+        low, high, structure=filters.structure, min_confidence=filters.min_confidence, state=filters.stored_state
     )
     found = []
     for i in filters.select(store.instances_of(sorted(ids.tolist()))):

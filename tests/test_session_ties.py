@@ -1,0 +1,70 @@
+"""When one video is placed in the world of another: laws on small graphs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from list3r.association.session_ties import hold_back
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge
+
+CHUNKS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 3, 6: 3}
+"""Session of each chunk; chunk k stands at x = k metres."""
+
+
+def _edge(u: int, v: int, kind: str = "loop", off_m: float = 0.0, features: float = 20.0) -> Edge:
+    S_v_u = Sim3(1.0, np.eye(3), np.array([u - v + off_m, 0.0, 0.0]))
+    scores = {"feature_inliers": features, "overlap": 0.8, "agreement": 1.0}
+    return Edge(u, v, kind, S_v_u, 0.8, 0.8, 100, 0.01, True, "measured", scores)
+
+
+def _accepted(edges: list[Edge], sessions: dict[int, int] | None = None) -> list[bool]:
+    return [e.accepted for e in hold_back(edges, sessions or CHUNKS)]
+
+
+INSIDE = [_edge(1, 2, "adjacent"), _edge(3, 4, "adjacent"), _edge(5, 6, "adjacent")]
+
+
+def test_one_weak_relation_does_not_place_a_session() -> None:
+    out = hold_back([*INSIDE, _edge(1, 3)], CHUNKS)
+    assert [e.accepted for e in out] == [True, True, True, False]
+    assert "held back" in out[3].reason
+
+
+def test_two_that_agree_do_and_release_what_was_held() -> None:
+    held = hold_back([*INSIDE, _edge(1, 3)], CHUNKS)[3]
+    out = hold_back([*INSIDE, held, _edge(2, 4)], CHUNKS)
+    assert all(e.accepted for e in out)
+    assert out[3].reason == "measured"
+
+
+def test_two_that_disagree_do_not() -> None:
+    assert _accepted([*INSIDE, _edge(1, 3), _edge(2, 4, off_m=3.0)]) == [True] * 3 + [False] * 2
+
+
+def test_one_beyond_doubt_is_enough() -> None:
+    assert _accepted([*INSIDE, _edge(1, 3, features=150.0)]) == [True] * 4
+
+
+def test_a_third_session_connects_a_second_that_could_not_be_placed() -> None:
+    """The third lies surely in both worlds, so the first relation between them is believed too."""
+    edges = [*INSIDE, _edge(1, 3), _edge(2, 5, features=90.0), _edge(4, 6, features=90.0)]
+    assert _accepted(edges) == [True] * 6
+
+
+def test_pairs_given_the_other_way_round_agree_too() -> None:
+    backwards = _edge(4, 2)
+    assert _accepted([*INSIDE, _edge(1, 3), backwards]) == [True] * 5
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (4, 3, 2, 1, 0), (3, 0, 4, 1, 2)])
+def test_the_order_of_edges_does_not_matter(order: tuple[int, ...]) -> None:
+    edges = [*INSIDE, _edge(1, 3), _edge(2, 4, off_m=3.0)]
+    out = _accepted([edges[k] for k in order])
+    assert [out[order.index(k)] for k in range(5)] == [True, True, True, False, False]
+
+
+def test_a_memory_of_one_session_is_left_as_it_is() -> None:
+    edges = [_edge(1, 2), _edge(3, 4)]
+    assert hold_back(edges, dict.fromkeys(CHUNKS, 1)) == edges
