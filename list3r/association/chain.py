@@ -8,7 +8,7 @@ of that is refused.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,12 +48,46 @@ class Prediction:
         return float(np.sqrt(max(float(off @ np.linalg.solve(self.covariance, off)), 0.0)))
 
 
-def predict(edges: Sequence[Edge], u: int, v: int, settings: ChainSettings) -> Prediction | None:
+class Ways:
+    """Accepted edges laid out once, for many predictions."""
+
+    def __init__(self, edges: Iterable[Edge], settings: ChainSettings) -> None:
+        self._settings = settings
+        self._near: dict[int, list[tuple[int, Edge]]] = {}
+        for edge in sorted((e for e in edges if e.accepted), key=_order):
+            self._near.setdefault(edge.u, []).append((edge.v, edge))
+            self._near.setdefault(edge.v, []).append((edge.u, edge))
+
+    def tied_to(self, chunk_id: int) -> set[int]:
+        """The chunks that some way leads to, and the chunk itself."""
+        out, queue = {chunk_id}, [chunk_id]
+        while queue:
+            fresh = {k for k, _ in self._near.get(queue.pop(), [])} - out
+            out |= fresh
+            queue += sorted(fresh)
+        return out
+
+    def predict(self, u: int, v: int, more: Sequence[Edge] = ()) -> Prediction | None:
+        """The relation of two chunks along the surest path, `more` edges among them; None where there is no path."""
+        near = self._near
+        if more:
+            near = dict(near)
+            for edge in sorted((e for e in more if e.accepted), key=_order):
+                near[edge.u] = [*near.get(edge.u, []), (edge.v, edge)]
+                near[edge.v] = [*near.get(edge.v, []), (edge.u, edge)]
+        return _along(near, u, v, self._settings)
+
+
+def predict(edges: Iterable[Edge], u: int, v: int, settings: ChainSettings) -> Prediction | None:
     """The relation of two chunks along the surest path of accepted edges; None where there is no path."""
-    near: dict[int, list[tuple[int, Edge]]] = {}
-    for edge in sorted((e for e in edges if e.accepted), key=lambda e: (e.u, e.v, e.kind, e.frames or (0, 0))):
-        near.setdefault(edge.u, []).append((edge.v, edge))
-        near.setdefault(edge.v, []).append((edge.u, edge))
+    return Ways(edges, settings).predict(u, v)
+
+
+def _order(edge: Edge) -> tuple[int, int, str, tuple[int, int]]:
+    return edge.u, edge.v, edge.kind, edge.frames or (0, 0)
+
+
+def _along(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings: ChainSettings) -> Prediction | None:
     path = _path(near, u, v)
     if path is None:
         return None
@@ -78,7 +112,7 @@ def adjoint(S: Sim3) -> Array:
     return out
 
 
-def _path(near: dict[int, list[tuple[int, Edge]]], u: int, v: int) -> list[Edge] | None:
+def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int) -> list[Edge] | None:
     """The path with the least sum of 1 / confidence (Dijkstra)."""
     queue: list[tuple[float, int, int]] = [(0.0, u, u)]
     done: dict[int, int] = {}

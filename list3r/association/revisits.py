@@ -23,7 +23,7 @@ from typing import Protocol
 
 import numpy as np
 
-from list3r.association.chain import ChainSettings, Prediction, predict
+from list3r.association.chain import ChainSettings, Prediction, Ways
 from list3r.association.cross_check import Side
 from list3r.association.frame_search import Candidate, DescriptorStore, SearchSettings, find_candidates
 from list3r.association.instance_cues import (
@@ -188,8 +188,8 @@ class _Lookout:
         self._rows = {c.chunk_id: c for c in store.chunks()}
         self._sides: dict[int, Side] = {}
         self._cues: dict[int, InstanceCues] = {}
-        self._edges = store.edges()
-        self._tied: set[int] | None = None
+        self._ways = Ways(store.edges(), settings.chain)
+        self._tied = self._ways.tied_to(chunk_id)
 
     def cues(self, u: int) -> InstanceCues:
         """How the instances of a stored chunk agree with those of the new one."""
@@ -215,8 +215,7 @@ class _Lookout:
         """The edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
         c = scored.candidate
         u, v = self._rows[c.u], self._rows[self._id]
-        known = self._edges if self._apart(c.u) else [*self._edges, *found]
-        way = predict(known, c.u, self._id, self._settings.chain)
+        way = None if self._apart(c.u) else self._ways.predict(c.u, self._id, found)
         objection = partial(self._objection, scored.cues, way)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
@@ -260,22 +259,11 @@ class _Lookout:
 
     def _agree(self, one: Edge, other: Edge) -> bool:
         """Whether two relations of the new chunk can both be true; those to places apart from each other can."""
-        way = predict([*self._edges, one], other.u, self._id, self._settings.chain)
+        way = self._ways.predict(other.u, self._id, [one])
         return way is None or way.deviations(other.S_v_u) <= self._settings.chain.most_deviations
 
     def _apart(self, u: int) -> bool:
         """Whether nothing tied a chunk to the new one before."""
-        if self._tied is None:
-            near: dict[int, list[int]] = {}
-            for e in self._edges:
-                if e.accepted:
-                    near.setdefault(e.u, []).append(e.v)
-                    near.setdefault(e.v, []).append(e.u)
-            self._tied, queue = {self._id}, [self._id]
-            while queue:
-                fresh = [k for k in near.get(queue.pop(), []) if k not in self._tied]
-                self._tied.update(fresh)
-                queue += fresh
         return u not in self._tied
 
     def _objection(self, cues: InstanceCues, way: Prediction | None, S_v_u: Sim3) -> str | None:
