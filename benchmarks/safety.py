@@ -206,7 +206,7 @@ def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
     except Exception as error:
         return "traceback", f"{what}: {type(error).__name__}: {error}"
     said = "detected by verify"
-    got = None
+    got = wanted
     try:
         with store:
             got = answers(store)
@@ -214,6 +214,8 @@ def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
         said = "detected by reading"
     except Exception as error:
         return "traceback", f"{what}: {type(error).__name__}: {error}"
+    if not same(got, wanted):
+        return "silent", f"{what}: the answers are others"
     try:
         with Store.open(copy) as again:
             if again.verify():
@@ -222,7 +224,7 @@ def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
         return said, what
     if said == "detected by reading":
         return "silent", f"{what}: reading fails, verify finds nothing"
-    return ("harmless", what) if same(got, wanted) else ("silent", what)
+    return "harmless", what
 
 
 def answers(store: Store) -> list[Any]:

@@ -5,7 +5,7 @@ python benchmarks/scale.py --instances 1000,1000000 --json benchmarks/results/sc
 The instances are made up and written through the store's own verbs: rooms of 5 x 5 x 3 m side by side, 30 things in
 each, relations to the neighbours, features of 256 numbers in families that lie apart by design (`features`). They have
 no measured surfaces, so distances are to their boxes. Each size runs in a process of its own. Where each
-vector belongs is kept in the cache of the user (`$LIST3R_CACHE`); here that is a scratch folder.
+vector belongs is kept in the cache of the user (`$LIST3R_CACHE`); here that is beside the memories.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store import Store
+from list3r.memory.vector_cells import cache_file
 from list3r.queries.camera import Camera
 from list3r.queries.find import find
 from list3r.queries.nearest import nearest
@@ -63,10 +64,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which the memories are kept and taken up again")
+    parser.add_argument("--no-database", action="store_true", help="ours and NumPy only: the others take long to build")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     words = parser.parse_args()
     if words.one is not None:
-        print(json.dumps(measure(words.one, words.questions, words.seed, words.keep)))
+        print(json.dumps(measure(words.one, words.questions, words.seed, words.keep, database=not words.no_database)))
         return
     print(machine())
     rows = []
@@ -75,14 +77,15 @@ def main() -> None:
             folder = words.keep or Path(scratch)
             command = [sys.executable, __file__, "--one", str(count), "--keep", str(folder)]
             command += ["--questions", str(words.questions), "--seed", str(words.seed)]
-            cache = {**os.environ, "LIST3R_CACHE": str(Path(scratch) / "cache")}
+            command += ["--no-database"] if words.no_database else []
+            cache = {**os.environ, "LIST3R_CACHE": str((words.keep or Path(scratch)) / "cache")}
             out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=cache).stdout
             rows.append(json.loads(out.splitlines()[-1]))
             print("\n".join(f"{count:>9,}  {k:34} {v}" for k, v in rows[-1].items()), flush=True)
             write_json(words.json, {"sizes": rows})
 
 
-def measure(count: int, questions: int, seed: int, folder: Path) -> dict[str, Any]:
+def measure(count: int, questions: int, seed: int, folder: Path, *, database: bool) -> dict[str, Any]:
     """All figures of one size."""
     path = folder / f"scale-{count}-{seed}.l3r"
     written = write_memory(path, count, seed) if not path.exists() else None
@@ -103,6 +106,7 @@ def measure(count: int, questions: int, seed: int, folder: Path) -> dict[str, An
         row |= timed(f"find_{name}", [lambda text=text: find(store, text)] * 5, warm=1)
     row |= timed("words_near_point", [lambda p=p: nearest(store, point=p, words="noun7") for p in points[:10]])
     row |= timed("camera", [lambda p=p: visible(store, camera_in(p), max_depth=6.0) for p in points[:20]])
+    row["cells_kept_before"] = cache_file(path, SPACE).exists()
     started, spent = time.perf_counter(), time.process_time()
     similar(store, vector=asked[0], space=SPACE, k=10)
     row["similar_first_s"] = round(time.perf_counter() - started, 2)
@@ -114,7 +118,7 @@ def measure(count: int, questions: int, seed: int, folder: Path) -> dict[str, An
 
     row |= timed("similar", [lambda n=n: ask(n) for n in range(len(asked))])
     row["resident_mb"] = resident_mb()
-    row |= beside(store, points, asked, found)
+    row |= beside(store, points, asked, found, database=database)
     row |= timed("one_more_chunk", [lambda n=n: one_more_chunk(store, int(n), count) for n in range(20)], warm=1)
     row |= timed("similar_after_chunk", [lambda v=v: similar(store, vector=v, space=SPACE, k=10) for v in asked[:20]])
     store.close()
@@ -236,7 +240,9 @@ def one_more_chunk(store: Store, n: int, count: int) -> None:
 # ---------------------------------------------------------------------------------------------- beside it
 
 
-def beside(store: Store, points: Floats, asked: NDArray[np.float32], found: dict[int, list[int]]) -> dict[str, Any]:
+def beside(
+    store: Store, points: Floats, asked: NDArray[np.float32], found: dict[int, list[int]], *, database: bool
+) -> dict[str, Any]:
     """A plain NumPy scan over the same data, which is also the truth for the recall, and a vector database."""
     out: dict[str, Any] = {}
     ids, vectors = store.embeddings(SPACE)
@@ -258,7 +264,7 @@ def beside(store: Store, points: Floats, asked: NDArray[np.float32], found: dict
         np.argpartition(np.einsum("ij,ij->i", apart, apart), min(5, len(boxes) - 1))
 
     out |= timed("numpy_nearest", [lambda p=p: scan_boxes(p) for p in points[:50]], warm=1)
-    return out | vector_database(ids, vectors, asked, truth)
+    return out | vector_database(ids, vectors, asked, truth) if database else out
 
 
 def vector_database(

@@ -17,7 +17,7 @@ from list3r.cli.app import run
 from list3r.memory.errors import List3rError
 from list3r.memory.store import Store
 from list3r.queries.grammar import RELATIONS
-from list3r.queries.match import Match
+from list3r.queries.match import Filters, Match
 from list3r.queries.relations import ALL_PREDICATES
 from list3r.scene_memory import SceneMemory
 from tests.conftest import write_small_room
@@ -98,7 +98,13 @@ def test_find(memory: SceneMemory, text: str, k: int, viewpoint: Any) -> None:
 @settings(often)
 @given(target=st.one_of(THINGS, POINTS), k=st.integers(-1, 2**70), limit=st.one_of(st.none(), NUMBERS), filters=FILTERS)
 def test_nearest(memory: SceneMemory, target: Any, k: int, limit: float | None, filters: Any) -> None:
-    answers(lambda: memory.nearest(target, k, max_distance=limit, **filters))
+    found = answers(lambda: memory.nearest(target, k, max_distance=limit, **filters))
+    if found is not None:
+        assert len(found) <= k
+        keys = [(m.distance_m, m.instance.id) if m.distance_m is not None else (-m.score, 0) for m in found]
+        assert [key[0] for key in keys] == sorted(key[0] for key in keys)
+        assert limit is None or all(m.distance_m is not None and m.distance_m <= limit for m in found)
+        assert all(Filters(**{**filters, "structure": True}).passes(m.instance) for m in found)
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
@@ -106,7 +112,8 @@ def test_nearest(memory: SceneMemory, target: Any, k: int, limit: float | None, 
 @given(one=POINTS, two=POINTS, radius=NUMBERS, sphere=st.booleans(), filters=FILTERS)
 def test_within(memory: SceneMemory, one: Any, two: Any, radius: float, sphere: bool, filters: Any) -> None:
     region = {"center": one, "radius": radius} if sphere else {"lower": one, "upper": two}
-    answers(lambda: memory.within(**region, **filters))
+    found = answers(lambda: memory.within(**region, **filters))
+    assert found is None or all(0.0 < m.score <= 1.0 and Filters(**filters).passes(m.instance) for m in found)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -115,7 +122,10 @@ def test_within(memory: SceneMemory, one: Any, two: Any, radius: float, sphere: 
     place=POINTS, quat=st.lists(NUMBERS, min_size=3, max_size=4), depth=st.one_of(st.none(), NUMBERS), filters=FILTERS
 )
 def test_within_what_a_camera_sees(memory: SceneMemory, place: Any, quat: Any, depth: Any, filters: Any) -> None:
-    answers(lambda: memory.within(camera=memory.camera(position=place, quat_wxyz=quat), max_depth=depth, **filters))
+    found = answers(
+        lambda: memory.within(camera=memory.camera(position=place, quat_wxyz=quat), max_depth=depth, **filters)
+    )
+    assert found is None or all(0.0 < m.score <= 1.0 and Filters(**filters).passes(m.instance) for m in found)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -138,21 +148,28 @@ def test_relations(memory: SceneMemory, **arguments: Any) -> None:
 @settings(often, max_examples=200)
 @given(one=IDS, two=IDS, gap=NUMBERS, structure=st.booleans())
 def test_path_and_seen(memory: SceneMemory, one: int, two: int, gap: float, structure: bool) -> None:
-    answers(lambda: memory.path_between(one, two, structure=structure))
-    answers(lambda: memory.seen(one, gap_s=gap))
-    answers(lambda: memory.similar(one, two))
+    way = answers(lambda: memory.path_between(one, two, structure=structure))
+    assert not way or {one, two} & {way[0].subject, way[0].object}
+    sightings = answers(lambda: memory.seen(one, gap_s=gap))
+    assert sightings is None or all(start <= end for _, start, end in sightings.spans_s)
+    alike = answers(lambda: memory.similar(one, two))
+    assert alike is None or (len(alike) <= two and one not in {m.instance.id for m in alike})
 
 
+COMMANDS = [
+    *(["query", name] for name in "find nearest within relations similar seen path changes".split()),
+    *([name] for name in "info list show merges verify".split()),
+]
 VALUES = st.one_of(TEXTS, NUMBERS.map(repr), IDS.map(str), POINTS.map(lambda p: ",".join(map(repr, p))))
 LINES = st.tuples(
-    st.sampled_from(["find", "nearest", "within", "relations", "similar", "seen", "path"]),
+    st.sampled_from(COMMANDS),
     st.lists(VALUES, max_size=2),
     st.lists(
         st.tuples(
             st.sampled_from(
                 "--id --point -k --radius --box --view --time --pose --session --from --subject --object --and"
                 " --predicate --max-depth --max-distance --label --color --min-size --structure --no-occlusion"
-                " --json".split()
+                " --max-size --min-confidence --state --component --image --since --at --json".split()
             ),
             VALUES,
         ),
@@ -162,10 +179,11 @@ LINES = st.tuples(
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@settings(often, max_examples=200)
+@settings(often, max_examples=400)
 @given(line=LINES)
-def test_the_command_line(room: Path, line: tuple[str, list[str], list[tuple[str, str]]]) -> None:
+def test_the_command_line(room: Path, line: tuple[list[str], list[str], list[tuple[str, str]]]) -> None:
     command, values, options = line
     flags = ("--structure", "--no-occlusion", "--json")
     arguments = [part for name, value in options for part in ((name,) if name in flags else (name, value))]
-    assert run(["query", command, str(room), *values, *arguments]) in (0, 2), shlex.join([command, *values, *arguments])
+    words = [*command, str(room), *values, *arguments]
+    assert run(words) in (0, 2), shlex.join(words)

@@ -12,15 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.store import Store
-from list3r.memory.vector_cells import Cells, cache_file, sample_size
+from list3r.memory.vector_cells import Cells, cache_file, cell_count, sample_size
 
 if TYPE_CHECKING:
     import faiss
 
 _EXACT = 30_000
 """Up to so many vectors all are compared; more are looked up in an inverted file."""
-_PROBED = 128
-"""Cells looked into for a question; twice as many whenever too few of what they hold passes the filters."""
+_PROBED = 64
+"""Cells looked into for a question, at least; twice as many whenever too few of what they hold passes the filters."""
+_LOOKED_AT = 10_000
+"""Vectors that the cells hold together, at least: small cells part what is alike more often."""
 _RANKED = 64
 """Candidates of the inverted file, at least, that are compared exactly with what the store holds."""
 _REBUILD = 0.1
@@ -93,7 +95,7 @@ class VectorIndex:
         `passing` says which of some ids may answer; it is asked about as few as it takes.
         """
         query = self._checked(vector)
-        width, probed = max(4 * k, _RANKED), _PROBED
+        width, probed = max(4 * k, _RANKED), max(_PROBED, -(-_LOOKED_AT * cell_count(self.count) // max(self.count, 1)))
         while True:
             found = self._ranked(store, query, width, probed)
             kept = _first(found, k, passing)

@@ -118,6 +118,8 @@ class Filters:
 
 _MOST = 1_000_000_000
 """Answers that anybody can want."""
+_FARTHEST = 1e100
+"""A coordinate whose square is still a number."""
 _LARGEST_ID = 2**63 - 1
 """Of what a file holds."""
 
@@ -144,6 +146,8 @@ def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
         raise OptionError(f"{name} must be three numbers x, y, z, not {value!r}") from error
     if point.shape != (3,) or not np.isfinite(point).all():
         raise OptionError(f"{name} must be three finite numbers x, y, z, not {value!r}")
+    if np.abs(point).max() > _FARTHEST:
+        raise OptionError(f"{name} {value!r} lies beyond {_FARTHEST:g}, where distances are no numbers any more")
     return point
 
 
