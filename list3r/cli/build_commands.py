@@ -12,8 +12,9 @@ from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import report_lines, run_build
 from list3r.cli.common import JsonOption, note, print_json
-from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector, run_detector
-from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
+from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
+from list3r.cli.finishing import finish
+from list3r.cli.scale_commands import ScaleAnchor, check_anchor
 
 
 def register(app: typer.Typer) -> None:
@@ -133,16 +134,15 @@ def build(
             note(line)
     run = {"options": options, "settings": settings, "workers": workers, "resume": resume, "force": force}
     report = run_build(source, memory, quiet=json, debug_dir=debug, **run)
-    if scale_anchor is not None:
-        anchored = anchor_scale(memory, scale_anchor)
-        report = replace(report, notes=(*report.notes, anchored.text))
-    if detector is not None:
-        seen = run_detector(memory, detector, detector_classes, source, options, quiet=json)
-        report = replace(report, notes=(*report.notes, f"{seen.detector} named {len(seen.labels)} things"))
+    after: dict[str, Any] = {"scale_anchor": scale_anchor, "detector": detector, "classes": detector_classes}
+    notes, failure = finish(memory, source, options, quiet=json, **after)
+    report = replace(report, notes=(*report.notes, *notes))
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:
         print("\n".join(report_lines(memory, report)))
+    if failure is not None:
+        raise failure
 
 
 def demo(

@@ -14,8 +14,9 @@ from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
 from list3r.cli.common import JsonOption, MemoryArgument, note, print_json, with_at
-from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector, run_detector
-from list3r.cli.scale_commands import ScaleAnchor, anchor_scale, check_anchor
+from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
+from list3r.cli.finishing import finish
+from list3r.cli.scale_commands import ScaleAnchor, check_anchor
 
 if TYPE_CHECKING:
     from list3r.updating import UpdateReport
@@ -90,15 +91,15 @@ def update(
         for line in told:
             note(line)
     report = _run(memory, source, quiet=json, options=options, settings=settings, workers=workers, resume=resume)
-    if scale_anchor is not None:
-        report = replace(report, notes=(*report.notes, anchor_scale(memory, scale_anchor).text))
-    if detector is not None:
-        seen = run_detector(memory, detector, detector_classes, source, options, quiet=json)
-        report = replace(report, notes=(*report.notes, f"{seen.detector} named {len(seen.labels)} things"))
+    after: dict[str, Any] = {"scale_anchor": scale_anchor, "detector": detector, "classes": detector_classes}
+    notes, failure = finish(memory, source, options, quiet=json, **after)
+    report = replace(report, notes=(*report.notes, *notes))
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:
         print("\n".join(report_lines(memory, report)))
+    if failure is not None:
+        raise failure
 
 
 def report_lines(memory: Path, report: UpdateReport) -> list[str]:
