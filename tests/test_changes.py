@@ -39,9 +39,10 @@ def test_a_surface_at_its_place_is_there() -> None:
     assert len(found.frames) == 2
 
 
-def test_free_space_through_a_place_means_gone_and_needs_two_frames() -> None:
-    assert look(_patch(), [_view(2.6, 0), _view(2.6, 1, 0.1)]).verdict == "gone"
-    assert look(_patch(), [_view(2.6, 0)]).verdict != "gone"
+def test_free_space_through_a_place_means_gone_and_needs_four_frames() -> None:
+    views = [_view(2.6, k, 0.05 * k) for k in range(4)]
+    assert look(_patch(), views).verdict == "gone"
+    assert look(_patch(), views[:3]).verdict != "gone"
 
 
 @pytest.mark.parametrize("depth", [1.2, 0.0])

@@ -36,7 +36,7 @@ class VisibilitySettings:
     """Share of what is told that must be free space for a thing to be gone from there;"""
     there: float = 0.2
     """and up to which it is still there."""
-    least_frames: int = 2
+    least_frames: int = 4
     """Frames that must agree."""
 
 
