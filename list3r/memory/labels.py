@@ -68,6 +68,8 @@ def put_votes(store: Store, chunk_id: int, detector: str, votes: Mapping[int, Vo
         for n, v in sorted(votes.items())
     }
     store.set_value(_key(chunk_id), {"detector": detector, "locals": rows})
+    if store.get_value("label votes") is None:
+        store.set_value("label votes", True)
 
 
 def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
@@ -132,10 +134,10 @@ def apply_labels(store: Store, settings: LabelSettings | None = None) -> dict[in
 
     Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was derived.
     """
+    if store.get_value("label votes") is None:
+        return {}
     before = store.get_value("detected labels")
     votes = {c.chunk_id: votes_of(store, c.chunk_id) for c in store.chunks()}
-    if before is None and not any(found for _, found in votes.values()):
-        return {}
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     spoken = _named_by_operators(store, home)
     members: dict[int, list[Key]] = {}
