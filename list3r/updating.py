@@ -15,6 +15,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r.association.joint_rgbd import RgbdJointReconstructor
+from list3r.association.session_ties import HELD
 from list3r.calibration_stage import with_camera
 from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_parts
 from list3r.frames.base import SourceInfo
@@ -170,6 +171,12 @@ def ties(store: Store, session: int) -> list[Edge]:
     return [e for e in store.edges() if e.accepted and owner[e.u] < owner[e.v] == session]
 
 
+def held(store: Store, session: int) -> int:
+    """How many relations of a session to earlier ones are held back, see `association.session_ties`."""
+    owner = {c.chunk_id: c.session_id for c in store.chunks()}
+    return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges())
+
+
 def _report(
     store: Store, session: int, info: SourceInfo, spans: Sequence[ChunkSpan], done: set[int], started: float
 ) -> UpdateReport:
@@ -199,11 +206,11 @@ def _report(
         seconds=round(seconds, 2),
         frames_per_second=round(max(0, fresh) / seconds, 2),
         resumed_chunks=len(done),
-        notes=_notes(info, len(own), placed, len({(e.u, e.v) for e in tied}), lost, len(frames)),
+        notes=_notes(info, len(own), placed, held(store, session), lost, len(frames)),
     )
 
 
-def _notes(info: SourceInfo, chunks: int, placed: int, ties: int, lost: int, frames: int) -> tuple[str, ...]:
+def _notes(info: SourceInfo, chunks: int, placed: int, held: int, lost: int, frames: int) -> tuple[str, ...]:
     notes = []
     if lost == frames:
         notes.append(f"the camera could not be followed in any frame of {info.path}; the library is as it was")
@@ -211,11 +218,12 @@ def _notes(info: SourceInfo, chunks: int, placed: int, ties: int, lost: int, fra
         notes.append(
             "no place in this video was recognised: it is kept apart, in a frame of its own, and is joined "
             "when a later session connects the two"
+            if not held
+            else "a place in this video seems known, but no second relation agrees on how the two worlds lie: it "
+            "is kept apart until another does, or a later session connects the two"
         )
     elif placed < chunks:
         notes.append(f"{chunks - placed} of {chunks} chunks could not be placed; they are kept apart")
-    if placed and ties == 1:
-        notes.append("one relation alone holds this session in its place; the positions' deviations say how well")
     if 0 < lost < frames:
         notes.append(f"the camera could not be followed in {lost} of {frames} frames; they have no pose")
     return tuple(notes)

@@ -93,3 +93,42 @@ def test_the_program_says_in_one_line_what_is_wrong(
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 3
     assert all(line.startswith("error: ") for line in lines)
+
+
+def test_an_interrupted_update_goes_on_to_the_same_memory(
+    one: Path, two: Path, walks: tuple[Path, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "resumed.l3r"
+    shutil.copy(one, path)
+
+    def stop(done: int, _: int) -> None:
+        if done > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        update(path, walks[1], settings=SETTINGS, workers=1, progress=stop)
+    with Store.open(path) as store, Store.open(one) as before:
+        assert [i.id for i in store.instances()] == [i.id for i in before.instances()]
+        assert store.events() == []
+    with pytest.raises(OptionError, match="--resume"):
+        update(path, walks[1], settings=SETTINGS, workers=1)
+    report = update(path, walks[1], settings=SETTINGS, workers=1, resume=True)
+    assert report.resumed_chunks == 1
+    with Store.open(path) as store, Store.open(two) as whole:
+        assert [(e.instance_id, e.kind) for e in store.events()] == [(e.instance_id, e.kind) for e in whole.events()]
+        assert [i.id for i in store.instances()] == [i.id for i in whole.instances()]
+        assert store.verify() == []
+
+
+def test_a_session_whose_poses_are_given_is_placed_in_the_world_of_the_first(
+    one: Path, walks: tuple[Path, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "given.l3r"
+    shutil.copy(one, path)
+    settings = BuildSettings(poses="given", chunks=SETTINGS.chunks)
+    report = update(path, walks[1], settings=settings, workers=1)
+    assert report.placed == report.chunks
+    assert report.posed == report.frames
+    with Store.open(path) as store:
+        assert {c.component for c in store.chunks()} == {store.chunks()[0].component}
+        assert [e for e in store.events(2) if e.kind in ("removed", "moved")] == []
