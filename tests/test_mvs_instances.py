@@ -1,0 +1,76 @@
+"""Things found on depth that was computed from colour."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from list3r.frames.base import Frame
+from list3r.instances.library import build_library
+from list3r.instances.settings import InstanceSettings
+from list3r.instances.views import chunk_views, forget_views
+from list3r.memory.masks import decode_mask
+from list3r.memory.records import LocalInstance, LocalLibrary
+from list3r.reconstruction.base import DepthNoise, Reconstruction
+from list3r.reconstruction.mvs import dense_depth, stereo_noise
+from tests.rgbd_scenes import BOXES, CAMERA, frames_along, walk
+
+COUNT = 24
+
+
+def reconstructed() -> tuple[list[Frame], np.ndarray, Reconstruction]:
+    T = walk(COUNT, speed=2.0)
+    frames = frames_along(T, seed=101)
+    depth, confidence = dense_depth(frames, np.ones(COUNT, bool), T, CAMERA)
+    reconstruction = Reconstruction(
+        frame_indices=np.arange(COUNT),
+        posed=np.ones(COUNT, bool),
+        T_chunk_cam=T,
+        camera=CAMERA,
+        depth=depth,
+        confidence=confidence,
+        scale_kind="metric",
+        keyframes=np.arange(0, COUNT, 8),
+        depth_noise=stereo_noise(depth, confidence),
+    )
+    return frames, T, reconstruction
+
+
+def at(library: LocalLibrary, frame: int, T: np.ndarray, point: np.ndarray) -> LocalInstance | None:
+    """The instance seen where a point of the world lies in a frame."""
+    local = np.linalg.inv(T[frame]) @ np.append(point, 1.0)
+    x, y = (CAMERA.matrix() @ local[:3] / local[2])[:2].round().astype(int)
+    for instance in library.instances:
+        for row in np.flatnonzero(instance.track.frames == frame):
+            if decode_mask(instance.track.masks[row], instance.track.image_size)[y, x]:
+                return instance
+    return None
+
+
+def test_boxes_on_a_box_are_things_of_their_own() -> None:
+    frames, T, reconstruction = reconstructed()
+    library = build_library(frames, reconstruction)
+    fronts = [np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]) for low, high in BOXES[:3]]
+    found = [at(library, 12, T, point) for point in fronts]
+    assert all(instance is not None for instance in found)
+    assert len({instance.local_id for instance in found if instance is not None}) == 3
+
+
+def test_frames_that_share_their_errors_do_not_confirm_an_edge() -> None:
+    T = walk(COUNT)
+    frames = frames_along(T, seed=101, noise=False)
+    depth = np.stack([f.depth for f in frames if f.depth is not None])
+    seen = {}
+    for noise in (None, DepthNoise(0.0, 0.002)):
+        reconstruction = Reconstruction(
+            np.arange(COUNT), np.ones(COUNT, bool), T, CAMERA, depth, (depth > 0).astype(np.float16), "metric",
+            np.arange(0, COUNT, 8), depth_noise=noise,
+        )  # fmt: skip
+        views = chunk_views(frames, reconstruction, InstanceSettings())
+        view = views.view(views.anchors[0])
+        seen[noise is None] = view.confirmed
+        if noise is not None:
+            assert views.noise_scale == 1.0
+            assert np.allclose(view.reading, noise.sigma(views.small_depth(views.anchors[0])), rtol=1e-5)
+        forget_views()
+    assert seen[True].mean() > seen[False].mean() > 0.8
+    assert (seen[False] & ~seen[True]).mean() < 0.01
