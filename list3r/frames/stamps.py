@@ -75,7 +75,8 @@ def list_stamps(path: Path) -> Stamps:
             rows = [(p.pts, p.dts, bool(p.is_keyframe)) for p in found]
             return _stamps(path, rows, container, stream)
     except av.FFmpegError as error:
-        reason = "it is none, or breaks off before its index" if isinstance(error, av.InvalidDataError) else error.strerror
+        headless = isinstance(error, av.InvalidDataError)
+        reason = "it is none, or breaks off before its index" if headless else error.strerror
         raise SourceError(f"{path} is not a video that can be read ({reason}); is the copy complete?") from None
 
 
