@@ -372,6 +372,10 @@ def _finish(
     )
 
 
+_MOST_REASONS = 5
+"""Chunks that were lost of which the report says why."""
+
+
 def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...]:
     notes = [line for session in store.sessions() for line in camera_notes(store, session.session_id)]
     cuts = store.get_value("cuts", [])
@@ -383,7 +387,7 @@ def _notes(store: Store, lost: int, bad: int, components: int) -> tuple[str, ...
         notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
     elif lost:
         notes.append(f"the camera could not be followed in {_count(lost, 'frame')}; they have no pose")
-    notes += store.get_value("lost", [])
+    notes += store.get_value("lost", [])[:_MOST_REASONS]
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
     if store.get_value("gravity") == "unknown":

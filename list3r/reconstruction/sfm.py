@@ -123,10 +123,9 @@ class SfmReconstructor:
         for position, pose in segment.T_map_cam.items():
             T[position], posed[position] = pose, True
         sparse = [segment.depths(k) if k in segment.seen and len(segment.seen[k][0]) else None for k in range(len(T))]
-        scale = 1.0
+        depths = np.concatenate([np.ones(0), *(s[1] for s in sparse if s is not None)])
         if self.poses == "estimate":
-            middle = np.median(np.concatenate([z for _, z in (s for s in sparse if s is not None)]))
-            scale = MIDDLE_DEPTH / float(middle)
+            scale = MIDDLE_DEPTH / float(np.median(depths)) if len(depths) else 1.0
             T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
             T[:, :3, 3] *= scale
             sparse = [None if s is None else (s[0], s[1] * scale) for s in sparse]

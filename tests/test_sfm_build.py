@@ -1,0 +1,78 @@
+"""A folder of pictures becomes a memory: the camera is found once, parts of a chunk are chunks of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import list3r
+from list3r.chunk_stage import PART_STEP, BuildSettings, ChunkTask, process_parts
+from list3r.frames.chunks import ChunkSettings, ChunkSpan
+from list3r.frames.source import SourceOptions
+from list3r.memory.errors import TrackingError
+from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.memory.store import Store
+from list3r.pipeline import build
+from tests.rgbd_scenes import CAMERA, render
+
+COUNT = 26
+
+
+def pose(k: int) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = rotation_exp(np.array([0.0, 0.004 * k, 0.0]))
+    T[:3, 3] = -0.35 + 0.028 * k, 0.04 * np.sin(k / 4), -0.4
+    return T
+
+
+def save(folder: Path, poses: list[np.ndarray], seeds: list[int] | None = None) -> Path:
+    folder.mkdir()
+    for k, T in enumerate(poses):
+        color = render(T, seed=0 if seeds is None else seeds[k], index=k).color
+        cv2.imwrite(str(folder / f"{k:04d}.png"), color[..., ::-1])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save(tmp_path_factory.mktemp("sfm") / "walk", [pose(k) for k in range(COUNT)])
+
+
+def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path):
+    memory = tmp_path / "walk.l3r"
+    settings = BuildSettings(reconstruction="auto", poses="auto", chunks=ChunkSettings(18, 8))
+    report = build(pictures, memory, settings=settings, workers=2)
+    assert report.posed == COUNT and report.components == 1 and report.chunks == 2
+    assert any("estimated from the pictures" in line for line in report.notes)
+    with Store.open(memory) as store:
+        assert store.get_value("scale_kind") == "relative" and store.get_value("scale_source") == "none"
+        assert store.sessions()[0].settings["reconstruction"] == "sfm"
+        first, second = store.chunks()
+        assert first.intrinsics == second.intrinsics and abs(first.intrinsics[0] / CAMERA.fx - 1) < 0.1
+        found = np.stack([S.translation for _, S in store.camera_poses()])
+    truth = np.stack([pose(k)[:3, 3] for k in range(COUNT)])
+    S = umeyama(found, truth, with_scale=True)
+    assert np.sqrt((np.linalg.norm(S.apply(found) - truth, axis=1) ** 2).mean()) < 0.02
+    assert list3r.open(memory) is not None
+
+
+def test_nothing_is_left_of_a_video_that_cannot_be_followed(tmp_path: Path):
+    folder = save(tmp_path / "still", [pose(0)] * 5)
+    with pytest.raises(TrackingError, match="stands still"):
+        build(folder, tmp_path / "still.l3r", settings=BuildSettings("auto", "auto"), workers=1)
+
+
+def test_parts_of_a_chunk_are_numbered_so_that_the_last_closes_the_span(tmp_path: Path):
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])
+    there = [pose(k) @ away for k in range(14)]
+    folder = save(tmp_path / "jump", [pose(k) for k in range(14)] + there, [0] * 14 + [7] * 14)
+    camera = replace(CAMERA)
+    options = SourceOptions(intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy), distortion=())
+    task = ChunkTask(str(folder), options, ChunkSpan(3, 0, 28), BuildSettings("sfm", "estimate", device="cpu"))
+    first, last = process_parts(task)
+    assert (first.index, last.index) == (3 + PART_STEP, 3)
+    assert first.frame_indices[-1] < last.frame_indices[0] and first.posed.all() and last.posed.all()
