@@ -296,7 +296,7 @@ def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
             ids = [i.id for i in store.instances(structure=False)]
         command = _edit_command(memory, ids, known, rng)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        if _runs_for(process, rng.uniform(0.4, 1.1)):
+        if _runs_for(process, rng.uniform(0.5, 1.6)):
             process.kill()
             counts["kills"] += 1
         process.communicate()
