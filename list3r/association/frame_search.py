@@ -185,7 +185,8 @@ def _is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bo
 
 def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> _Known:
     """The index with all of the given chunks in it, read anew where a chunk is no longer the one that was read."""
-    checksums = {k: c for k, c in store.chunk_checksums().items() if k in set(chunk_ids)}
+    wanted = set(chunk_ids)
+    checksums = {k: c for k, c in store.chunk_checksums().items() if k in wanted}
     known = _known.get(store)
     if known is None or any(known.checksums[k] != checksums.get(k) for k in known.checksums):
         known = _known[store] = _Known({}, {})

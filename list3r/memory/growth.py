@@ -209,7 +209,7 @@ class _Growth(Region):
         if not len(near):
             return set()
         chunks = sorted(
-            {n for k, _ in self._regrouped(changed).items() for n in neighbours(self._rows, k)}
+            {n for k, _ in self._regrouped(changed).items() for n in self._beside(k)}
             | {n for k in self._dirty for n in self._beside_before(k)}
         )
         self._look_up(chunks)
@@ -253,8 +253,11 @@ class _Growth(Region):
         pose = self._T_world_graph @ self._before[k].S_graph_chunk
         return claim_cells(self._shapes(k), pose, self._world.unit, self._s.evidence)
 
+    def _beside(self, k: int) -> list[int]:
+        return neighbours(self._rows, k, None, self._extents)
+
     def _beside_before(self, k: int) -> list[int]:
-        return neighbours({**self._rows, k: self._before[k]}, k) if k in self._before else []
+        return neighbours(self._rows, k, self._before[k], self._extents) if k in self._before else []
 
     def _dropped_of(self, k: int) -> NDArray[np.bool_]:
         if k not in self._dropped:

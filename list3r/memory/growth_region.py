@@ -42,6 +42,7 @@ class Region:
         self._store, self._summaries, self._world, self._s = store, summaries, world, s
         self._dirty = sorted(dirty)
         self._rows = store.settled()
+        self._extents = np.array([r.extent for r in self._rows.values()])
         self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
         self._word = store.constraints()
         self._placed: dict[int, Sim3] = {}
@@ -77,7 +78,7 @@ class Region:
         stored = self._store.overlaps(self._dirty)
         fresh: dict[tuple[int, int], bytes] = {}
         for k in self._dirty:
-            for other in neighbours(self._rows, k):
+            for other in neighbours(self._rows, k, None, self._extents):
                 u, v = sorted((k, other))
                 if (u, v) not in fresh:
                     S_u_v = self._rows[u].S_graph_chunk.inverse() @ self._rows[v].S_graph_chunk

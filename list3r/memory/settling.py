@@ -95,11 +95,17 @@ def _extent(summary: ChunkSummary, S_graph_chunk: Sim3, slack: float) -> Array:
     return np.stack([p.min(axis=0) - slack, p.max(axis=0) + slack])
 
 
-def neighbours(rows: Mapping[int, SettledRow], chunk_id: int) -> list[int]:
-    """Ids of the chunks of one component that lie near a chunk, itself among them, in order."""
+def neighbours(
+    rows: Mapping[int, SettledRow], chunk_id: int, here: SettledRow | None = None, extents: Array | None = None
+) -> list[int]:
+    """Ids of the chunks of one component that lie near a chunk, itself among them, in order.
+
+    `here` is where the chunk lies, where that is not what `rows` says; `extents` are those of the rows, (N, 2, 3), for
+    who asks often.
+    """
     ids = np.fromiter(rows, np.int64, len(rows))
-    extents = np.array([r.extent for r in rows.values()])
-    here = rows[chunk_id]
+    extents = np.array([r.extent for r in rows.values()]) if extents is None else extents
+    here = here or rows[chunk_id]
     meet = np.all((extents[:, 0] <= here.extent[1]) & (extents[:, 1] >= here.extent[0]), axis=1)
     found = [int(k) for k in ids[meet] if rows[int(k)].component == here.component]
     return sorted({chunk_id, *found})
