@@ -137,7 +137,8 @@ def _described(
     keep, how = task.settings.keep_pictures, _keyframe_settings(task.settings)
     keyframes = make_keyframes(frames, reconstruction, keep, how)
     samples = frame_samples(reconstruction, library)
-    library = flag_moving(samples, library, reconstruction.camera)
+    if reconstruction.depth_noise is None:  # stereo has no depth where things move; what it sees through is error
+        library = flag_moving(samples, library, reconstruction.camera)
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
