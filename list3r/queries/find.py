@@ -188,8 +188,12 @@ def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
     encoder = search.encoder
     if encoder is None or encoder.space not in search.store.embedding_spaces():
         return None
+    try:
+        query = np.asarray(encoder.encode(" ".join(phrase.words)), dtype=np.float64)
+    except OptionError as error:  # the memory has come to a machine without the model's weights
+        search.notes.append(f"free words are not compared: {error}")
+        return None
     ids, vectors = search.store.embeddings(encoder.space)
-    query = np.asarray(encoder.encode(" ".join(phrase.words)), dtype=np.float64)
     lengths = np.linalg.norm(vectors, axis=1) * np.linalg.norm(query)
     cosine = vectors @ query / np.maximum(lengths, 1e-12)
     if search.gathered is not None:

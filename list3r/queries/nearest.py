@@ -106,7 +106,10 @@ def _alike(
     store: Store, instances: Sequence[Instance], words: str, encoder: WordEncoder | None
 ) -> list[tuple[Instance, float, str]]:
     """Things whose vectors fit words that nothing bears."""
-    cosine = {} if encoder is None else named_by_vectors(store, encoder, words)
+    try:
+        cosine = {} if encoder is None else named_by_vectors(store, encoder, words)
+    except OptionError:  # the memory has come to a machine without the model's weights: only plain words answer
+        cosine = {}
     return [
         (i, round(cosine[i.id], 4), f"like {words!r}: cosine {cosine[i.id]:.2f}") for i in instances if i.id in cosine
     ]

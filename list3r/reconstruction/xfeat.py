@@ -69,7 +69,7 @@ class XFeat:
 def _sorted_outputs(
     outputs: list[NDArray[np.float32]],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Unit features (h, w, 64), scores of the pixels of each cell (h, w, 65) and reliability (h, w), by their shapes."""
+    """Unit features (h, w, 64), scores of each cell's pixels (h, w, 65), reliability (h, w), told by their shapes."""
     by_width = {o.shape[-1]: o for o in outputs if o.shape[1] != 1}
     (reliability,) = [o for o in outputs if o.shape[1] == 1]
     features = by_width[64][0]
