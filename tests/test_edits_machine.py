@@ -99,7 +99,8 @@ class StoreAgainstModel(RuleBasedStateMachine):
         report = edits.split(self.store, n, out)
         now = view(self.store)
         assert len(report.new) == 1 and report.new[0] > max(self.held)
-        left, right = now[n][1] & before[n][1], now[report.new[0]][1] & before[n][1]
+        kept = self.store.resolve(n)  # what a split leaves free may go to an older thing that it had been kept from
+        left, right = now[kept][1] & before[n][1], now[report.new[0]][1] & before[n][1]
         assert left | right == before[n][1] and left and right
         assert out is None or frozenset(out) in (left, right)
         self._said(report.entry, Said("split", (left, right)), before)
