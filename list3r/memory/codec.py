@@ -86,7 +86,7 @@ def unpack_sim3(blob: bytes) -> Sim3:
 
 def raw_array(blob: bytes, dtype: str, shape: tuple[int, ...], where: str) -> NDArray[Any]:
     """A raw little-endian blob as an array. Raises `MemoryFileError` when its length does not fit dtype and shape."""
-    expected = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    expected = math.prod(shape) * np.dtype(dtype).itemsize
     if len(blob) != expected:
         raise MemoryFileError(f"{where} holds {len(blob)} bytes instead of {expected}; run `list3r verify` on the file")
     return np.frombuffer(blob, dtype=dtype).reshape(shape)

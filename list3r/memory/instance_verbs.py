@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -153,13 +154,7 @@ class InstanceVerbs(EmbeddingVerbs):
         rows = self._rows("SELECT data FROM instance_boxes_node WHERE nodeno = 1")
         if not rows or len(rows[0][0]) < 4:
             return None
-        data = rows[0][0]
-        count = int.from_bytes(data[2:4], "big")
-        cell = np.dtype([("id", ">i8"), ("span", ">f4", 6)])
-        if count == 0 or len(data) < 4 + count * cell.itemsize:
-            return None
-        span = np.frombuffer(data, cell, count, 4)["span"].astype(np.float64)
-        return np.stack([span[:, 0::2].min(axis=0), span[:, 1::2].max(axis=0)])
+        return _bounds(rows[0][0])
 
     # ------------------------------------------------------------------ observations and supports
 
@@ -365,6 +360,19 @@ class InstanceVerbs(EmbeddingVerbs):
         """The merge log, oldest first."""
         query = "SELECT kind, a, b, scores, reason FROM merges ORDER BY entry"
         return [MergeDecision(r[0], r[1], r[2], json.loads(r[3]), r[4]) for r in self._rows(query)]
+
+
+@lru_cache(maxsize=16)
+def _bounds(node: bytes) -> NDArray[np.float64] | None:
+    """Box around what a node of the R*Tree holds, None where that is nothing; not to be changed. Shape (2, 3)."""
+    count = int.from_bytes(node[2:4], "big")
+    cell = np.dtype([("id", ">i8"), ("span", ">f4", 6)])
+    if count == 0 or len(node) < 4 + count * cell.itemsize:
+        return None
+    span = np.frombuffer(node, cell, count, 4)["span"].astype(np.float64)
+    bounds = np.stack([span[:, 0::2].min(axis=0), span[:, 1::2].max(axis=0)])
+    bounds.setflags(write=False)
+    return bounds
 
 
 def _support_part(row: tuple[Any, ...]) -> tuple[int, Support]:

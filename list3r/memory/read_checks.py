@@ -22,6 +22,8 @@ WHOLE_BYTES = 128 * 2**20
 FAILURES = (sqlite3.Error, UnicodeError)
 """What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
 GEOMETRY_BYTES = 24 * 8
+_PARTS = 500
+"""Parts of the sums that are asked for in one statement."""
 BOXES = "instance_boxes"
 WORDS = "words"
 
@@ -110,17 +112,15 @@ def bad_words(database: sqlite3.Connection) -> Iterator[str]:
 
 def unbelieved(database: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
     """Ids of those of some whole rows of a table, the id first, that its checksums do not know."""
-    known: dict[int, frozenset[bytes]] = {}
-    bad = []
-    for row in rows:
-        part = int(row[0]) >> 4
-        if part not in known:
-            found = database.execute("SELECT crcs FROM sums WHERE name = ? AND part = ?", (table, part)).fetchone()
-            crcs = found[0] if found is not None and isinstance(found[0], bytes) else b""
-            known[part] = frozenset(crcs[k : k + 4] for k in range(0, len(crcs) - 4, 4))
-        if row_crc(row) not in known[part]:
-            bad.append(row[0])
-    return bad
+    parts = sorted({int(row[0]) >> 4 for row in rows})
+    known: dict[int, list[bytes]] = {}
+    for start in range(0, len(parts), _PARTS):
+        some = parts[start : start + _PARTS]
+        query = f"SELECT part, crcs FROM sums WHERE name = ? AND part IN ({','.join('?' * len(some))})"
+        for part, crcs in database.execute(query, (table, *some)):
+            held = crcs if isinstance(crcs, bytes) else b""
+            known[part] = [held[k : k + 4] for k in range(0, len(held) - 4, 4)]
+    return [row[0] for row in rows if row_crc(row) not in known.get(int(row[0]) >> 4, ())]
 
 
 def any_text(text: bytes) -> str:

@@ -102,7 +102,8 @@ class Filters:
 
     def passes(self, i: Instance) -> bool:
         """Whether a question is about this one."""
-        size = float(np.max(i.box.size))
+        sized = self.min_size is not None or self.max_size is not None
+        size = float(np.max(i.box.size)) if sized else 0.0
         return (
             (self.structure or i.structure is None)
             and i.confidence >= self.min_confidence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Unpack
@@ -205,6 +206,6 @@ def _match(
     else:
         assert place is not None
         offset, whence = i.center - place, "from the point"
-    center = float(np.linalg.norm(offset))
+    center = math.sqrt(offset.dot(offset))
     reason = f"surface {surface:.2f}, centre {center:.2f} {whence}" + (f", {named}" if named else "")
     return Match(i, round(1.0 / (1.0 + surface), 4), surface, center, reason)

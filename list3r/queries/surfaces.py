@@ -117,10 +117,16 @@ def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float6
         return float(np.sqrt(np.min(np.einsum("ij,ij->i", offset, offset))))
     box = instance.box
     outside = (np.abs((point - box.center) @ box.rotation) - box.size / 2.0).tolist()
-    apart = np.maximum(instance.aabb[0] - point, point - instance.aabb[1]).tolist()
     if max(outside) <= 0.0:
         return float(-max(outside))
-    return math.sqrt(max(sum(max(x, 0.0) ** 2 for x in side) for side in (outside, apart)))
+    apart = np.maximum(instance.aabb[0] - point, point - instance.aabb[1]).tolist()
+    return math.sqrt(max(_squared(*outside), _squared(*apart)))
+
+
+def _squared(x: float, y: float, z: float) -> float:
+    """Square of a distance by how far a point lies outside along three axes, not above 0 where it does not."""
+    x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
+    return x**2 + y**2 + z**2
 
 
 def distance_between(store: Store, a: Instance, b: Instance) -> float:
