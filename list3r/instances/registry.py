@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking import ReprojectionTracker
 from list3r.memory.errors import OptionError
+
+if TYPE_CHECKING:
+    from list3r.instances.appearance import Appearance
 
 DISCOVERERS = ("geometric", "eomt", "mask2former", "sam2", "sam3", "precomputed")
 TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
@@ -32,37 +36,51 @@ def check_choice(discovery: str, tracking: str, features: str) -> None:
         raise OptionError("--features own are those of a neural discoverer; with geometric use geometric or dinov2")
 
 
-@lru_cache(maxsize=2)
 def make_discoverer(
     discovery: str, features: str, folders: tuple[tuple[str, str], ...], device: str, settings: InstanceSettings
 ) -> Discoverer:
-    """The discoverer of that name; `folders` are (part/model, folder of its weights). Raises `OptionError`."""
-    where = {name: Path(folder) for name, folder in folders}
+    """The discoverer of that name; `folders` are (part/model, folder of its weights). Raises `OptionError`.
+
+    Networks are loaded once in a process; the geometric discoverer is made anew, for it holds on to its chunk.
+    """
+    where = dict(folders)
     found: Discoverer
     if discovery == "geometric":
         found = GeometricDiscoverer(settings)
-    elif discovery in ("eomt", "mask2former"):
-        from list3r.instances.query_segmenter import QuerySegmenter
-
-        found = QuerySegmenter(discovery, where[f"discovery/{discovery}"], device, settings)
     elif discovery == "precomputed":
         from list3r.instances.precomputed_masks import PrecomputedMasks
 
         if "discovery/precomputed" not in where:
             raise OptionError("--discovery precomputed needs a folder: --weights discovery=DIR (docs/precomputed.md)")
-        found = PrecomputedMasks(where["discovery/precomputed"], settings)
+        found = PrecomputedMasks(Path(where["discovery/precomputed"]), settings)
     else:
-        from list3r.instances.sam_masks import SamMasks
-
-        found = SamMasks(discovery, where[f"discovery/{discovery}"], device, settings)
+        found = _network(discovery, where[f"discovery/{discovery}"], device, settings)
     if features in ("geometric", "own"):
         return found
-    from list3r.instances.appearance import Appearance, WithAppearance
+    from list3r.instances.appearance import WithAppearance
 
-    return WithAppearance(found, Appearance(features, where[f"features/{features}"], device))
+    return WithAppearance(found, _appearance(features, where[f"features/{features}"], device))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
+def _network(discovery: str, folder: str, device: str, settings: InstanceSettings) -> Discoverer:
+    if discovery in ("eomt", "mask2former"):
+        from list3r.instances.query_segmenter import QuerySegmenter
+
+        return QuerySegmenter(discovery, Path(folder), device, settings)
+    from list3r.instances.sam_masks import SamMasks
+
+    return SamMasks(discovery, Path(folder), device, settings)
+
+
+@lru_cache(maxsize=1)
+def _appearance(features: str, folder: str, device: str) -> Appearance:
+    from list3r.instances.appearance import Appearance
+
+    return Appearance(features, Path(folder), device)
+
+
+@lru_cache(maxsize=1)
 def make_tracker(
     tracking: str, folders: tuple[tuple[str, str], ...], device: str, settings: InstanceSettings
 ) -> Tracker:
