@@ -33,8 +33,8 @@ class RelationSettings:
     """And nearer than this."""
     least_base: float = 0.25
     """Least area of the surface under a thing over the thing's own footprint: a floor does not stand on table legs."""
-    enclosed: float = 0.7
-    """Share of directions round a thing in which a container has a side."""
+    enclosed: float = 0.8
+    """Share of directions round a thing in which a container has a side: more than the back and arms of a sofa."""
     inside: float = 0.8
     """Share of a thing's points inside its container's box."""
     half_inside: float = 0.6
