@@ -6,7 +6,8 @@ The pictures, depth noise, poses, tracking, merging and all rules are those of a
 which thing is told, so that the geometry and the rules are measured and not the discovery (`benchmarks/simulated.py`
 measures both together). Walls and ceilings do not count, and all floors are one. A thing counts when it was seen in 12
 frames and once covered 300 pixels of 320 x 240.
-What stands half on a rug is not asked where it stands; next_to_decided leaves out pairs within 3 cm of the bound (two deviations of a measured gap).
+What stands half on a rug is not asked where it stands; next_to_decided leaves out pairs within 3 cm of the bound (two
+deviations of a measured gap).
 The same memory with gravity set to unknown must make no vertical claim.
 """
 
