@@ -83,7 +83,7 @@ def detect(
                 votes.append(vote(found, detector.class_names, things, gap_s, voting))
                 last_s = own[index]
                 pictures, boxes = pictures + 1, boxes + len(found.scores)
-            put_votes(store, chunk.chunk_id, detector.name, summed(votes))
+            put_votes(store, chunk.chunk_id, detector.name, summed(votes), detector.class_names)
         if rows and not pictures:
             raise OptionError(
                 f"{store.path} keeps no pictures; name the video: list3r detect {store.path} --source {_source(store)}"

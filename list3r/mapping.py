@@ -34,7 +34,7 @@ from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.gravity import estimate_gravity, world_from_graph
-from list3r.memory.labels import apply_labels, put_votes, votes_of, votes_of_names
+from list3r.memory.labels import apply_labels, put_votes, votes_of_names
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.scale import settle_scale
 from list3r.memory.store import Store
@@ -87,7 +87,7 @@ def add_chunk(
             _draw_loops(store, chunk_id, debug_dir)
         if library:
             consolidate(store, chunk_id)
-            if store.get_value("detected labels") is not None or votes_of(store, chunk_id)[1]:
+            if store.get_value("detected labels") is not None or named:
                 apply_labels(store)
     return chunk_id
 

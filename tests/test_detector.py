@@ -22,7 +22,7 @@ from list3r.detection.voting import Seen, summed, vote
 from list3r.memory import edits
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import OptionError
-from list3r.memory.labels import Votes, apply_labels, decide, detected_labels, put_votes, votes_of
+from list3r.memory.labels import Votes, apply_labels, decide, detected_labels, put_votes, votes_of, votes_of_names
 from list3r.memory.store import Store
 from tests.session_scenes import ROOM, add_session, cameras, place_together
 
@@ -215,15 +215,22 @@ def named(store: Store, rgb: tuple[int, int, int]) -> int:
     return min(store.instances(), key=lambda i: float(np.abs(np.subtract(i.color_rgb, rgb)).sum())).id
 
 
-def say(store: Store, instance_id: int, votes: Votes, chunk: int | None = None) -> None:
+def say(
+    store: Store,
+    instance_id: int,
+    votes: Votes,
+    chunk: int | None = None,
+    source: str = "test-net",
+    classes: tuple[str, ...] | None = None,
+) -> None:
     """A detector saw an instance so, in one chunk or in all."""
     with store.transaction():
         for c in store.chunks():
-            kept = votes_of(store, c.chunk_id)[1]
+            kept = votes_of(store, c.chunk_id).get(source, {})
             for o in store.observations(instance_id):
                 if o.chunk_id == c.chunk_id and chunk in (None, c.chunk_id):
                     kept[o.local_id] = votes
-            put_votes(store, c.chunk_id, "test-net", kept)
+            put_votes(store, c.chunk_id, source, kept, classes)
         apply_labels(store)
 
 
@@ -234,8 +241,51 @@ def test_votes_are_kept_and_name_things(memory: Path) -> None:
         assert store.instance(red).label == "cup" and store.instance(blue).label is None
         told = detected_labels(store)[red]
         assert told.detector == "test-net" and 0.9 < told.confidence <= 0.97
-        assert votes_of(store, 1)[1] == {o.local_id: CUP for o in store.observations(red) if o.chunk_id == 1}
+        assert votes_of(store, 1) == {"test-net": {o.local_id: CUP for o in store.observations(red) if o.chunk_id == 1}}
         assert not store.verify()
+
+
+def test_a_source_that_looks_again_replaces_its_own_votes_only(memory: Path) -> None:
+    with Store.open(memory, writable=True) as store:
+        red = named(store, ROOM["red"].rgb)
+        say(store, red, votes_of_names([("mug", 0.9)] * 6), source="segmenter")
+        assert store.instance(red).label == "mug"
+        say(store, red, Votes(0.5, {"cup": (9.0, 40.0)}), source="one")
+        assert detected_labels(store)[red].label == "cup" and detected_labels(store)[red].detector == "one"
+        say(store, red, Votes(1.0, {}), source="one")
+        assert detected_labels(store)[red].label == "mug" and detected_labels(store)[red].detector == "segmenter"
+        assert set(votes_of(store, 1)) == {"segmenter", "one"}
+
+
+def test_what_two_detectors_see_adds_up(memory: Path) -> None:
+    weak = Votes(0.2, {"cup": (0.4, 2.4)})
+    with Store.open(memory, writable=True) as store:
+        red = named(store, ROOM["red"].rgb)
+        say(store, red, weak, source="one")
+        assert store.instance(red).label is None
+        say(store, red, weak, source="two")
+        assert detected_labels(store)[red].label == "cup" and detected_labels(store)[red].detector == "one, two"
+
+
+def test_a_detector_says_nothing_against_what_it_does_not_know(memory: Path) -> None:
+    with Store.open(memory, writable=True) as store:
+        red = named(store, ROOM["red"].rgb)
+        say(store, red, votes_of_names([("flower pot", 0.9)] * 6), source="segmenter")
+        say(store, red, Votes(30.0, {}), source="one", classes=("cup", "bowl"))
+        assert store.instance(red).label == "flower pot"
+        say(store, red, Votes(30.0, {}), source="one", classes=("cup", "flower pot"))
+        assert store.instance(red).label is None
+
+
+def test_votes_of_an_older_memory_have_the_name_of_their_detector(tmp_path: Path) -> None:
+    path = Path(shutil.copy(Path(__file__).parent / "fixtures" / "schema6.l3r", tmp_path / "old.l3r"))
+    with Store.open(path, writable=True) as store:
+        assert store.verify() == []
+        (votes,) = votes_of(store, 1).values()
+        assert set(votes_of(store, 1)) == {"old-net"} and set(votes) and votes[1].classes["cup"] == (4.0, 16.0)
+        (red,) = detected_labels(store)
+        say(store, red, Votes(0.5, {"bowl": (8.0, 40.0)}), source="new-net", classes=COCO_80)
+        assert detected_labels(store)[red].label == "bowl" and set(votes_of(store, 1)) == {"old-net", "new-net"}
 
 
 def test_an_operator_has_the_last_word(memory: Path) -> None:
@@ -323,4 +373,4 @@ def test_a_memory_without_pictures_says_what_is_needed(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         with pytest.raises(OptionError, match="--source"):
             detect(store, Everything())
-        assert store.get_value("label votes 1") is None
+        assert votes_of(store, 1) == {}

@@ -1,7 +1,8 @@
-"""What things are called by a detector: votes kept for local instances, labels derived from them.
+"""What things are called by detectors and by discoverers with class names: votes kept for local instances.
 
-Votes are log odds that add up, kept in the key-value table for each chunk, so that labels follow whatever becomes of
-the groups. An operator's word always wins, a name that an operator took away stays away, and structure is never named.
+Votes are log odds that add up, kept in the key-value table for each chunk and each source, so that labels follow
+whatever becomes of the groups, and a source that looks again replaces what it said itself and nothing else. An
+operator's word always wins, a name that an operator took away stays away, and structure is never named.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from list3r.memory.constraints import Key
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
 
+_CLASSES = "label classes"
+"""Key of the classes that each source knows; there as soon as one has voted."""
 PRIOR_ODDS = math.log(0.02 / 0.98)
 """Log odds that a thing is of a given class before anything is seen: some fifty kinds of things stand in rooms."""
 
@@ -59,17 +62,25 @@ class DetectedLabel:
     found: float
     """Independent pictures in which it was found, weighted."""
     detector: str
+    """Who found it, by name, with commas between several."""
 
 
-def put_votes(store: Store, chunk_id: int, detector: str, votes: Mapping[int, Votes]) -> None:
-    """Keep what a detector saw of a chunk, instead of what one saw before. Call inside `transaction()`."""
+def put_votes(
+    store: Store, chunk_id: int, source: str, votes: Mapping[int, Votes], class_names: Iterable[str] | None = None
+) -> None:
+    """Keep what a source saw of a chunk, instead of what the same one saw before. Call inside `transaction()`.
+
+    `class_names` are the classes that it knows, where that is a closed list: it says nothing against others.
+    """
     rows = {
         str(n): [round(v.missed, 4), {c: [round(a, 4), round(b, 4)] for c, (a, b) in v.classes.items()}]
         for n, v in sorted(votes.items())
     }
-    store.set_value(_key(chunk_id), {"detector": detector, "locals": rows})
-    if store.get_value("label votes") is None:
-        store.set_value("label votes", True)
+    store.set_value(_key(chunk_id), {**store.get_value(_key(chunk_id), {}), source: rows})
+    known = store.get_value(_CLASSES, {})
+    names = None if class_names is None else sorted(class_names)
+    if source not in known or known[source] != names:
+        store.set_value(_CLASSES, {**known, source: names})
 
 
 def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
@@ -85,14 +96,28 @@ def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
     return Votes(0.0, classes)
 
 
-def votes_of(store: Store, chunk_id: int) -> tuple[str, dict[int, Votes]]:
-    """The detector and its votes by local id; nothing where none looked at the chunk."""
-    told: dict[str, Any] | None = store.get_value(_key(chunk_id))
-    if told is None:
-        return "", {}
-    rows = told["locals"].items()
-    found = {int(n): Votes(missed, {c: (a, b) for c, (a, b) in classes.items()}) for n, (missed, classes) in rows}
-    return str(told["detector"]), found
+def votes_of(store: Store, chunk_id: int) -> dict[str, dict[int, Votes]]:
+    """By source, its votes by local id; nothing where none looked at the chunk."""
+    told: dict[str, dict[str, Any]] = store.get_value(_key(chunk_id), {})
+    return {
+        source: {int(n): Votes(missed, {c: (a, b) for c, (a, b) in got.items()}) for n, (missed, got) in rows.items()}
+        for source, rows in told.items()
+    }
+
+
+def together(votes: Mapping[str, Votes], known: Mapping[str, Collection[str] | None]) -> Votes:
+    """The votes of several sources: a class loses what was missed only by those that know it.
+
+    `known` are the classes of each source, None or absent for one that speaks of every class.
+    """
+    out: dict[str, tuple[float, float]] = {}
+    for name in sorted({c for v in votes.values() for c in v.classes}):
+        for source, v in sorted(votes.items()):
+            names = known.get(source)
+            missed = v.missed if names is None or name in names else 0.0
+            found, got = v.classes.get(name, (0.0, 0.0))
+            out[name] = _plus(out.get(name, (0.0, 0.0)), (found, got - missed))
+    return Votes(0.0, out)
 
 
 def decide(votes: Votes, settings: LabelSettings | None = None) -> tuple[str, float, float] | None:
@@ -115,7 +140,7 @@ def decide(votes: Votes, settings: LabelSettings | None = None) -> tuple[str, fl
 
 
 def detected_labels(store: Store) -> dict[int, DetectedLabel]:
-    """The labels that instances have from a detector, by id."""
+    """The labels that instances have from detectors and discoverers, by id."""
     rows: dict[str, list[Any]] = store.get_value("detected labels", {})
     return {int(n): DetectedLabel(str(r[0]), float(r[1]), float(r[2]), str(r[3])) for n, r in rows.items()}
 
@@ -134,7 +159,8 @@ def apply_labels(store: Store, settings: LabelSettings | None = None) -> dict[in
 
     Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was derived.
     """
-    if store.get_value("label votes") is None:
+    known = store.get_value(_CLASSES)
+    if known is None:
         return {}
     before = store.get_value("detected labels")
     votes = {c.chunk_id: votes_of(store, c.chunk_id) for c in store.chunks()}
@@ -148,7 +174,7 @@ def apply_labels(store: Store, settings: LabelSettings | None = None) -> dict[in
     for i in store.instances():
         if i.id in spoken:
             continue
-        label = None if i.structure is not None else _label(members.get(i.id, ()), votes, settings)
+        label = None if i.structure is not None else _label(members.get(i.id, ()), votes, known, settings)
         if label is not None:
             out[i.id] = label
         text = None if label is None else label.label
@@ -162,18 +188,21 @@ def apply_labels(store: Store, settings: LabelSettings | None = None) -> dict[in
 
 
 def _label(
-    keys: Iterable[Key], votes: Mapping[int, tuple[str, Mapping[int, Votes]]], settings: LabelSettings | None
+    keys: Iterable[Key],
+    votes: Mapping[int, Mapping[str, Mapping[int, Votes]]],
+    known: Mapping[str, Collection[str] | None],
+    settings: LabelSettings | None,
 ) -> DetectedLabel | None:
-    total, detectors = Votes(0.0, {}), set()
+    total: dict[str, Votes] = {}
     for chunk_id, local_id in sorted(keys):
-        detector, found = votes.get(chunk_id, ("", {}))
-        if local_id in found:
-            total += found[local_id]
-            detectors.add(detector)
-    chosen = decide(total, settings)
+        for source, found in votes.get(chunk_id, {}).items():
+            if local_id in found:
+                total[source] = total.get(source, Votes(0.0, {})) + found[local_id]
+    chosen = decide(together(total, known), settings)
     if chosen is None:
         return None
-    return DetectedLabel(chosen[0], chosen[1], chosen[2], ", ".join(sorted(detectors)))
+    name, confidence, pictures = chosen
+    return DetectedLabel(name, confidence, pictures, ", ".join(s for s in sorted(total) if name in total[s].classes))
 
 
 def _named_by_operators(store: Store, home: Mapping[Key, int]) -> Collection[int]:

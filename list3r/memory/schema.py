@@ -126,6 +126,12 @@ MIGRATIONS: tuple[str, ...] = (
         PRIMARY KEY (word, instance)) WITHOUT ROWID;
     CREATE INDEX embeddings_by_space ON embeddings (space);
     """,
+    # 7: votes for labels by who gave them
+    """
+    UPDATE memory SET value = json_object(json_extract(value, '$.detector'), json_extract(value, '$.locals'))
+    WHERE key LIKE 'label votes _%' AND json_valid(value);
+    UPDATE memory SET key = 'label classes', value = '{}' WHERE key = 'label votes';
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)
