@@ -70,7 +70,7 @@ def detect(
             if progress is not None:
                 progress(done, len(rows))
             tracks = {n: store.mask_track(chunk.chunk_id, n) for k, n in sorted(home) if k == chunk.chunk_id}
-            votes, last_s = [], -np.inf
+            votes, last_s, region = [], -np.inf, _region(tracks)
             source = (sources or {}).get(chunk.session_id)
             own = in_session.get(chunk.session_id, {}) if source is None else in_chunk.get(chunk.chunk_id, {})
             for index, color in _pictures(store, chunk, own, source):
@@ -80,7 +80,7 @@ def detect(
                 found = detector(color)
                 things = _seen(index, tracks, {n: home[chunk.chunk_id, n] for n in tracks}, sizes)
                 gap_s = own[index] - last_s
-                votes.append(vote(found, detector.class_names, things, gap_s, voting))
+                votes.append(vote(found, detector.class_names, things, gap_s, voting, region))
                 last_s = own[index]
                 pictures, boxes = pictures + 1, boxes + len(found.scores)
             put_votes(store, chunk.chunk_id, detector.name, summed(votes), detector.class_names)
@@ -179,6 +179,15 @@ def _seen(
         shares = tuple((areas / areas.sum()).tolist())
         out.append(Seen(tuple(n for n, _ in pieces), shares, box, mask, visible, sizes.get(instance_id)))
     return out
+
+
+def _region(tracks: Mapping[int, MaskTrack]) -> NDArray[np.float32] | None:
+    """The part of the pictures in which the masks of a chunk lie: left, top, right, bottom, px. Shape (4,)."""
+    boxes = [t.boxes_xyxy[t.areas_px > 0] for t in tracks.values() if (t.areas_px > 0).any()]
+    if not boxes:
+        return None
+    every = np.concatenate(boxes)
+    return np.concatenate([every[:, :2].min(axis=0), every[:, 2:].max(axis=0)]).astype(np.float32)
 
 
 def _source(store: Store) -> str:

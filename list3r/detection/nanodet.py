@@ -30,8 +30,8 @@ _GRID = re.compile(r"cls_pred_stride_(\d+)$")
 class DetectorSettings:
     """What counts as a detection."""
 
-    min_score: float = 0.3
-    """Boxes less sure are dropped."""
+    min_score: float = 0.1
+    """Boxes less sure are dropped. Low, because votes are weighed by scores: see `detection.voting`."""
     max_overlap: float = 0.5
     """Of two boxes of one class that overlap by more (IoU) the surer stays."""
     side_px: int | None = None

@@ -30,6 +30,8 @@ class Votes:
     """Log odds that every class loses for all frames that looked; a class has them back for those that found it."""
     classes: Mapping[str, tuple[float, float]]
     """By class: in how many pictures it was found (weighted), and the log odds that they add up to."""
+    looks: float = 0.0
+    """In how many pictures it was looked at (weighted); 0 where nobody counted."""
 
     def __add__(self, other: Votes) -> Votes:
         names = sorted({*self.classes, *other.classes})
@@ -37,6 +39,7 @@ class Votes:
         return Votes(
             self.missed + other.missed,
             {n: _plus(self.classes.get(n, zero), other.classes.get(n, zero)) for n in names},
+            self.looks + other.looks,
         )
 
 
@@ -48,6 +51,10 @@ class LabelSettings:
     """Independent pictures in which the class was found, weighted by how well they see the thing: one is not enough."""
     min_confidence: float = 0.5
     """Probability of the class."""
+    likeness: float = 0.4
+    """Correlation of what a detector says in two pictures of one thing: n pictures say as much as n / (1 + likeness
+    (n - 1)) of different things would, never more than 1 / likeness. From 0.25 to 0.5 redkitchen has the same names.
+    """
     always_wrong: float = 0.03
     """A detector may be wrong in the same way in every picture; no label is surer than one less this."""
 
@@ -73,7 +80,11 @@ def put_votes(
     `class_names` are the classes that it knows, where that is a closed list: it says nothing against others.
     """
     rows = {
-        str(n): [round(v.missed, 4), {c: [round(a, 4), round(b, 4)] for c, (a, b) in v.classes.items()}]
+        str(n): [
+            round(v.missed, 4),
+            {c: [round(a, 4), round(b, 4)] for c, (a, b) in v.classes.items()},
+            round(v.looks, 4),
+        ]
         for n, v in sorted(votes.items())
     }
     store.set_value(_key(chunk_id), {**store.get_value(_key(chunk_id), {}), source: rows})
@@ -90,53 +101,57 @@ def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
     same mistakes, so each has half a voice.
     """
     classes: dict[str, tuple[float, float]] = {}
+    looks = 0.0
     for name, score in names:
+        looks += 0.5
         p = min(max(score, 0.02), 0.98)
         classes[name] = _plus(classes.get(name, (0.0, 0.0)), (0.5, 0.5 * (math.log(p / (1.0 - p)) - PRIOR_ODDS)))
-    return Votes(0.0, classes)
+    return Votes(0.0, classes, looks)
 
 
 def votes_of(store: Store, chunk_id: int) -> dict[str, dict[int, Votes]]:
     """By source, its votes by local id; nothing where none looked at the chunk."""
     told: dict[str, dict[str, Any]] = store.get_value(_key(chunk_id), {})
     return {
-        source: {int(n): Votes(missed, {c: (a, b) for c, (a, b) in got.items()}) for n, (missed, got) in rows.items()}
+        source: {
+            int(n): Votes(missed, {c: (a, b) for c, (a, b) in got.items()}, *looks)
+            for n, (missed, got, *looks) in rows.items()  # before looks were counted there were two
+        }
         for source, rows in told.items()
     }
 
 
-def together(votes: Mapping[str, Votes], known: Mapping[str, Collection[str] | None]) -> Votes:
-    """The votes of several sources: a class loses what was missed only by those that know it.
-
-    `known` are the classes of each source, None or absent for one that speaks of every class.
-    """
-    out: dict[str, tuple[float, float]] = {}
-    for name in sorted({c for v in votes.values() for c in v.classes}):
-        for source, v in sorted(votes.items()):
-            names = known.get(source)
-            missed = v.missed if names is None or name in names else 0.0
-            found, got = v.classes.get(name, (0.0, 0.0))
-            out[name] = _plus(out.get(name, (0.0, 0.0)), (found, got - missed))
-    return Votes(0.0, out)
-
-
-def decide(votes: Votes, settings: LabelSettings | None = None) -> tuple[str, float, float] | None:
+def decide(
+    votes: Mapping[str, Votes],
+    known: Mapping[str, Collection[str] | None] | None = None,
+    settings: LabelSettings | None = None,
+) -> tuple[str, float, float] | None:
     """(class, its probability, frames in which it was found), None where no class is likely enough.
 
-    The classes exclude one another and all of them may be wrong, which has the odds of 1.
+    `votes` are those of each source, `known` the classes that each knows, None or absent for one that speaks of every
+    class. The classes exclude one another and all of them may be wrong, which has the odds of 1.
     """
     s = settings or LabelSettings()
-    odds = {c: PRIOR_ODDS + got - votes.missed for c, (_, got) in votes.classes.items()}
+    odds: dict[str, float] = {}
+    found: dict[str, float] = {}
+    for name in sorted({c for v in votes.values() for c in v.classes}):
+        said = [_said(v, name, (known or {}).get(source), s.likeness) for source, v in sorted(votes.items())]
+        odds[name] = PRIOR_ODDS + sum(evidence for _, evidence in said)
+        found[name] = sum(pictures for pictures, _ in said)
     if not odds:
         return None
     top = max(0.0, *odds.values())
     total = math.exp(-top) + sum(math.exp(v - top) for v in odds.values())
     best = min(odds, key=lambda c: (-odds[c], c))
     confidence = (1.0 - s.always_wrong) * math.exp(odds[best] - top) / total
-    found = votes.classes[best][0]
-    if confidence < s.min_confidence or found < s.min_found:
-        return None
-    return best, confidence, found
+    return (best, confidence, found[best]) if confidence >= s.min_confidence and found[best] >= s.min_found else None
+
+
+def _said(votes: Votes, name: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:
+    """Pictures in which a source found a class, and its log odds for it; one that it does not know is not missed."""
+    found, got = votes.classes.get(name, (0.0, 0.0))
+    missed = votes.missed if known is None or name in known else 0.0
+    return found, (got - missed) / (1.0 + likeness * max(votes.looks - 1.0, 0.0))
 
 
 def detected_labels(store: Store) -> dict[int, DetectedLabel]:
@@ -198,7 +213,7 @@ def _label(
         for source, found in votes.get(chunk_id, {}).items():
             if local_id in found:
                 total[source] = total.get(source, Votes(0.0, {})) + found[local_id]
-    chosen = decide(together(total, known), settings)
+    chosen = decide(total, known, settings)
     if chosen is None:
         return None
     name, confidence, pictures = chosen
