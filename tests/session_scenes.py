@@ -77,21 +77,23 @@ def cast(room: Mapping[str, Box], T_world_cam: Array) -> tuple[Array, np.ndarray
 def add_session(store: Store, room: Mapping[str, Box], poses: Array) -> int:
     """One session of one chunk whose chunk frame is the world; its chunk's id. Call inside a transaction."""
     session = store.add_session("simulated", f"{len(store.sessions())}", {}, len(poses))
-    return store.add_chunk(session, _result(room, poses))
+    return store.add_chunk(session, simulated_chunk(room, poses))
 
 
-def _result(room: Mapping[str, Box], poses: Array) -> ChunkResult:
+def simulated_chunk(room: Mapping[str, Box], poses: Array, index: int = 0) -> ChunkResult:
+    """A chunk of a session that has its own frames; its frame of reference is the world."""
     pictures = [cast(room, T) for T in poses]
-    frames = np.arange(len(poses), dtype=np.int64)
+    start = index * len(poses)
+    frames = np.arange(start, start + len(poses), dtype=np.int64)
     instances = []
     for number, (name, box) in enumerate(room.items()):
         if name != "floor":
-            found = _instance(len(instances), number, box, pictures, poses)
+            found = _instance(len(instances), number, box, pictures, poses, start)
             if found is not None:
                 instances.append(found)
     keyframes = [
         Keyframe(
-            int(k),
+            start + int(k),
             poses[k],
             np.ones(4, np.float32) / 2,
             np.zeros((0, 2), np.float32),
@@ -103,7 +105,7 @@ def _result(room: Mapping[str, Box], poses: Array) -> ChunkResult:
         for k in range(0, len(poses), 3)
     ]
     return ChunkResult(
-        index=0,
+        index=index,
         frame_indices=frames,
         times_s=frames / 10.0,
         posed=np.ones(len(poses), bool),
@@ -119,7 +121,7 @@ def _result(room: Mapping[str, Box], poses: Array) -> ChunkResult:
 
 
 def _instance(
-    local_id: int, number: int, box: Box, pictures: list[tuple[Array, np.ndarray]], poses: Array
+    local_id: int, number: int, box: Box, pictures: list[tuple[Array, np.ndarray]], poses: Array, start: int
 ) -> LocalInstance | None:
     masks = [(k, owner == number) for k, (_, owner) in enumerate(pictures) if (owner == number).sum() >= 30]
     if not masks:
@@ -135,7 +137,7 @@ def _instance(
     support = np.concatenate(points)[::7].astype(np.float32)
     color = np.array([*box.rgb, 60.0])
     track = MaskTrack(
-        np.array([k for k, _ in masks], np.int64),
+        np.array([start + k for k, _ in masks], np.int64),
         np.array(boxes, np.float32),
         np.array(boxes, np.float32)[:, :2],
         np.array([m.sum() for _, m in masks], np.int32),

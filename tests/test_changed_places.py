@@ -24,7 +24,7 @@ ELSEWHERE = Box((-0.15, 0.25, 0.82), ROOM["green"].size, ROOM["green"].rgb)
 def _add(store: Store, room: dict[str, Box], start: float, overlooked: str | None) -> None:
     """A session whose discovery overlooks one box."""
     poses = np.concatenate([cameras(TABLE, start), cameras(TABLE, start + 0.1)])
-    result = session_scenes._result(room, poses)
+    result = session_scenes.simulated_chunk(room, poses)
     found = []
     for instance in result.library.instances:
         box = min(room.values(), key=lambda b: float(np.abs(instance.support.rgb[0].astype(int) - b.rgb).sum()))

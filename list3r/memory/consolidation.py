@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.changes import across_sessions, as_events, find_changes
+from list3r.memory.changes import Changes, across_sessions, as_events, find_changes
 from list3r.memory.constraints import Constraints
 from list3r.memory.derive import Thing, with_agreement
 from list3r.memory.evidence import Evidence, contested, weigh
@@ -36,7 +36,8 @@ from list3r.memory.relations import relations
 from list3r.memory.settling import Settled, neighbours, settle
 from list3r.memory.store import Store
 from list3r.memory.structure import classify_structure, flagged_only
-from list3r.memory.summaries import ChunkSummary, Summaries, chunk_summaries
+from list3r.memory.summaries import ChunkSummary, SomeSummaries, Summaries, chunk_summaries
+from list3r.memory.tale import Tale, read_tale, write_tale
 from list3r.memory.uncertainty import position_sigma
 
 __all__ = ["ConsolidationReport", "ConsolidationSettings", "consolidate"]
@@ -58,16 +59,17 @@ def consolidate(
     last = chunk_id if chunk_id is not None else chunks[-1].chunk_id
     summaries = chunk_summaries(store)
     world = known_world(store, chunks, s)
+    tale = read_tale(store, chunks)
     report = None
-    if world is not None and len(chunks) > s.whole_chunks and not _is_whole(chunks):
+    if world is not None and tale is not None and len(chunks) > s.whole_chunks:
         again = len(chunks) <= _LOOKED_AT or chunk_id is None
         if again and len(chunks) >= 2 * world.chunks:
             now = look_at_world(store, chunks, summaries, s)
             world = replace(world, chunks=now.chunks) if world.near(now) else None
         if world is not None:
-            report = grow(store, summaries, world, last, s, exact=chunk_id is None)
+            report = grow(store, summaries, world, last, s, tale, exact=chunk_id is None)
     if report is None:
-        report = _derive_whole(store, summaries, last, s)
+        report = _derive_whole(store, summaries, last, s, None if chunk_id is None else tale)
     store.touched = set()
     return report
 
@@ -77,12 +79,10 @@ _LOOKED_AT = 64
 done when a session ends, for what changes it makes all things be derived anew."""
 
 
-def _is_whole(chunks: Sequence[ChunkRow]) -> bool:
-    """Whether there is what ties all of a memory together: the changes between several sessions."""
-    return len({c.session_id for c in chunks}) > 1
-
-
-def _derive_whole(store: Store, summaries: Summaries, chunk_id: int, s: ConsolidationSettings) -> ConsolidationReport:
+def _derive_whole(
+    store: Store, summaries: Summaries, chunk_id: int, s: ConsolidationSettings, tale: Tale | None
+) -> ConsolidationReport:
+    """All of it. What has changed between sessions stands as `tale` says, or is told anew."""
     settled = settle(store, summaries, s.settling)
     chunks = settled.chunks
     world = look_at_world(store, chunks, summaries, s)
@@ -97,26 +97,33 @@ def _derive_whole(store: Store, summaries: Summaries, chunk_id: int, s: Consolid
     groups, movers = word.joined(groups, {c.chunk_id: c.component for c in chunks}, movers)
     evidence = weigh(groups, shapes, pairs, s.evidence)
     shown = word.shown(groups, [e.shown(s.evidence, world.posed) for e in evidence])
-    changes = find_changes(store, groups, shown, frozenset(movers), chunks, held, s.changes)
-    if changes.current:
-        groups, evidence = changes.groups, weigh(changes.groups, shapes, pairs, s.evidence)
-    decisions += joined + changes.decisions
+    story = None
+    if tale is None:
+        some = SomeSummaries(held, held, world.unit)
+        story = find_changes(store, groups, shown, frozenset(movers), chunks, some, s.changes)
+        tale, groups = Tale.of(story, groups, max(c.session_id for c in chunks)), story.groups
+        decisions += joined + story.decisions
+    else:
+        groups, tale = tale.joined(groups, {c.chunk_id: c.component for c in chunks})
+        decisions += joined
+    if tale.moved:
+        evidence = weigh(groups, shapes, pairs, s.evidence)
     before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
     weights = {key: len(shapes[key[0]].frames[_at(held, key)]) for group in groups for key in group}
-    told = {c.first for c in changes.events}
-    shown = word.shown(
-        groups, [e.shown(s.evidence, world.posed) or g[0] in told for e, g in zip(evidence, groups, strict=True)]
-    )
+    counts = [e.shown(s.evidence, world.posed) or tale.shows(g) for e, g in zip(evidence, groups, strict=True)]
+    shown = word.shown(groups, counts)
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
-    things = _things(store, groups, ids, evidence, chunks, held, s, movers, changes.current, world)
+    things = _things(store, groups, ids, evidence, chunks, held, s, movers, tale, world)
     things = _with_structure(store, things, chunks, groups, ids, s, world)
-    states = {n: changes.states[g[0]] for g, n in zip(groups, ids.of_group, strict=True) if g[0] in changes.states}
+    states = _states(store, groups, ids, chunks, tale, story)
     labels = {ids.of_group[n]: text for n, text in word.labels_of(groups, weights).items()}
     _write(store, things, groups, ids, settled, labels, states, world)
     store.put_groups(zip(groups, shown, strict=True))
     store.set_value("library", world.as_dict())
-    store.replace_events(as_events(changes, {g[0]: n for g, n in zip(groups, ids.of_group, strict=True)}))
+    write_tale(store, tale)
+    if story is not None:
+        store.replace_events(as_events(story, {g[0]: n for g, n in zip(groups, ids.of_group, strict=True)}))
     here = [t for t in things if states.get(t.body.id) != "removed"]
     store.replace_relations(None, _relations(store, here, s, world))
     log_decisions(store, chunk_id, decisions, before, ids)
@@ -215,7 +222,7 @@ def _things(
     summaries: Mapping[int, ChunkSummary],
     s: ConsolidationSettings,
     movers: Mapping[Key, Mover],
-    current: Mapping[Key, Sequence[Key]],
+    tale: Tale,
     world: World,
 ) -> list[Thing]:
     rows = {c.chunk_id: c for c in chunks}
@@ -228,19 +235,39 @@ def _things(
     for group, instance_id, seen in zip(groups, ids.of_group, evidence, strict=True):
         if instance_id is None:
             continue
+        mover = movers.get(group[0])
         thing = thing_of(
             store,
             instance_id,
             group,
-            current.get(group[0], group),
+            group if mover is not None else tale.current(group),
             {k: (shapes[k], placed[k], dropped[k]) for k in {k for k, _ in group}},
             rows[group[0][0]].component,
             s,
             world,
-            movers.get(group[0]),
+            mover,
         )
         out.append(with_agreement(thing, seen.agreement))
     return sorted(out, key=lambda t: t.body.id)
+
+
+def _states(
+    store: Store,
+    groups: Sequence[Sequence[Key]],
+    ids: Identities,
+    chunks: Sequence[ChunkRow],
+    tale: Tale,
+    story: Changes | None,
+) -> dict[int | None, str]:
+    """The state of each thing, by id: what the story says, or what stands."""
+    rows, before = {c.chunk_id: c for c in chunks}, store.states()
+    out: dict[int | None, str] = {}
+    for group, n in zip(groups, ids.of_group, strict=True):
+        if n is not None and story is not None:
+            out[n] = story.states.get(group[0], "present")
+        elif n is not None:
+            out[n] = tale.state(before[n][0] if n in before else None, group, rows)
+    return out
 
 
 def _with_structure(

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from list3r.memory.changes import across_sessions
 from list3r.memory.geometry import Sim3
 from list3r.memory.library_rows import pack_scores, unpack_scores
 from list3r.memory.library_rules import ConsolidationSettings, World
@@ -21,6 +23,7 @@ from list3r.memory.settling import neighbours
 from list3r.memory.shapes import ChunkShapes
 from list3r.memory.store import Store
 from list3r.memory.summaries import Summaries
+from list3r.memory.tale import Tale
 
 Group = tuple[Key, ...]
 Edges = tuple[list[Edge], dict[tuple[Key, Key], float]]
@@ -33,14 +36,39 @@ _edges_before: WeakKeyDictionary[
 ] = WeakKeyDictionary()
 
 
+@dataclass(frozen=True)
+class Occasion:
+    """Why the library grows."""
+
+    store: Store
+    summaries: Summaries
+    world: World
+    settings: ConsolidationSettings
+    tale: Tale
+    """What stands of changes between sessions."""
+    before: dict[int, SettledRow]
+    """Where chunks were settled before that were asked about."""
+    dirty: frozenset[int]
+    """Chunks that are new or have moved."""
+    spoken: frozenset[Key]
+    """Local instances that an operator has spoken of since the library was derived."""
+
+
 class Region:
     """What is touched, read as far as it is asked for."""
 
-    def __init__(
-        self, store: Store, summaries: Summaries, world: World, s: ConsolidationSettings, dirty: Collection[int]
-    ) -> None:
-        self._store, self._summaries, self._world, self._s = store, summaries, world, s
-        self._dirty = sorted(dirty)
+    def __init__(self, occasion: Occasion) -> None:
+        store = occasion.store
+        self._store, self._summaries, self._world, self._s = (
+            store,
+            occasion.summaries,
+            occasion.world,
+            occasion.settings,
+        )
+        self._dirty = sorted(occasion.dirty)
+        self._spoken = occasion.spoken
+        self._before = occasion.before
+        self._tale = occasion.tale
         self._rows = store.settled()
         self._extents = np.array([r.extent for r in self._rows.values()])
         self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
@@ -100,7 +128,8 @@ class Region:
         for pair, blob in self._store.overlaps(missing).items() if missing else ():
             if pair not in self._pairs:
                 shapes = {k: self._shapes(k) for k in pair}
-                self._pairs |= without_moving({pair: unpack_scores(blob)}, shapes, self._motions(pair))
+                scores = without_moving({pair: unpack_scores(blob)}, shapes, self._motions(pair))
+                self._pairs |= across_sessions(scores, shapes, self._s.changes)
         self._paired |= wanted
         return {p: self._pairs[p] for p in sorted(self._pairs) if p[0] in wanted or p[1] in wanted}
 
@@ -135,7 +164,8 @@ class Region:
 
     def _at_that_time(self, chunks: Collection[int]) -> set[int]:
         """Chunks seen so shortly before or after one of these that what moves may be the same."""
-        rows = sorted((c for c in self._store.chunks() if c.chunk_id in self._rows), key=lambda c: c.first_frame)
+        rows = [c for c in self._store.chunks() if c.chunk_id in self._rows]
+        rows.sort(key=lambda c: (c.session_id, c.first_frame))
         at = {c.chunk_id: n for n, c in enumerate(rows)}
         out = set(chunks)
         for k in chunks:
@@ -143,7 +173,8 @@ class Region:
             for way in (range(at[k] - 1, -1, -1), range(at[k] + 1, len(rows))):
                 for n in way:
                     other = self._span_s(rows[n].chunk_id)
-                    if max(other[0] - high, low - other[1]) > self._s.moving.most_gap_s:
+                    far = max(other[0] - high, low - other[1]) > self._s.moving.most_gap_s
+                    if far or rows[n].session_id != rows[at[k]].session_id:
                         break
                     out.add(rows[n].chunk_id)
         return {k for k in out if any(self._rows[k].component == self._rows[j].component for j in chunks)}
@@ -173,25 +204,30 @@ class Region:
         if not self._moving or self._motions({k for k, _ in group}).keys().isdisjoint(group):
             return None
         if group not in self._movers:
-            self._form(set(group))
+            self._by_overlap(set(group))
         return self._movers.get(group)
 
     # ------------------------------------------------------------------ groups
 
-    def _partition(self) -> tuple[list[Group], list[MergeDecision]]:
-        """The groups of all local instances that the chunks touch, formed anew, and the decisions."""
+    def _partition(self, seeds: Collection[Key] = ()) -> tuple[list[Group], list[MergeDecision]]:
+        """The groups by overlap of all local instances that the chunks, or these seeds, touch, formed anew; and the
+        decisions.
+        """
         region = {(k, n) for k in self._dirty for n in self._shapes(k).local_id.tolist()}
-        said = {*self._word.touched, *(k for d in self._word.deletions for k in d.keys)}
-        region |= {k for k in said if k[0] in self._rows}
+        region |= {k for k in (*self._spoken, *seeds) if k[0] in self._rows}
         region = self._closed(region)
         region = self._closed(region | self._across(region, region) | self._along(region, region))
         while True:
-            groups, decisions = self._form(region)
-            changed = {k for g in groups if self._has_changed(g) for k in g}
+            groups, decisions = self._by_overlap(region)
+            joined = self._tale.joined(groups, self._components(region))[0]
+            changed = {k for g in joined if self._has_changed(tuple(g)) for k in g}
             left = self._closed(self._across(changed, region) | self._along(changed, region)) - region
             if not left:
                 return groups, decisions
             region |= left
+
+    def _components(self, keys: Iterable[Key]) -> dict[int, int]:
+        return {k: self._rows[k].component for k in {k for k, _ in keys}}
 
     def _closed(self, keys: Collection[Key]) -> set[Key]:
         """All local instances that were in one group with any of these."""
@@ -199,7 +235,8 @@ class Region:
         return {m for key in keys for m in (*self._old.get(key, ()), key) if m[0] in self._rows}
 
     def _has_changed(self, group: Group) -> bool:
-        return self._old.get(group[0]) != group or any(k in self._dirty for k, _ in group)
+        spoken = not self._spoken.isdisjoint(group)
+        return self._old.get(group[0]) != group or spoken or any(k in self._dirty for k, _ in group)
 
     def _across(self, keys: Collection[Key], inside: Collection[Key]) -> set[Key]:
         """Local instances outside that an edge ties to one of these."""
@@ -238,7 +275,10 @@ class Region:
             self._nodes[chunk_id] = Nodes.of([self._shapes(chunk_id)], {chunk_id: self._pose(chunk_id)})
         return self._nodes[chunk_id]
 
-    def _form(self, region: Collection[Key]) -> tuple[list[Group], list[MergeDecision]]:
+    def _by_overlap(self, region: Collection[Key]) -> tuple[list[Group], list[MergeDecision]]:
+        """The groups of some local instances alone, and the decisions."""
+        if not region:
+            return [], []
         chunks = sorted({k for k, _ in region})
         edges: list[Edge] = []
         overlap: dict[tuple[Key, Key], float] = {}

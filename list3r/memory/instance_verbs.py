@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -93,7 +93,21 @@ class InstanceVerbs(EmbeddingVerbs):
             self._database.execute(f"DELETE FROM {table} WHERE {column} = ?", (instance_id,))
         self._database.execute("DELETE FROM relations WHERE subject = ? OR object = ?", (instance_id, instance_id))
         if alias_of is not None:
+            query = "UPDATE OR IGNORE events SET instance = ? WHERE instance = ?"
+            self._database.execute(query, (alias_of, instance_id))
+        self._database.execute("DELETE FROM events WHERE instance = ?", (instance_id,))
+        if alias_of is not None:
             self._database.execute("INSERT OR REPLACE INTO aliases VALUES (?, ?)", (instance_id, alias_of))
+
+    def states(self) -> dict[int, tuple[str, int]]:
+        """State and component of every instance, by id."""
+        return {n: (state, part) for n, state, part in self._rows("SELECT id, state, component FROM instances")}
+
+    def set_states(self, states: Mapping[int, str]) -> None:
+        """Write the state of instances, by id."""
+        self._database.executemany(
+            "UPDATE instances SET state = ? WHERE id = ?", [(state, n) for n, state in sorted(states.items())]
+        )
 
     def next_id(self) -> int:
         """The smallest id that was never used; ids are not used again."""

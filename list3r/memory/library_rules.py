@@ -9,6 +9,7 @@ import numpy as np
 
 from list3r.memory.changes import ChangeSettings
 from list3r.memory.colors import Reference
+from list3r.memory.constraints import Key
 from list3r.memory.derive import DeriveSettings
 from list3r.memory.evidence import EvidenceSettings
 from list3r.memory.gravity import floor_height
@@ -80,7 +81,9 @@ class World:
     space: str
     """The embedding space of all chunks; empty where they have several."""
     stamp: int
-    """Of the settings, of what operators said, and of where the graph's frame lies in the world."""
+    """Of the settings, and of where the graph's frame lies in the world."""
+    edits: int = 0
+    """The last edit of an operator that was obeyed."""
 
     def as_dict(self) -> dict[str, object]:
         """For the key-value table."""
@@ -128,6 +131,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         posed=store.posed_count(_POSED),
         space=spaces.pop() if len(spaces) == 1 else "",
         stamp=_stamp(store, s),
+        edits=max((e.entry for e in store.edits()), default=0),
     )
 
 
@@ -158,5 +162,16 @@ def _floor(store: Store, inside: list[ChunkRow], summaries: Summaries, unit: flo
 
 
 def _stamp(store: Store, s: ConsolidationSettings) -> int:
-    edits = [e.entry for e in store.edits()]
-    return zlib.crc32(repr((s, edits, store.get_value("T_world_graph"), store.get_value("scale_kind"))).encode())
+    return zlib.crc32(repr((s, store.get_value("T_world_graph"), store.get_value("scale_kind"))).encode())
+
+
+def spoken_of(store: Store, since: int) -> frozenset[Key]:
+    """The local instances that edits after an entry speak of; an undo speaks of what it takes back."""
+    edits = {e.entry: e for e in store.edits()}
+    left = [e for n, e in edits.items() if n > since]
+    out: set[Key] = set()
+    while left:
+        edit = left.pop()
+        out.update(k for part in (*edit.parts, *(keys for _, _, keys in edit.before)) for k in part)
+        left += [edits[n] for n in (edit.target,) if n in edits]
+    return frozenset(out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -81,6 +81,22 @@ class Summaries(Mapping[int, ChunkSummary]):
             return None
         scale = Sim3.from_matrix(self._store.get_value("T_world_graph", np.eye(4).tolist())).scale
         return float(scale) / float(metres)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._ids)
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+
+class SomeSummaries(Mapping[int, ChunkSummary]):
+    """The summaries of some chunks, for who goes through all of them; `metre` is what a metre is in world units."""
+
+    def __init__(self, known: Mapping[int, ChunkSummary], chunk_ids: Iterable[int], metre: float) -> None:
+        self._of, self._ids, self.metre = known, sorted(chunk_ids), metre
+
+    def __getitem__(self, chunk_id: int) -> ChunkSummary:
+        return self._of[chunk_id]
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._ids)

@@ -1,0 +1,159 @@
+"""A library of several sessions that grows is the one derived as a whole, and its changes are told when one ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.memory import consolidation, edits
+from list3r.memory.consolidation import consolidate
+from list3r.memory.geometry import Sim3
+from list3r.memory.library_rules import ConsolidationSettings
+from list3r.memory.store import Store
+from tests.session_scenes import FRAMES, Box, cameras, simulated_chunk
+from tests.test_growth import tables
+
+GROW = ConsolidationSettings(whole_chunks=0, whole_share=1.0)
+APART_M, TABLES = 9.0, 4
+COLORS = [(200, 30, 30), (30, 40, 200), (30, 170, 40)]
+
+
+def house(changes: Mapping[str, Box | None] | None = None) -> dict[str, Box]:
+    """Tables in a row, too far apart to be seen from one another, each with three things on it, and what is other."""
+    room = {}
+    for n in range(TABLES):
+        x = APART_M * n
+        room[f"table {n}"] = Box((x, 0.0, 0.72), (1.6, 0.9, 0.04), (150, 110, 70))
+        for m, dx in enumerate((-0.5, 0.0, 0.5)):
+            at = (x + dx, 0.15 - 0.15 * m, 0.81)
+            room[f"thing {n}{m}"] = Box(at, (0.12, 0.12 + 0.02 * m, 0.14), COLORS[m])
+    for name, box in (changes or {}).items():
+        room[name] = box if box is not None else Box((0.0, 0.0, -50.0), (0.1, 0.1, 0.1), (0, 0, 0))
+    return room
+
+
+def moved(name: str, dx: float, dy: float) -> Box:
+    """A thing somewhere else on its table."""
+    box = house()[name]
+    return replace(box, center=(box.center[0] + dx, box.center[1] + dy, box.center[2]))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.create(tmp_path / "house.l3r") as opened:
+        with opened.transaction():
+            opened.set_value("scale_kind", "metric")
+            opened.set_value("gravity", "known")
+        yield opened
+
+
+def film(store: Store, room: Mapping[str, Box], visits: list[tuple[int, float]], *, checked: bool = False) -> None:
+    """One session: a chunk for each (table, angle), each taken in by itself, then its end."""
+    with store.transaction():
+        session = store.add_session("simulated", f"{len(store.sessions())}", {}, FRAMES * len(visits))
+    for index, (table, angle) in enumerate(visits):
+        poses = cameras((APART_M * table, 0.0, 0.75), angle)
+        with store.transaction():
+            chunk_id = store.add_chunk(session, simulated_chunk(room, poses, index))
+            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            consolidate(store, chunk_id, GROW)
+        if checked:
+            check(store, chunk_id)
+    with store.transaction():
+        consolidate(store, settings=GROW)
+        store.complete_session(session)
+    check(store, None)
+
+
+def everything(store: Store) -> dict[str, object]:
+    """All that consolidation writes, and what has changed between sessions."""
+    events = store._rows("SELECT * FROM events ORDER BY session_id, instance")
+    return {**tables(store), "events": events, "tale": store.get_value("tale")}
+
+
+class _Undone(Exception):
+    """What was derived as a whole is only looked at."""
+
+
+def check(store: Store, chunk_id: int | None) -> None:
+    """What has grown is what is derived as a whole, while a session comes in or after its end."""
+    grown, boxes = everything(store), [i.aabb for i in store.instances()]
+    with pytest.raises(_Undone), store.transaction():
+        store.forget_library()
+        consolidate(store, chunk_id, GROW)
+        whole, others = everything(store), [i.aabb for i in store.instances()]
+        raise _Undone
+    for name, rows in whole.items():
+        assert grown[name] == rows, name
+    assert np.allclose(boxes, others, atol=1e-9)
+    assert store.verify() == []
+
+
+@pytest.fixture
+def whole_runs(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many chunks the memory had each time it was derived as a whole."""
+    runs: list[int] = []
+    derive = consolidation._derive_whole
+
+    def watched(store, *arguments):  # type: ignore[no-untyped-def]
+        runs.append(len(store.chunks()))
+        return derive(store, *arguments)
+
+    monkeypatch.setattr(consolidation, "_derive_whole", watched)
+    return runs
+
+
+FIRST = [(n, angle) for n in range(TABLES) for angle in (0.4, 1.5)]
+LATER = {
+    "thing 10": moved("thing 10", 0.25, -0.35),
+    "thing 11": None,
+    "new": Box((9.25, 0.3, 0.83), (0.13, 0.13, 0.18), (140, 20, 160)),
+}
+
+
+def test_three_sessions_grow_to_what_is_derived_as_a_whole(store: Store) -> None:
+    film(store, house(), FIRST)
+    film(store, house(LATER), [(1, 0.9), (1, 2.2), (2, 0.8)], checked=True)
+    kinds = [e.kind for e in store.events(2)]
+    assert {"seen_again", "moved", "removed", "added"} == set(kinds)
+    states = {i.state for i in store.instances()}
+    assert states == {"present", "moved", "removed", "added", "unseen"}
+    back = {"thing 11": house()["thing 11"], "thing 32": None, "thing 10": LATER["thing 10"]}
+    film(store, house(back), [(1, 1.4), (3, 0.7), (3, 2.1), (1, 0.2)], checked=True)
+    assert {e.kind for e in store.events(3)} == {"seen_again", "removed"}
+
+
+def test_a_chunk_of_a_later_session_is_not_derived_as_a_whole(store: Store, whole_runs: list[int]) -> None:
+    film(store, house(), FIRST)
+    del whole_runs[:]
+    with store.transaction():
+        session = store.add_session("simulated", "later", {}, 1)
+        chunk_id = store.add_chunk(session, simulated_chunk(house(LATER), cameras((APART_M, 0.0, 0.75), 0.9), 0))
+        store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+        consolidate(store, chunk_id, GROW)
+        assert store.events() == []
+        consolidate(store, settings=GROW)
+    assert {"moved", "removed", "added"} < {e.kind for e in store.events(session)}
+    assert whole_runs == []
+
+
+def test_an_edit_in_a_memory_of_two_sessions_tells_the_changes_again(store: Store, whole_runs: list[int]) -> None:
+    film(store, house(), FIRST)
+    film(store, house(LATER), [(1, 0.9), (1, 2.2)])
+    with store.transaction():
+        consolidate(store)
+    gone = next(e.instance_id for e in store.events(2) if e.kind == "moved")
+    before = everything(store)
+    del whole_runs[:]
+    entry = edits.split(store, gone, author="somebody").entry
+    assert gone not in [e.instance_id for e in store.events(2) if e.kind == "moved"]
+    edits.undo(store, entry, "somebody")
+    assert everything(store)["events"] == before["events"]
+    edits.delete(store, gone, "somebody")
+    assert not [e for e in store.events() if e.instance_id == gone]
+    assert whole_runs == []
+    check(store, None)
