@@ -39,7 +39,8 @@ from list3r.mapping import add_chunk, finish_session
 from list3r.memory.store import Store
 from list3r.queries.relations import VERTICAL
 from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
-from list3r.simulation.truth import NEXT_TO_M, footprint_gap, surface_gap
+from list3r.simulation.gaps import surface_gap
+from list3r.simulation.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
 PREDICATES = ("on", "in", "next_to")
@@ -216,8 +217,7 @@ def _close_calls(seed: int) -> set[tuple[int, int]]:
         for b in things:
             if a.id != b.id:
                 limit = float(np.clip(0.25 * (a.box().size.max() + b.box().size.max()), *NEXT_TO_M))
-                gaps = surface_gap(a, b), footprint_gap(a.box(), b.box())
-                if min(abs(limit - gap) for gap in gaps) < CLOSE_M:
+                if abs(limit - surface_gap(a, b)) < CLOSE_M:
                     close.add((a.id, b.id))
     return close
 

@@ -271,3 +271,47 @@ def test_a_ball_of_which_only_the_top_looks_out_of_a_bowl_is_in_it() -> None:
         corners = np.stack([points.min(axis=0), points.max(axis=0)])
         parts.append(Body(id, points, rgb, fit_box(points, upright=True), corners, None, None))
     assert (3, "in", 2) in facts(parts)
+
+
+def sofa() -> list[Piece]:
+    return [
+        Piece("seat", (0, 0, 0.3), (1.4, 0.85, 0.26), points=1500),
+        Piece("back", (0, -0.32, 0.6), (1.8, 0.22, 0.4), points=900),
+        *(Piece("arm", (x, 0, 0.4), (0.18, 0.85, 0.4), points=700) for x in (-0.81, 0.81)),
+    ]
+
+
+@pytest.mark.parametrize("x", [-0.5, 0.0, 0.45])
+def test_a_cushion_between_the_arms_of_a_sofa_is_on_it(x: float) -> None:
+    cushion = body(3, Piece("cushion", (x, -0.1, 0.61), (0.42, 0.16, 0.36), points=600))
+    found = facts([body(1, FLOOR, structure="floor"), body(2, *sofa(), view=np.pi / 2), cushion])
+    assert (3, "on", 2) in found and (3, "in", 2) not in found
+
+
+def test_a_ball_on_a_flat_box_is_not_in_it() -> None:
+    ball = body(3, Piece("ball", (0, 0, 0.26), (0.12, 0.12, 0.12), round=True, points=400))
+    found = facts([body(2, Piece("carton", (0, 0, 0.1), (0.25, 0.25, 0.2), points=900)), ball])
+    assert (3, "on", 2) in found and (3, "in", 2) not in found
+
+
+def gap_of(*bodies: Body) -> float:
+    """The gap that `near` was said with."""
+    limit = float(np.clip(0.25 * (bodies[0].size + bodies[1].size), 0.15, 0.4))
+    return limit - next(r.margin for r in relations(list(bodies), gravity_known=True) if r.predicate == "near")
+
+
+@pytest.mark.parametrize("points", [150, 600, 4000])
+def test_a_gap_does_not_depend_on_how_densely_the_surfaces_were_seen(points: int) -> None:
+    left = body(2, Piece("left", (0, 0, 0.2), (0.4, 0.4, 0.4), points=points), view=0.6)
+    right = body(3, Piece("right", (0.6, 0, 0.2), (0.4, 0.4, 0.4), points=points), view=0.6)
+    assert gap_of(left, right) == pytest.approx(0.2, abs=0.02)
+
+
+def test_readings_amidst_the_edge_between_two_things_do_not_bring_them_nearer() -> None:
+    left = body(2, Piece("left", (0, 0, 0.1), (0.2, 0.2, 0.2), points=600))
+    right = body(3, Piece("right", (0.32, 0, 0.1), (0.2, 0.2, 0.2), points=600))
+    stray = np.column_stack([np.linspace(0.12, 0.2, 4), np.zeros(4), np.linspace(0.05, 0.2, 4)])
+    points = np.concatenate([left.points, stray])
+    rgb = np.tile(np.uint8([200, 200, 200]), (len(points), 1))
+    frayed = Body(2, points, rgb, left.box, left.aabb, None)
+    assert gap_of(frayed, right) == pytest.approx(gap_of(left, right), abs=0.005)

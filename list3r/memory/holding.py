@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -170,24 +172,36 @@ def _held_inside(scene: Scene, a: int, b: int) -> Sure | None:
     subject, holder = scene.bodies[a], scene.bodies[b]
     local = (subject.points - holder.box.center) @ holder.box.rotation
     inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
-    share, uneven = _sides_round(scene, a, b)
+    sides = _sides_round(scene, a, b)
     width = float(np.min(subject.box.size[:2]))
     if inside >= scene.s.inside:
-        if share >= scene.s.enclosed and _rests_on(scene, a, b):
-            return inside * min(1.0, 0.5 + share / 2), (share - scene.s.enclosed) * width
-        covered = _between_boards(scene, a, b, walled=share > 0.5)
+        enclosed = np.radians(scene.s.enclosed_deg)
+        if sides.open_rad <= enclosed and _rests_on(scene, a, b):
+            return inside * (1.0 - sides.open_rad / (4 * np.pi)), 0.5 * (enclosed - sides.open_rad) * width
+        covered = _between_boards(scene, a, b, walled=sides.open_rad < np.pi)
         if covered is not None:
             return 0.9 * inside, covered
-    if share < scene.s.around and inside >= scene.s.half_inside:
-        share, uneven = _sides_round(scene, a, b, sunk=True)
-    if share >= scene.s.around and uneven < scene.s.uneven and _down_in(scene, a, b):
-        return 0.5 + 0.5 * min(share, 0.8), (share - scene.s.around) * width
+    if sides.share < scene.s.around and _is_hollow(scene, b):
+        sides = _sides_round(scene, a, b, sunk=True)
+    if sides.share >= scene.s.around and sides.uneven < scene.s.uneven and _down_in(scene, a, b):
+        return 0.5 + 0.5 * min(sides.share, 0.8), (sides.share - scene.s.around) * width
     return None
 
 
-def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> tuple[float, float]:
-    """Share of the directions round a in which b has a surface at a's height, above a's lowest part; and how far they
-    are from being equally far away, as the deviation of their distances over the mean.
+@dataclass(frozen=True)
+class _Sides:
+    """Where round a thing its holder has a surface."""
+
+    share: float
+    """Share of the directions in which there is one."""
+    uneven: float
+    """How far they are from being equally far away: the deviation of their distances over the mean."""
+    open_rad: float
+    """The widest angle without any. One flat side leaves at least a half circle."""
+
+
+def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> _Sides:
+    """b's surfaces round a at a's height, above a's lowest part.
 
     Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too, of which
     the farthest are the rim.
@@ -201,12 +215,33 @@ def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> tuple[f
     away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
     away = away[np.linalg.norm(away, axis=1) > 0.25 * float(np.min(subject.box.size[:2]))]
     if len(away) == 0:
-        return 0.0, np.inf
-    sector = np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 12).astype(int) % 12
+        return _Sides(0.0, np.inf, 2 * np.pi)
+    angle = np.sort(np.arctan2(away[:, 1], away[:, 0]) % (2 * np.pi))
+    sector = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0 * 12).astype(int) % 12
     distance = np.linalg.norm(away, axis=1)
     side = np.max if sunk else np.min
-    away = np.array([side(distance[sector == n]) for n in np.unique(sector)])
-    return len(away) / 12, float(away.std() / away.mean())
+    reach = np.array([side(distance[sector == n]) for n in np.unique(sector)])
+    opening = float(np.max(np.diff(angle, append=angle[0] + 2 * np.pi)))
+    return _Sides(len(reach) / 12, float(reach.std() / reach.mean()), opening)
+
+
+def _is_hollow(scene: Scene, b: int) -> bool:
+    """Whether b is seen to be open above: over its middle most of its surface lies below its rim."""
+    seen = _within(scene, b)
+    return seen is not None and seen >= scene.s.hollow
+
+
+def _within(scene: Scene, b: int) -> float | None:
+    """Share of the surface over the middle of b that lies well below its rim; None where hardly any is seen."""
+    holder = scene.bodies[b]
+    aside = np.abs((holder.points - holder.box.center) @ holder.box.rotation)[:, :2]
+    z = holder.points[np.all(aside < 0.3 * holder.box.size[:2], axis=1), 2]
+    depth = max(2.0 * scene.s.noise_m * scene.unit, 0.25 * float(holder.box.size[2]))
+    return float((z < _rim(scene, b) - depth).mean()) if len(z) >= 10 else None
+
+
+def _rim(scene: Scene, b: int) -> float:
+    return float(np.quantile(scene.bodies[b].points[:, 2], 0.97))
 
 
 def _rests_on(scene: Scene, a: int, b: int) -> bool:
@@ -236,13 +271,14 @@ def _between_boards(scene: Scene, a: int, b: int, *, walled: bool) -> float | No
 def _down_in(scene: Scene, a: int, b: int) -> bool:
     """Whether a sits below the rim of an open container not much wider than it, over the container's middle."""
     subject, holder = scene.bodies[a], scene.bodies[b]
-    width, noise = float(np.max(subject.box.size[:2])), 2.0 * scene.s.noise_m * scene.unit
+    width, noise = float(np.max(subject.box.size[:2])), scene.s.noise_m * scene.unit
     footprints = float(np.prod(subject.box.size[:2])) / max(float(np.prod(holder.box.size[:2])), 1e-12)
     wide = float(np.max(holder.box.size[:2])) > scene.s.most_wider * width
     if wide or footprints > 0.8 or holder.size > scene.s.open_m * scene.unit:
         return False
-    rim, bottom = float(np.quantile(holder.points[:, 2], 0.97)), float(np.quantile(subject.points[:, 2], 0.03))
-    if bottom > rim - max(noise, 0.25 * float(subject.box.size[2])) or bottom < scene.low[b, 2] - noise:
+    seen, bottom = _within(scene, b), float(np.quantile(subject.points[:, 2], 0.03))
+    deep = bottom <= _rim(scene, b) - max(noise, 0.25 * float(subject.box.size[2]))
+    if not deep or bottom < scene.low[b, 2] - 2.0 * noise or (seen is not None and seen < scene.s.hollow):
         return False
     outside, _ = hull_under(subject.points[:, :2].mean(axis=0), holder.points[:, :2])
     return outside <= 0.25 * width

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from list3r.memory.bodies import Body, neighbours_of
@@ -33,12 +34,12 @@ class RelationSettings:
     """And nearer than this."""
     least_base: float = 0.25
     """Least area of the surface under a thing over the thing's own footprint: a floor does not stand on table legs."""
-    enclosed: float = 0.8
-    """Share of directions round a thing in which a container has a side: more than the back and arms of a sofa."""
+    enclosed_deg: float = 75.0
+    """A container goes round a thing but for at most this: the back and arms of a sofa leave more."""
     inside: float = 0.8
     """Share of a thing's points inside its container's box."""
-    half_inside: float = 0.6
-    """The same for what stands out of an open container, of which mostly the upper part is seen."""
+    hollow: float = 0.5
+    """Share of the surface over the middle of an open container that lies well below its rim, where it is seen."""
     overhead: float = 0.4
     """Share of a thing's points that have something over them, to be under it."""
     most_wider: float = 3.0
@@ -58,9 +59,9 @@ class RelationSettings:
     """Gap between surfaces: half the mean size of the two, within these."""
     near_m: tuple[float, float] = (0.15, 0.4)
     """The same for near."""
-    hidden_side_m: float = 0.08
-    """Sides that face each other are hidden from the camera, so a measured gap is too large by up to half the width of
-    the smaller thing, and at most by this."""
+    grain: float = 0.5
+    """The nearest points of two surfaces lie further apart than the surfaces, by about this share of the spacing of the
+    coarser one's points."""
     attached_m: float = 0.05
 
 
@@ -99,6 +100,7 @@ class Scene:
         self.s = settings
         self._trees: dict[int, cKDTree] = {}
         self._plans: dict[int, Plan] = {}
+        self._grains: dict[int, tuple[float, float]] = {}
         low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
         high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
         gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
@@ -123,9 +125,22 @@ class Scene:
         """A measure of two bodies, from memory where it is known."""
         return self._measured.get(what, self.bodies[a], self.bodies[b], lambda: compute(self, a, b))
 
+    def touch(self, a: int, b: int) -> float:
+        """Distance of a few hundred points of the smaller body to the nearest of the other."""
+        return self.measure("touch", min(a, b), max(a, b), _touch)
+
     def gap(self, a: int, b: int) -> float:
-        """Distance between surfaces: of the nearest support points."""
+        """Distance between surfaces."""
         return self.measure("gap", min(a, b), max(a, b), _gap)
+
+    def grain(self, n: int) -> tuple[float, float]:
+        """Typical distance of a body's points from the nearest other, and from the fourth."""
+        if n not in self._grains:
+            points = self.bodies[n].points
+            count = min(_COMPANY + 1, len(points))
+            away = neighbours_of(points[:: max(1, len(points) // 100)], self.tree(n), count)[0]
+            self._grains[n] = float(np.median(away[:, min(1, count - 1)])), float(np.median(away[:, -1]))
+        return self._grains[n]
 
     def plan(self, n: int) -> Plan:
         """A body as it is seen from above."""
@@ -136,11 +151,40 @@ class Scene:
         return self._plans[n]
 
 
-def _gap(scene: Scene, a: int, b: int) -> float:
+def _touch(scene: Scene, a: int, b: int) -> float:
     small, large = sorted((a, b), key=lambda n: (len(scene.bodies[n].points), n))
     return float(neighbours_of(scene.plan(small).points, scene.tree(large))[0].min())
 
 
+def _gap(scene: Scene, a: int, b: int) -> float:
+    """Of the nearest points that keep company; a reading amidst the edge between two things is no surface."""
+    small, large = sorted((a, b), key=lambda n: (len(scene.bodies[n].points), n))
+    points, tree = scene.bodies[small].points, scene.tree(large)
+    near = _nearest(points, tree)
+    away, at = neighbours_of(points[near], tree, min(_COMPANY, tree.n))
+    keeps = _in_company(scene, small, near)[:, None] & _in_company(scene, large, at.ravel()).reshape(at.shape)
+    gap = float(away[keeps].min() if keeps.any() else away.min())
+    return max(0.0, gap - scene.s.grain * max(scene.grain(a)[0], scene.grain(b)[0]))
+
+
+def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
+    """Positions of the few dozen points that are nearest to those of a tree; looks first where its box is near."""
+    at_least = np.linalg.norm(np.maximum(0.0, np.maximum(tree.mins - points, points - tree.maxes)), axis=1)
+    order = np.argsort(at_least, kind="stable")
+    away = np.sort(neighbours_of(points[order[: 2 * _NEAR]], tree)[0][:, 0])
+    asked = order[at_least[order] <= away[min(_NEAR, len(away)) - 1]]
+    found = neighbours_of(points[asked], tree)[0][:, 0]
+    return np.asarray(asked[np.argsort(found, kind="stable")[:_NEAR]])
+
+
+def _in_company(scene: Scene, n: int, at: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether points of a body have others about them as is usual for it."""
+    tree = scene.tree(n)
+    away = neighbours_of(scene.bodies[n].points[at], tree, min(_COMPANY + 1, tree.n))[0][:, -1]
+    return np.asarray(away <= 2.0 * scene.grain(n)[1])
+
+
+_COMPANY, _NEAR = 4, 32
 _SAMPLE = 200
 """Points that stand for a body where its outline matters, not its detail."""
 
@@ -161,7 +205,7 @@ def wall_touched(scene: Scene, a: int) -> tuple[float, int] | None:
     """The wall that a thing touches: (gap, position), the nearest one."""
     limit = scene.s.attached_m * scene.unit
     walls = [
-        (scene.gap(a, b), b)
+        (scene.touch(a, b), b)
         for b, other in enumerate(scene.bodies)
         if other.structure in ("wall", "plane") and scene.box_gap[a, b] < limit
     ]

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from list3r.memory.bodies import Body, neighbours_of
-from list3r.memory.geometry import OrientedBox
 from list3r.memory.holding import containments, on_hidden_feet, supports
 from list3r.memory.records import Relation
 from list3r.memory.relation_scene import Measured, RelationSettings, Scene, certainty, wall_touched
@@ -33,6 +32,8 @@ INVERSE = {
 }
 """The inverse of each predicate that has one; `under` and `attached_to` have none."""
 PREDICATES = (*INVERSE, "under", "attached_to")
+_SLACK_M = 0.08
+"""Boxes leave out strays and surfaces lie nearer than their points, so boxes are looked at that are this much apart."""
 
 
 def relations(
@@ -144,38 +145,19 @@ def _beside(scene: Scene, holding: set[tuple[int, int]], gravity_known: bool) ->
     mean = 0.5 * (scene.size[:, None] + scene.size[None])
     close = np.clip(0.5 * mean, s.next_to_m[0] * unit, s.next_to_m[1] * unit)
     reach = np.maximum(np.clip(0.5 * mean, s.near_m[0] * unit, s.near_m[1] * unit), close)
-    in_reach = scene.box_gap <= reach + s.hidden_side_m * unit
+    in_reach = scene.box_gap <= reach + _SLACK_M * unit
     pairs = np.triu(scene.thing[:, None] & scene.thing[None] & in_reach, 1)
     out: list[Relation] = []
     for a, b in np.argwhere(pairs).tolist():
         if (a, b) in holding:
             continue
-        gap, near, beside = _apart(scene, a, b), float(reach[a, b]), float(close[a, b])
+        gap, near, beside = scene.gap(a, b), float(reach[a, b]), float(close[a, b])
         if gap > near:
             continue
         out += _both(scene.bodies, a, "near", b, certainty(near - gap, noise), near - gap)
         if gap <= beside and (not gravity_known or _side_by_side(scene, a, b)):
             out += _both(scene.bodies, a, "next_to", b, certainty(beside - gap, noise), beside - gap)
     return out
-
-
-def _apart(scene: Scene, a: int, b: int) -> float:
-    """Gap between two things: of the seen surfaces less what the hidden sides may fill of it, which cannot be more
-    than what is between their boxes.
-    """
-    seen = scene.gap(a, b)
-    width = min(float(np.min(scene.bodies[n].box.size[:2])) for n in (a, b))
-    hidden = min(0.5 * width, scene.s.hidden_side_m * scene.unit)
-    return min(seen, max(seen - hidden, _box_gap(scene.bodies[a].box, scene.bodies[b].box)))
-
-
-def _box_gap(a: OrientedBox, b: OrientedBox) -> float:
-    """Distance between two oriented boxes, from below: the longest separation along the axes of either."""
-    p, q = a.corners(), b.corners()
-    axes = np.concatenate([a.rotation.T, b.rotation.T])
-    along, across = p @ axes.T, q @ axes.T
-    gap = np.maximum(across.min(axis=0) - along.max(axis=0), along.min(axis=0) - across.max(axis=0))
-    return float(max(0.0, gap.max()))
 
 
 def _side_by_side(scene: Scene, a: int, b: int) -> bool:

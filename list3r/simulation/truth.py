@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
+from list3r.simulation.gaps import surface_gap
 from list3r.simulation.things import Thing
 from list3r.simulation.world import World
 
@@ -101,15 +102,6 @@ def _side_by_side(a: Thing, b: Thing) -> bool:
         return False
     limit = float(np.clip(0.25 * (one.size.max() + two.size.max()), *NEXT_TO_M))
     return footprint_gap(one, two) <= limit and surface_gap(a, b) <= limit
-
-
-def surface_gap(a: Thing, b: Thing) -> float:
-    """Distance between two things, metres, from the boxes of their parts: a chair under a table does not touch it."""
-    return min(
-        float(np.hypot(footprint_gap(p, q), max(abs(p.center[2] - q.center[2]) - (p.size[2] + q.size[2]) / 2, 0.0)))
-        for p in a.part_boxes()
-        for q in b.part_boxes()
-    )
 
 
 def footprint_gap(a: OrientedBox, b: OrientedBox) -> float:
