@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -21,11 +22,18 @@ _SILENT_ON_DISTORTION = ("images", "video")
 
 
 def with_camera(
-    store: Store, session: int, source: str | Path, options: SourceOptions, model: str, info: SourceInfo
+    store: Store,
+    session: int,
+    source: str | Path,
+    options: SourceOptions,
+    model: str,
+    info: SourceInfo,
+    look: Callable[[str, int, int], None] | None = None,
 ) -> SourceOptions:
     """The options with the camera that was estimated for a session, for models that leave that to a stage of its own.
 
     It is estimated where intrinsics or distortion are unknown, once: an interrupted session goes on with the same.
+    `look` hears ("camera", windows of the video done, in all).
     """
     module = entry(model).calibration
     told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
@@ -34,7 +42,9 @@ def with_camera(
     known = store.get_value(_name(session))
     if known is None:
         with threadpool_limits(1):
-            found = import_module(f"list3r.reconstruction.{module}").calibrate(open_source(source, options))
+            progress = None if look is None else (lambda done, total: look("camera", done, total))
+            calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
+            found = calibrate(open_source(source, options), progress=progress)
         known = {"notes": list(found.notes), **_as_stored(found.camera, source, options)}
         with store.transaction():
             store.set_value(_name(session), known)

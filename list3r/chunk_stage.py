@@ -15,6 +15,7 @@ import numpy as np
 
 from list3r.association.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
+from list3r.frames.borrowing import Repeat, borrow
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
@@ -22,7 +23,7 @@ from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.registry import make_discoverer, make_tracker
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
-from list3r.memory.errors import TrackingError
+from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.reconstruction.base import Reconstruction, Reconstructor
@@ -71,6 +72,8 @@ class ChunkTask:
     settings: BuildSettings
     debug_dir: str | None = None
     """Folder for overlays, or None."""
+    shot: tuple[int, int] | None = None
+    """Positions [start, stop) of the shot that the chunk lies in, from which it may borrow frames; None for none."""
 
 
 def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
@@ -96,7 +99,7 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     try:
         if not frames:
             raise TrackingError("no frame of the chunk could be decoded")
-        parts = _reconstructed(task, source, frames, camera)
+        used, parts, repeats = _reconstructed(task, source, frames, camera)
     except TrackingError as error:
         return (replace(_without_geometry(task, frames, camera, bad, clock.seconds), lost_reason=str(error)),)
     clock.mark("reconstruction")
@@ -104,7 +107,8 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     for number, part in enumerate(parts, start=1):
         here = set(part.frame_indices.tolist())
         last = number == len(parts)
-        made = _described(task, [f for f in frames if f.index in here], part, bad if last else (), clock, discoverer)
+        made = _described(task, [f for f in used if f.index in here], part, bad if last else (), clock, discoverer)
+        made = _with_repeats(made, repeats)
         results.append(made if last else replace(made, index=task.span.index + number * PART_STEP))
     return tuple(results)
 
@@ -115,11 +119,50 @@ PART_STEP = 1_000_000
 
 def _reconstructed(
     task: ChunkTask, source: FrameSource, frames: Sequence[Frame], camera: Camera
-) -> Sequence[Reconstruction]:
-    """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
+) -> tuple[Sequence[Frame], Sequence[Reconstruction], Sequence[Repeat]]:
+    """The frames that were looked at, the parts that hang together, and frames that show what one of these shows.
+
+    Where the camera moves too little through the chunk frames from around it are borrowed. Raises `TrackingError`.
+    """
     model = _model(task.settings, source.info.camera is not None)
+    try:
+        return frames, _parts(model, frames, camera), ()
+    except BaselineError as error:
+        if task.shot is None:
+            raise
+        more = borrow(source, (task.span.start, task.span.stop), task.shot, frames)
+        try:
+            parts = [p for p in _parts(model, more.frames, camera) if more.own & set(p.frame_indices[p.posed].tolist())]
+        except TrackingError:
+            parts = []
+        if not parts:
+            raise error from None
+        return more.frames, parts, more.repeats
+
+
+def _parts(model: Reconstructor, frames: Sequence[Frame], camera: Camera) -> Sequence[Reconstruction]:
+    """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
     parts = getattr(model, "parts", None)
     return [model(frames, camera)] if parts is None else parts(frames, camera)
+
+
+def _with_repeats(result: ChunkResult, repeats: Sequence[Repeat]) -> ChunkResult:
+    """The result with further frames that show what one of its frames shows, where that one is."""
+    place = {index: k for k, index in enumerate(result.frame_indices.tolist())}
+    rows = [(r, place[r.shown]) for r in repeats if r.shown in place]
+    if not rows:
+        return result
+    indices = np.concatenate([result.frame_indices, [r.index for r, _ in rows]])
+    times_s = np.concatenate([result.times_s, [r.time_s for r, _ in rows]])
+    order = np.argsort(indices)
+    shown = np.concatenate([np.arange(len(place)), [k for _, k in rows]])[order]
+    return replace(
+        result,
+        frame_indices=indices[order],
+        times_s=times_s[order],
+        posed=result.posed[shown],
+        T_chunk_cam=result.T_chunk_cam[shown],
+    )
 
 
 def _described(

@@ -16,7 +16,6 @@ from list3r.frames.cuts import find_cuts
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, TrackingError
-from list3r.pipeline import check_buildable, resolve_settings, with_weights
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.precomputed_files import (
     MANIFEST,
@@ -28,6 +27,7 @@ from list3r.reconstruction.precomputed_files import (
     write_piece,
 )
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
+from list3r.session_stage import check_buildable, resolve_settings, with_weights
 
 
 @dataclass(frozen=True)

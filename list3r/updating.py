@@ -7,27 +7,21 @@ Then all chunks are placed once more and the library is derived from both sessio
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from list3r.association.joint_rgbd import RgbdJointReconstructor
 from list3r.association.session_ties import HELD
-from list3r.calibration_stage import with_camera
-from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_parts
+from list3r.calibration_stage import camera_notes
+from list3r.chunk_stage import BuildSettings
 from list3r.frames.base import SourceInfo
-from list3r.frames.chunks import ChunkSpan, plan_chunks
-from list3r.frames.cuts import find_cuts
-from list3r.frames.source import SourceOptions, check_bad_share, open_source
-from list3r.mapping import add_chunk, finish_session
+from list3r.frames.source import SourceOptions
+from list3r.mapping import finish_session
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Edge
 from list3r.memory.store import Store
-from list3r.pipeline import Progress, check_buildable, resolve_settings, usual_workers, with_weights
-from list3r.workers import OrderedPool
+from list3r.session_stage import Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare
 
 
 @dataclass(frozen=True)
@@ -68,7 +62,7 @@ def update(
     workers: int | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-    scan: Progress | None = None,
+    look: Look | None = None,
 ) -> UpdateReport:
     """Add one more video to an existing memory.
 
@@ -76,24 +70,14 @@ def update(
     was and the chunks that were finished, which `resume` goes on with.
     """
     started = time.monotonic()
-    options = options or SourceOptions()
-    info = open_source(source, options).info
-    settings = resolve_settings(settings or BuildSettings(poses="auto"), info)
-    check_buildable(info, settings)
-    settings = with_weights(settings)
-    if workers is not None and workers < 1:
-        raise OptionError(f"--workers {workers}: at least 1 process is needed")
+    job = prepare(source, options, settings, workers)
     with Store.open(memory, writable=True) as store:
-        session = _session(store, info, settings, resume=resume)
-        spans = plan_chunks(info.frame_count, settings.chunks, _cuts(store, session, source, options, settings, scan))
-        done = {c.index for c in store.chunks(session)}
-        found = with_camera(store, session, source, options, settings.reconstruction, info)
-        tasks = [ChunkTask(str(source), found, span, settings) for span in spans if span.index not in done]
+        session = _session(store, job.info, job.settings, resume=resume)
+        plan = plan_session(store, session, job, look)
+        add_chunks(store, job, plan, progress, library=False)
         with threadpool_limits(1):
-            if tasks:
-                _add_all(store, session, tasks, min(workers or usual_workers(settings), len(tasks)), info, progress)
             finish_session(store, session)
-        return _report(store, session, info, spans, done, started)
+        return _report(store, job.info, plan, started)
 
 
 def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume: bool) -> int:
@@ -122,49 +106,6 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume:
         return store.add_session(path, info.fingerprint, asdict(settings), info.frame_count)
 
 
-def _cuts(
-    store: Store,
-    session: int,
-    source: str | Path,
-    options: SourceOptions,
-    settings: BuildSettings,
-    scan: Progress | None,
-) -> tuple[int, ...]:
-    """Where the video jumps, found once; given poses know where the camera is on either side."""
-    if settings.poses == "given":
-        return ()
-    name = f"cuts {session}"
-    known = store.get_value(name)
-    if known is None:
-        known = list(find_cuts(open_source(source, options), progress=scan))
-        with store.transaction():
-            store.set_value(name, known)
-    return tuple(known)
-
-
-def _add_all(
-    store: Store, session: int, tasks: Sequence[ChunkTask], workers: int, info: SourceInfo, progress: Progress | None
-) -> None:
-    """Place the chunks in order; the library waits for the last one."""
-    joint = RgbdJointReconstructor(store, {session: tasks[0].options}, joint_model(tasks[0]))
-    bad = {index for s, index, _ in store.bad_frames() if s == session}
-    if progress is not None:
-        progress(len(store.frames(session)), info.frame_count)
-    known = {c.index for c in store.chunks(session)}
-    pool = OrderedPool(process_parts, workers)
-    try:
-        for task, results in zip(tasks, pool.map(tasks), strict=True):
-            bad.update(index for part in results for index, _ in part.bad_frames)
-            check_bad_share(len(bad), info.frame_count)
-            for part in results:
-                if part.index not in known:
-                    add_chunk(store, session, part, joint, library=False)
-            if progress is not None:
-                progress(task.span.stop, info.frame_count)
-    finally:
-        pool.stop()
-
-
 def ties(store: Store, session: int) -> list[Edge]:
     """The accepted relations between chunks of a session and chunks of the sessions before it."""
     owner = {c.chunk_id: c.session_id for c in store.chunks()}
@@ -177,9 +118,8 @@ def held(store: Store, session: int) -> int:
     return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges())
 
 
-def _report(
-    store: Store, session: int, info: SourceInfo, spans: Sequence[ChunkSpan], done: set[int], started: float
-) -> UpdateReport:
+def _report(store: Store, info: SourceInfo, plan: Plan, started: float) -> UpdateReport:
+    session = plan.session
     frames = store.frames(session)
     rows = store.chunks()
     own = [c for c in rows if c.session_id == session]
@@ -188,8 +128,6 @@ def _report(
     lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
     events = [e.kind for e in store.events(session)]
     seconds = time.monotonic() - started
-    fresh = sum(s.stop - s.start for s in spans if s.index not in done)
-    fresh -= sum(max(0, a.stop - b.start) for a, b in pairwise(spans) if b.index not in done)
     tied = ties(store, session)
     return UpdateReport(
         session=session,
@@ -204,9 +142,13 @@ def _report(
         instances=len(store.instances(structure=False)),
         events={kind: events.count(kind) for kind in ("seen_again", "moved", "removed", "added")},
         seconds=round(seconds, 2),
-        frames_per_second=round(max(0, fresh) / seconds, 2),
-        resumed_chunks=len(done),
-        notes=_notes(info, len(own), placed, held(store, session), lost, len(frames)),
+        frames_per_second=round(plan.fresh_frames() / seconds, 2),
+        resumed_chunks=len(plan.done),
+        notes=(
+            *camera_notes(store, session),
+            *_notes(info, len(own), placed, held(store, session), lost, len(frames)),
+            *lost_reasons(store, session),
+        ),
     )
 
 

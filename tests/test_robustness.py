@@ -23,11 +23,11 @@ def build_ended(walk: Path, memory: Path, end: str, *more: str) -> subprocess.Co
     """A build of the real program that is ended, by the statement `end`, as its first chunk is to be added."""
     program = f"""
 import os, signal, sys
-import list3r.pipeline
+import list3r.session_stage
 from list3r.cli import main
 def add_chunk(*_, **__):
     {end}
-list3r.pipeline.add_chunk = add_chunk
+list3r.session_stage.add_chunk = add_chunk
 sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given", "--workers", "1", *{more!r}]
 main()
 """

@@ -33,28 +33,29 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
             bar.refresh()
 
         try:
-            return build_memory(source, memory, progress=progress, scan=looking(bar, "building"), **arguments)
+            return build_memory(source, memory, progress=progress, look=looking(bar, "building"), **arguments)
         except KeyboardInterrupt:
             bar.close()
             if kept and memory.exists():
                 note(f"\ninterrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
             else:
-                note("\ninterrupted before the first chunk was finished; nothing was changed")
+                note("\ninterrupted before a chunk was finished; nothing was changed")
             raise typer.Exit(1) from None
 
 
-def looking(bar: Any, then: str) -> Callable[[int, int], None]:
-    """What moves a progress bar during the look for jumps; afterwards it begins anew under its name."""
+def looking(bar: Any, then: str) -> Callable[[str, int, int], None]:
+    """What moves a progress bar while a video is looked at before its chunks; afterwards it begins anew as `then`."""
 
-    def scan(done: int, total: int) -> None:
+    def look(what: str, done: int, total: int) -> None:
         bar.total = total
-        bar.set_description("looking for cuts", refresh=False)
+        bar.set_description(f"looking for {what}", refresh=False)
         bar.update(done - bar.n)
+        bar.refresh()
         if done == total:
             bar.set_description(then, refresh=False)
             bar.reset(total)
 
-    return scan
+    return look
 
 
 def report_lines(memory: Path, report: BuildReport) -> list[str]:

@@ -148,7 +148,7 @@ def _run(memory: Path, source: str, *, quiet: bool, **arguments: Any) -> UpdateR
             bar.refresh()
 
         try:
-            return update_memory(memory, source, progress=progress, scan=looking(bar, "updating"), **arguments)
+            return update_memory(memory, source, progress=progress, look=looking(bar, "updating"), **arguments)
         except KeyboardInterrupt:
             bar.close()
             note(f"\ninterrupted; {memory} keeps what it knew and the finished chunks: go on with --resume")

@@ -29,6 +29,10 @@ class TrackingError(List3rError):
     """A video in which the camera cannot be followed."""
 
 
+class BaselineError(TrackingError):
+    """A stretch through which the camera moves too little for depth from colour."""
+
+
 class DegenerateError(List3rError):
     """Correspondences that do not determine a transform: too few, collinear, or without extent."""
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.mvs import MvsSettings, dense_depth, stereo_noise
@@ -110,7 +110,7 @@ class SfmReconstructor:
         maps = build_maps(problem, camera, free_camera="" if self.camera_known else "focal", settings=s.mapping)
         segments = fill_segments(maps, tracks, grays, s.fill)
         if not segments:
-            raise TrackingError(f"{_span(frames)}: {_why_no_map(tracks)}")
+            raise _no_map(frames, tracks)
         return segments
 
     def _given(self, frames: Sequence[Frame], tracks: Tracks, problem: object, camera: Camera) -> Segment:
@@ -173,17 +173,20 @@ def _with_given_poses(found: SparseMap, poses: dict[int, Poses], tracks: Tracks)
 def _check_motion(frames: Sequence[Frame], tracks: Tracks, settings: SfmSettings) -> None:
     """Raise `TrackingError` for frames in which nothing can be followed or nothing moves."""
     if len(frames) < 2:
-        raise TrackingError(f"{_span(frames)}: depth from colour needs at least two frames from different places")
+        raise BaselineError(f"{_span(frames)}: depth from colour needs at least two frames from different places")
     if tracks.run.max(initial=-1) < 0:
         raise TrackingError(f"{_span(frames)}: no texture to follow; the pictures are black, blank or out of focus")
     if np.nansum(tracks.flow) < settings.least_flow:
-        raise TrackingError(f"{_span(frames)}: the camera stands still; depth from colour needs it to move")
+        raise BaselineError(f"{_span(frames)}: the camera stands still; depth from colour needs it to move")
 
 
-def _why_no_map(tracks: Tracks) -> str:
+def _no_map(frames: Sequence[Frame], tracks: Tracks) -> TrackingError:
+    """What is wrong with frames of which no map could be made."""
     if int(tracks.run.max()) > len(tracks.run) // 4:
-        return "the camera moves too fast to be followed; film slower, or take more frames"
-    return "the camera only turns, or hardly moves; depth from colour needs it to move sideways"
+        why = "the camera moves too fast to be followed; film slower, or take more frames"
+        return TrackingError(f"{_span(frames)}: {why}")
+    why = "the camera only turns, or hardly moves; depth from colour needs it to move sideways"
+    return BaselineError(f"{_span(frames)}: {why}")
 
 
 def _span(frames: Sequence[Frame]) -> str:

@@ -7,7 +7,7 @@ parallax decides how much it says. All chunks are then made with the camera that
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -61,15 +61,17 @@ class Calibration:
     """What the user should know, one sentence each."""
 
 
-def calibrate(source: FrameSource, settings: CalibrationSettings | None = None) -> Calibration:
+def calibrate(
+    source: FrameSource, settings: CalibrationSettings | None = None, progress: Progress | None = None
+) -> Calibration:
     """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given."""
     chosen = settings or CalibrationSettings()
     info = source.info
     known = info.camera is not None
     start = info.camera or guessed_camera(info)
-    found = _estimated(source, start, chosen)
+    found = _estimated(source, start, chosen, progress)
     if found is None and known:
-        found = _estimated(source, guessed_camera(info), chosen)
+        found = _estimated(source, guessed_camera(info), chosen, progress)
     if found is None:
         return _nothing(start, known)
     windows, free, k1 = found
@@ -88,14 +90,21 @@ def calibrate(source: FrameSource, settings: CalibrationSettings | None = None) 
 
 
 _Windows = list[tuple[MapProblem, SparseMap]]
+Progress = Callable[[int, int], None]
+"""Called with (windows done, in all)."""
 
 
 def _estimated(
-    source: FrameSource, start: Camera, settings: CalibrationSettings
+    source: FrameSource, start: Camera, settings: CalibrationSettings, progress: Progress | None
 ) -> tuple[_Windows, Camera, float] | None:
     """The windows that could be mapped and agree, and their camera and k1; None where they make no sense."""
-    looked = (_window(source, a, b, start, settings) for a, b in _spans(source.info.frame_count, settings))
-    windows = [w for w in looked if w is not None]
+    windows, spans = [], _spans(source.info.frame_count, settings)
+    for done, (a, b) in enumerate(spans, start=1):
+        window = _window(source, a, b, start, settings)
+        if window is not None:
+            windows.append(window)
+        if progress is not None:
+            progress(done, len(spans))
     if not windows:
         return None
     focals = np.array([found.camera.fx for _, found in windows])
