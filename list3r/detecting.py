@@ -34,6 +34,7 @@ class DetectReport:
     frames: int
     """Pictures looked at."""
     boxes: int
+    """Of any score, also those that are too unsure to name anything by themselves."""
     labels: dict[int, str]
     """What things are called now by detectors, by id."""
 
