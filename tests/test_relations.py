@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from list3r.memory.bodies import Body, fit_box
 from list3r.memory.geometry import rotation_exp
 from list3r.memory.relations import INVERSE, relations
+from list3r.memory.roundness import round_axis
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, WALL, Piece, surface
 
 LEGS = [Piece("leg", (x, y, 0.35), (0.05, 0.05, 0.7), points=150) for x in (-0.65, 0.65) for y in (-0.35, 0.35)]
@@ -315,3 +316,38 @@ def test_readings_amidst_the_edge_between_two_things_do_not_bring_them_nearer() 
     rgb = np.tile(np.uint8([200, 200, 200]), (len(points), 1))
     frayed = Body(2, points, rgb, left.box, left.aabb, None)
     assert gap_of(frayed, right) == pytest.approx(gap_of(left, right), abs=0.005)
+
+
+def front(radius: float, height: float, view: float, *, ball: bool, seed: int = 5) -> np.ndarray:
+    """What is seen of a ball, or of a pipe, about the origin from an azimuth and from above. Shape (N, 3)."""
+    rng = np.random.default_rng(seed)
+    away = rng.normal(size=(1500, 3))
+    away[:, 2] *= ball
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    seen = away[away @ np.array([np.cos(view), np.sin(view), 0.8]) > 0.15][:400]
+    points = radius * seen + rng.normal(0, 0.003, (len(seen), 3))
+    points[:, 2] += radius if ball else rng.uniform(0, height, len(seen))
+    return points
+
+
+def made_of(id: int, points: np.ndarray) -> Body:
+    rgb = np.tile(np.uint8([90, 90, 200]), (len(points), 1))
+    corners = np.stack([points.min(axis=0), points.max(axis=0)])
+    return Body(id, points, rgb, fit_box(points, upright=True), corners, None)
+
+
+@pytest.mark.parametrize("view", [0.3, 2.0, 4.5])
+def test_the_backs_of_round_things_are_told_by_their_fronts(view: float) -> None:
+    behind = np.array([-0.24 * np.cos(view), -0.24 * np.sin(view), 0.0])
+    pipe, ball = front(0.07, 0.24, view, ball=False), front(0.08, 0.0, view, ball=True) + behind
+    assert gap_of(made_of(2, pipe), made_of(3, ball)) == pytest.approx(0.24 - 0.07 - 0.08, abs=0.015)
+
+
+def test_only_what_is_round_has_an_axis() -> None:
+    for ball in (True, False):
+        found = round_axis(front(0.08, 0.2, 1.0, ball=ball) + np.array([1.0, 2.0, 3.0]), 0.015)
+        assert found is not None and np.linalg.norm(found - [1.0, 2.0]) < 0.01
+    for other in (body(3, BOX), body(4, CHAIR), body(5, TABLE, *LEGS), body(6, MAGAZINE), body(7, WALL)):
+        assert round_axis(other.points, 0.015) is None
+    assert round_axis(np.zeros((60, 3)), 0.015) is None
+    assert round_axis(np.column_stack([np.zeros((60, 2)), np.linspace(0, 1, 60)]), 0.015) is None

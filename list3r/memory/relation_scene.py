@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from list3r.memory.bodies import Body, neighbours_of
 from list3r.memory.geometry import Array
+from list3r.memory.roundness import round_axis, turned
 
 T = TypeVar("T")
 
@@ -59,9 +60,9 @@ class RelationSettings:
     """Gap between surfaces: half the mean size of the two, within these."""
     near_m: tuple[float, float] = (0.15, 0.4)
     """The same for near."""
-    grain: float = 0.5
-    """The nearest points of two surfaces lie further apart than the surfaces, by about this share of the spacing of the
-    coarser one's points."""
+    grain: float = 0.2
+    """The nearest points of two surfaces lie further apart than the surfaces, as surfaces are sampled, less what the
+    noise of the points makes up for: by this share of the spacing of the coarser one's points."""
     attached_m: float = 0.05
 
 
@@ -93,14 +94,17 @@ Sure = tuple[float, float]
 class Scene:
     """Bodies with what is derived from them once."""
 
-    def __init__(self, bodies: Sequence[Body], unit: float, settings: RelationSettings, measured: Measured) -> None:
+    def __init__(
+        self, bodies: Sequence[Body], unit: float, settings: RelationSettings, measured: Measured, *, upright: bool
+    ) -> None:
         self.bodies = bodies
+        self._upright = upright
         self._measured = measured
         self.unit = unit
         self.s = settings
         self._trees: dict[int, cKDTree] = {}
         self._plans: dict[int, Plan] = {}
-        self._grains: dict[int, tuple[float, float]] = {}
+        self._surfaces: dict[int, Surface] = {}
         low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
         high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
         gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
@@ -131,16 +135,20 @@ class Scene:
 
     def gap(self, a: int, b: int) -> float:
         """Distance between surfaces."""
-        return self.measure("gap", min(a, b), max(a, b), _gap)
+        return self.measure("upright gap" if self._upright else "gap", min(a, b), max(a, b), _gap)
 
-    def grain(self, n: int) -> tuple[float, float]:
-        """Typical distance of a body's points from the nearest other, and from the fourth."""
-        if n not in self._grains:
+    def surface(self, n: int) -> Surface:
+        """What is known of a body's surface: its points, and for what is round its hidden sides too."""
+        if n not in self._surfaces:
             points = self.bodies[n].points
-            count = min(_COMPANY + 1, len(points))
-            away = neighbours_of(points[:: max(1, len(points) // 100)], self.tree(n), count)[0]
-            self._grains[n] = float(np.median(away[:, min(1, count - 1)])), float(np.median(away[:, -1]))
-        return self._grains[n]
+            axis = self.measure("axis", n, n, _axis) if self._upright and self.thing[n] else None
+            if axis is not None:
+                points = turned(points[:: -(-len(points) // _TURNED)], axis)
+            tree = self.tree(n) if axis is None else cKDTree(points)
+            away = neighbours_of(points[:: max(1, len(points) // 100)], tree, min(_COMPANY + 1, len(points)))[0]
+            grain, company = np.median(away[:, min(1, away.shape[1] - 1)]), np.median(away[:, -1])
+            self._surfaces[n] = Surface(points, tree, float(grain), float(company))
+        return self._surfaces[n]
 
     def plan(self, n: int) -> Plan:
         """A body as it is seen from above."""
@@ -156,15 +164,18 @@ def _touch(scene: Scene, a: int, b: int) -> float:
     return float(neighbours_of(scene.plan(small).points, scene.tree(large))[0].min())
 
 
+def _axis(scene: Scene, a: int, _: int) -> Array | None:
+    return round_axis(scene.bodies[a].points, scene.s.noise_m * scene.unit)
+
+
 def _gap(scene: Scene, a: int, b: int) -> float:
     """Of the nearest points that keep company; a reading amidst the edge between two things is no surface."""
-    small, large = sorted((a, b), key=lambda n: (len(scene.bodies[n].points), n))
-    points, tree = scene.bodies[small].points, scene.tree(large)
-    near = _nearest(points, tree)
-    away, at = neighbours_of(points[near], tree, min(_COMPANY, tree.n))
-    keeps = _in_company(scene, small, near)[:, None] & _in_company(scene, large, at.ravel()).reshape(at.shape)
+    small, large = sorted((scene.surface(a), scene.surface(b)), key=lambda s: len(s.points))
+    near = _nearest(small.points, large.tree)
+    away, at = neighbours_of(small.points[near], large.tree, min(_COMPANY, large.tree.n))
+    keeps = _in_company(small, near)[:, None] & _in_company(large, at.ravel()).reshape(at.shape)
     gap = float(away[keeps].min() if keeps.any() else away.min())
-    return max(0.0, gap - scene.s.grain * max(scene.grain(a)[0], scene.grain(b)[0]))
+    return max(0.0, gap - scene.s.grain * max(small.grain, large.grain))
 
 
 def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
@@ -177,16 +188,27 @@ def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
     return np.asarray(asked[np.argsort(found, kind="stable")[:_NEAR]])
 
 
-def _in_company(scene: Scene, n: int, at: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether points of a body have others about them as is usual for it."""
-    tree = scene.tree(n)
-    away = neighbours_of(scene.bodies[n].points[at], tree, min(_COMPANY + 1, tree.n))[0][:, -1]
-    return np.asarray(away <= 2.0 * scene.grain(n)[1])
+def _in_company(surface: Surface, at: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether points of a surface have others about them as is usual for it."""
+    away = neighbours_of(surface.points[at], surface.tree, min(_COMPANY + 1, surface.tree.n))[0][:, -1]
+    return np.asarray(away <= 2.0 * surface.company)
 
 
-_COMPANY, _NEAR = 4, 32
+_COMPANY, _NEAR, _TURNED = 4, 32, 250
 _SAMPLE = 200
 """Points that stand for a body where its outline matters, not its detail."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points of a surface."""
+
+    points: Array
+    tree: cKDTree
+    grain: float
+    """Typical distance of a point from the nearest other."""
+    company: float
+    """And from the fourth."""
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def relations(
     """
     s = settings or RelationSettings()
     bodies = sorted(bodies, key=lambda b: b.id)
-    scene = Scene(bodies, unit, s, measured or Measured())
+    scene = Scene(bodies, unit, s, measured or Measured(), upright=gravity_known)
     out: list[Relation] = []
     holding: set[tuple[int, int]] = set()
     if gravity_known:
