@@ -8,6 +8,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -57,19 +58,26 @@ def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
 
 def _read_npy(data: bytes) -> NDArray[Any]:
     """An array in NumPy's format 1 or 2. Raises `ValueError` when it is not one, or its header does not fit."""
-    buffer = io.BytesIO(data)
-    version = np.lib.format.read_magic(buffer)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"an array in format {version}")
-    shape, fortran, dtype = readers[version](buffer)
+    major = int(data[6]) if len(data) > 10 and data[:6] == b"\x93NUMPY" else 0
+    start = {1: 10 + int.from_bytes(data[8:10], "little"), 2: 12 + int.from_bytes(data[8:12], "little")}.get(major, 0)
+    shape, fortran, dtype = _npy_header(data[:start])
     if dtype.kind not in "biuf" or dtype.fields is not None or any(n < 0 for n in shape):
         raise ValueError(f"an array of {dtype}")
-    start = buffer.tell()
     if math.prod(shape) * dtype.itemsize != len(data) - start:
         raise ValueError(f"{len(data) - start} bytes for an array of shape {shape}")
     flat: NDArray[Any] = np.frombuffer(bytearray(data[start:]), dtype=dtype)
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+
+
+@lru_cache(maxsize=512)
+def _npy_header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type; most arrays of a memory have one of a few headers."""
+    buffer = io.BytesIO(header)
+    version = np.lib.format.read_magic(buffer)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"an array in format {version}")
+    return readers[version](buffer)
 
 
 def pack_sim3(transform: Sim3) -> bytes:

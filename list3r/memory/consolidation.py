@@ -28,7 +28,9 @@ from list3r.memory.library_rules import (
 )
 from list3r.memory.library_things import eye_level, measured_before, thing_of
 from list3r.memory.library_verbs import Anchor
-from list3r.memory.merging import Key, MergeSettings, PairScores, merge_nodes, pair_scores
+from list3r.memory.meetings import Key, PairScores, pair_scores
+from list3r.memory.merge_settings import MergeSettings
+from list3r.memory.merging import merge_nodes
 from list3r.memory.moving import Mover, Tracks, join_movers, without_moving
 from list3r.memory.records import ChunkRow, MergeDecision, MotionTrack, Observation, Relation
 from list3r.memory.relation_scene import Measured

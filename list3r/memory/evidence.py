@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging import Key, PairScores
+from list3r.memory.meetings import Key, Meetings, Numbering, PairScores
 from list3r.memory.shapes import ChunkShapes, Ints
 
 
@@ -69,28 +69,22 @@ def weigh(
     With `wanted` only these groups are weighed, by the pairs of their chunks, and the others are left without any;
     every local instance of those chunks must be in a group.
     """
-    home = {k: np.full(len(c.local_id), -1, np.int64) for k, c in chunks.items()}
-    frames: list[set[tuple[int, int]]] = []
-    for n, group in enumerate(groups):
-        seen: set[tuple[int, int]] = set()
-        for chunk_id, local_id in group:
-            if chunk_id in home:
-                at = int(np.searchsorted(chunks[chunk_id].local_id, local_id))
-                home[chunk_id][at] = n
-                if wanted is None or n in wanted:
-                    seen.update((chunks[chunk_id].session_id, int(f)) for f in chunks[chunk_id].frames[at])
-        frames.append(seen)
-    weighed = np.ones(len(groups) + 1, dtype=bool)
-    if wanted is not None:
-        weighed[:] = False
-        weighed[list(wanted)] = True
+    numbering = Numbering(chunks)
+    home = numbering.homes(groups)
+    weighed = np.zeros(len(groups) + 1, dtype=bool)
+    weighed[list(range(len(groups)) if wanted is None else wanted)] = True
+    frames = [_frames_of(g, chunks) if weighed[n] else set() for n, g in enumerate(groups)]
+    chunk_of = np.array([k for k, _ in numbering.keys], np.int64)
+    meet = Meetings.of(pairs, numbering)
     against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
-    for (u, v), p in sorted(pairs.items()):
-        a, b = home[u][p.i], home[v][p.j]
-        for inner, outer, cover, chunk in ((a, b, p.i_on_j, v), (b, a, p.j_on_i, u)):
-            for e in np.flatnonzero((inner != outer) & weighed[inner] & (cover >= settings.swallowed)):
-                claim = (float(cover[e]), -int(outer[e]))
-                against[int(inner[e])][chunk] = max(claim, against[int(inner[e])].get(chunk, claim))
+    for inner, outer, cover in ((meet.a, meet.b, meet.a_on_b), (meet.b, meet.a, meet.b_on_a)):
+        a, b = home[inner], home[outer]
+        swallowed = np.flatnonzero((a != b) & weighed[a] & (cover >= settings.swallowed))
+        seen_by = chunk_of[outer[swallowed]].tolist()
+        rows = zip(a[swallowed].tolist(), b[swallowed].tolist(), cover[swallowed].tolist(), seen_by, strict=True)
+        for n, other, share, chunk in rows:
+            claim = (share, -other)
+            against[n][chunk] = max(claim, against[n].get(chunk, claim))
     out = []
     for n, group in enumerate(groups):
         own = {k for k, _ in group}
@@ -101,6 +95,17 @@ def weigh(
         ranked = tuple(sorted(votes, key=lambda g: (-votes[g], g)))
         out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked))
     return out
+
+
+def _frames_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes]) -> set[tuple[int, int]]:
+    """(session id, Frame.index) of the frames in which a group is seen."""
+    seen: set[tuple[int, int]] = set()
+    for chunk_id, local_id in group:
+        if chunk_id in chunks:
+            shapes = chunks[chunk_id]
+            at = int(np.searchsorted(shapes.local_id, local_id))
+            seen.update((shapes.session_id, f) for f in shapes.frames[at].tolist())
+    return seen
 
 
 def contested(

@@ -118,7 +118,7 @@ class _Growth(Writing):
         weighed = self._weigh(changed)
         contested_by = self._contest(changed)
         ids, listed, owned = self._identify(weighed)
-        self._store.put_groups((g, weighed.shown[g]) for g in weighed.evidence)
+        self._put_members(weighed.shown)
         touched = self._write(ids, listed, weighed, contested_by)
         if self._changes is not None:
             touched |= self._write_changes(groups, self._changes)

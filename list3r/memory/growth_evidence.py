@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.memory.evidence import Evidence, claim_cells, contested, weigh
 from list3r.memory.growth_region import Group, Occasion, Region
 from list3r.memory.identities import Identities, assign_ids
-from list3r.memory.merging import Key
+from list3r.memory.meetings import Key, Meetings
 from list3r.memory.settling import neighbours
 from list3r.memory.shapes import Ints
 
@@ -81,16 +81,12 @@ class Weighing(Region):
         """Groups of which a member lies on a member of one of these."""
         keys = {k for g in groups for k in g}
         pairs = self._pairs_of({k for k, _ in keys})
-        self._look_up({k for pair in pairs for k in pair})
-        out: set[Group] = set()
-        for (u, v), p in pairs.items():
-            a, b = self._shapes(u).local_id, self._shapes(v).local_id
-            most = np.maximum(p.i_on_j, p.j_on_i)
-            for e in np.flatnonzero(most >= self._s.evidence.swallowed):
-                i, j = (u, int(a[p.i[e]])), (v, int(b[p.j[e]]))
-                if i in keys or j in keys:
-                    out |= {self._home[i], self._home[j]}
-        return out
+        numbering = self._numbered(k for pair in pairs for k in pair)
+        meet, here = Meetings.of(pairs, numbering), numbering.flags(keys)
+        inside = np.maximum(meet.a_on_b, meet.b_on_a) >= self._s.evidence.swallowed
+        inside &= here[meet.a] | here[meet.b]
+        found = np.unique(np.concatenate([meet.a[inside], meet.b[inside]]))
+        return {self._home[numbering.keys[n]] for n in found}
 
     def _identify(self, weighed: Weighed) -> tuple[Identities, list[Group], dict[Key, int]]:
         """Ids of the groups that were weighed, and of those that they lie within; what they were before."""

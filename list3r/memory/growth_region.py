@@ -16,7 +16,9 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.library_rows import pack_scores, unpack_scores
 from list3r.memory.library_rules import ConsolidationSettings, World
 from list3r.memory.library_verbs import SettledRow
-from list3r.memory.merging import Edge, Key, Nodes, PairScores, form_groups, local_edges, pair_scores
+from list3r.memory.meetings import Key, Numbering, PairScores, pair_scores
+from list3r.memory.merge_nodes import Nodes
+from list3r.memory.merging import NONE, Links, form_groups, links_of
 from list3r.memory.moving import Mover, Tracks, join_movers, tied_movers, without_moving
 from list3r.memory.records import MergeDecision, MotionTrack
 from list3r.memory.settling import neighbours
@@ -26,14 +28,22 @@ from list3r.memory.summaries import Summaries
 from list3r.memory.tale import Tale
 
 Group = tuple[Key, ...]
-Edges = tuple[list[Edge], dict[tuple[Key, Key], float]]
-"""What argues for local instances of a pair of chunks being one thing, and how far they overlap."""
+_KEPT = 6000
+"""Pairs of chunks of which it is kept what argues for their local instances being one thing: a walk that stays in one
+room comes to the same pairs again. They take some 3 kB each."""
 
-_KEPT = 2000
-"""Pairs of chunks whose edges are kept: a walk that stays in one room comes to the same pairs again."""
-_edges_before: WeakKeyDictionary[
-    Store, OrderedDict[tuple[int, int], tuple[tuple[SettledRow, SettledRow], int, Edges]]
-] = WeakKeyDictionary()
+
+@dataclass(frozen=True)
+class _Pair:
+    """A pair of chunks, as long as neither of the two is settled anew."""
+
+    rows: tuple[SettledRow, SettledRow]
+    stamp: int
+    scores: PairScores
+    links: Links
+
+
+_pairs_before: WeakKeyDictionary[Store, OrderedDict[tuple[int, int], _Pair]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -74,9 +84,9 @@ class Region:
         self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
         self._word = store.constraints()
         self._placed: dict[int, Sim3] = {}
-        self._pairs: dict[tuple[int, int], PairScores] = {}
+        self._pairs: dict[tuple[int, int], _Pair] = {}
         self._paired: set[int] = set()
-        self._edges: dict[tuple[int, int], Edges] = {}
+        self._linked: tuple[frozenset[tuple[int, int]], Numbering, Links] | None = None
         self._nodes: dict[int, Nodes] = {}
         self._left: set[Key] = set()
         """Local instances that lay on, or under, one of a chunk that has moved."""
@@ -125,13 +135,43 @@ class Region:
         """Scores of all pairs of which one is among these chunks, in order."""
         wanted = set(chunks)
         missing = sorted(wanted - self._paired)
-        for pair, blob in self._store.overlaps(missing).items() if missing else ():
+        for pair in self._store.overlapping(missing) if missing else ():
             if pair not in self._pairs:
-                shapes = {k: self._shapes(k) for k in pair}
-                scores = without_moving({pair: unpack_scores(blob)}, shapes, self._motions(pair))
-                self._pairs |= across_sessions(scores, shapes, self._s.changes)
+                self._pairs[pair] = self._pair(pair)
         self._paired |= wanted
-        return {p: self._pairs[p] for p in sorted(self._pairs) if p[0] in wanted or p[1] in wanted}
+        return {p: self._pairs[p].scores for p in sorted(self._pairs) if p[0] in wanted or p[1] in wanted}
+
+    def _pair(self, pair: tuple[int, int]) -> _Pair:
+        """What is known of a pair, from the chunks before where that still holds."""
+        kept = _pairs_before.setdefault(self._store, OrderedDict())
+        rows, stamp = (self._rows[pair[0]], self._rows[pair[1]]), self._world.stamp
+        found = kept.get(pair)
+        if found is None or any(a is not b for a, b in zip(found.rows, rows, strict=True)) or found.stamp != stamp:
+            shapes = {k: self._shapes(k) for k in pair}
+            known = {pair: unpack_scores(self._store.overlap(pair))}
+            scores = across_sessions(without_moving(known, shapes, self._motions(pair)), shapes, self._s.changes)[pair]
+            u, v = (self._nodes_of(k) for k in pair)
+            found = kept[pair] = _Pair(rows, stamp, scores, links_of(u, v, scores, self._s.merging))
+        kept.move_to_end(pair)
+        while len(kept) > _KEPT:
+            kept.popitem(last=False)
+        return found
+
+    def _numbered(self, chunks: Iterable[int]) -> Numbering:
+        """The local instances of chunks, looked up."""
+        chunks = set(chunks)
+        self._look_up(chunks)
+        return Numbering({k: self._shapes(k) for k in chunks})
+
+    def _links(self, pairs: Collection[tuple[int, int]]) -> tuple[Numbering, Links]:
+        """What argues for local instances of pairs of chunks being one thing."""
+        asked = frozenset(pairs)
+        if self._linked is None or self._linked[0] != asked:
+            numbering = self._numbered(k for pair in asked for k in pair)
+            start = numbering.start
+            parts = [(start[u], start[v], self._pairs[u, v].links) for u, v in sorted(asked)]
+            self._linked = asked, numbering, Links.join(parts)
+        return self._linked[1:]
 
     def _look_up(self, chunks: Iterable[int]) -> None:
         """Read how the local instances of chunks were grouped before; new ones stand alone."""
@@ -240,35 +280,11 @@ class Region:
 
     def _across(self, keys: Collection[Key], inside: Collection[Key]) -> set[Key]:
         """Local instances outside that an edge ties to one of these."""
-        chunks = {k for k, _ in keys}
-        pairs = self._pairs_of(chunks)
-        self._look_up({k for pair in pairs for k in pair})
-        out = set()
-        for edges, _ in (self._edges_of(p) for p in pairs):
-            for e in edges:
-                for here, there in ((e.a, e.b), (e.b, e.a)):
-                    if here in keys and there not in inside:
-                        out.add(there)
-        return out
-
-    def _edges_of(self, pair: tuple[int, int]) -> Edges:
-        if pair not in self._edges:
-            self._edges[pair] = self._known_edges(pair)
-        return self._edges[pair]
-
-    def _known_edges(self, pair: tuple[int, int]) -> Edges:
-        """The same, from the chunks before where neither of the two has been settled anew since."""
-        kept = _edges_before.setdefault(self._store, OrderedDict())
-        here = (self._rows[pair[0]], self._rows[pair[1]])
-        found = kept.get(pair)
-        if found is None or found[0][0] is not here[0] or found[0][1] is not here[1] or found[1] != self._world.stamp:
-            u, v = (self._nodes_of(k) for k in pair)
-            edges = local_edges(u, v, self._pairs[pair], self._s.merging)
-            found = kept[pair] = (here, self._world.stamp, edges)
-        kept.move_to_end(pair)
-        while len(kept) > _KEPT:
-            kept.popitem(last=False)
-        return found[2]
+        numbering, links = self._links(self._pairs_of({k for k, _ in keys}))
+        here, outside = numbering.flags(keys), ~numbering.flags(inside)
+        tied = links.kind != NONE
+        found = [y[tied & here[x] & outside[y]] for x, y in ((links.a, links.b), (links.b, links.a))]
+        return {numbering.keys[n] for n in np.unique(np.concatenate(found))}
 
     def _nodes_of(self, chunk_id: int) -> Nodes:
         if chunk_id not in self._nodes:
@@ -280,22 +296,17 @@ class Region:
         if not region:
             return [], []
         chunks = sorted({k for k, _ in region})
-        edges: list[Edge] = []
-        overlap: dict[tuple[Key, Key], float] = {}
-        for pair in self._pairs_of(chunks):
-            if pair[0] in chunks and pair[1] in chunks:
-                found = self._edges_of(pair)
-                edges += [e for e in found[0] if e.a in region and e.b in region]
-                overlap |= found[1]
-        links = [((k, int(a)), (k, int(b))) for k in chunks for a, b in self._summaries[k].cannot_link]
-        nodes = Nodes.join([self._nodes_of(k) for k in chunks]).only(region)
-        found_groups, decisions = form_groups(nodes, edges, overlap, links, self._s.merging, self._word)
+        inside = set(chunks)
+        links = {p: self._pairs[p].links for p in self._pairs_of(chunks) if p[0] in inside and p[1] in inside}
+        apart = [((k, int(a)), (k, int(b))) for k in chunks for a, b in self._summaries[k].cannot_link]
+        tables = {k: self._nodes_of(k) for k in chunks}
+        found_groups, decisions = form_groups(tables, links, region, apart, self._s.merging, self._word)
         components = {k: self._rows[k].component for k in chunks}
         movers: dict[Key, Mover] = {}
         motions = self._motions(chunks) if self._moving else {}
         if motions:
             shapes, placed = {k: self._shapes(k) for k in chunks}, {k: self._pose(k) for k in chunks}
-            apart, tracks = links + self._word.pairs_apart(motions), self._tracks(chunks)
+            apart, tracks = apart + self._word.pairs_apart(motions), self._tracks(chunks)
             found_groups, movers, joins = join_movers(
                 found_groups, shapes, placed, components, apart, tracks, self._s.moving
             )

@@ -76,16 +76,17 @@ class Writing(Weighing):
         for g in recut - weighed.evidence.keys():
             found = store.observed_as(g[:1])
             fresh |= {n: g for n in found.values()}
-        keys = [k for g in weighed.evidence for k in g]
-        gone = sorted(set(store.observed_as(keys).values()) - fresh.keys() - set(of.values()))
+        before = store.observed_as([k for g in weighed.evidence for k in g])
+        gone = sorted(set(before.values()) - fresh.keys() - set(of.values()))
         was = {i.id: i for i in store.instances_of([*sorted(fresh), *gone])}
         boxes = {n: i.aabb for n, i in was.items()}
         labels = {n: i.label for n, i in was.items()} | self._said(fresh)
         self._states |= {n: self._state(was[n].state if n in was else None, g) for n, g in fresh.items()}
         for n in gone:
             store.drop_instance(n, dict(ids.aliases).get(n))
-        store.forget_observations(keys)
-        store.set_observations(Observation(n, *key) for n, g in sorted(fresh.items()) for key in g)
+        now = {key: n for n, g in fresh.items() for key in g}
+        store.forget_observations(before.keys() - now.keys())
+        store.set_observations(Observation(n, *key) for key, n in now.items() if before.get(key) != n)
         order = sorted(fresh)
         for n in order:
             thing = self._thing(n, fresh[n], was[n].structure if n in was else None)
@@ -101,6 +102,15 @@ class Writing(Weighing):
         self.written.update(order, again)
         touched = {n: self._things[n].body.aabb for n in (*order, *again)}
         return {n: around(touched.get(n), boxes.get(n)) for n in {*touched, *gone}}
+
+    def _put_members(self, shown: Mapping[Group, bool]) -> None:
+        """Write who is grouped with whom, where that was otherwise."""
+        self._store.put_members(
+            (key, g[0], show)
+            for g, show in shown.items()
+            for key in g
+            if key not in self._old or (self._old[key][0], self._old_shown[self._old[key]]) != (g[0], show)
+        )
 
     def _said(self, fresh: Mapping[int, Group]) -> dict[int, str | None]:
         """What operators called things that are written: a name goes to the group with most of what it was given to,

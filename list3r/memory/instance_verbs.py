@@ -362,9 +362,14 @@ class InstanceVerbs(EmbeddingVerbs):
 
     def observed_as(self, keys: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
         """The instances of these local instances (chunk id, local id) that belong to one."""
-        query = "SELECT instance FROM observations WHERE chunk_id = ? AND local_id = ?"
-        found = {key: self._rows(query, key) for key in keys}
-        return {key: int(rows[0][0]) for key, rows in found.items() if rows}
+        wanted, chunks = set(keys), sorted({int(k) for k, _ in keys})
+        out: dict[tuple[int, int], int] = {}
+        for start in range(0, len(chunks), _BATCH):
+            part = tuple(chunks[start : start + _BATCH])
+            marks = ",".join("?" * len(part))
+            query = f"SELECT chunk_id, local_id, instance FROM observations WHERE chunk_id IN ({marks})"
+            out |= {(k, n): i for k, n, i in self._rows(query, part) if (k, n) in wanted}
+        return out
 
     def forget_observations(self, keys: Iterable[tuple[int, int]]) -> None:
         """Forget which instances these local instances belong to."""

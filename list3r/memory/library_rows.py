@@ -15,7 +15,7 @@ from list3r.memory.describe import describe
 from list3r.memory.geometry import Sim3
 from list3r.memory.identities import Identities
 from list3r.memory.library_rules import World
-from list3r.memory.merging import Key, PairScores
+from list3r.memory.meetings import Key, PairScores
 from list3r.memory.records import Instance, MergeDecision
 from list3r.memory.store import Store
 

@@ -13,7 +13,7 @@ from list3r.memory.constraints import Key
 from list3r.memory.derive import DeriveSettings
 from list3r.memory.evidence import EvidenceSettings
 from list3r.memory.gravity import floor_height
-from list3r.memory.merging import MergeSettings
+from list3r.memory.merge_settings import MergeSettings
 from list3r.memory.moving import MovingSettings
 from list3r.memory.planes import place_planes
 from list3r.memory.records import ChunkRow

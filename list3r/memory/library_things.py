@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.memory.derive import Member, Thing, derive_mover, derive_thing
 from list3r.memory.geometry import Sim3
 from list3r.memory.library_rules import ConsolidationSettings, World
-from list3r.memory.merging import Key
+from list3r.memory.meetings import Key
 from list3r.memory.moving import Mover
 from list3r.memory.records import ChunkRow
 from list3r.memory.shapes import ChunkShapes

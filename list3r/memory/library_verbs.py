@@ -117,6 +117,20 @@ class LibraryVerbs(Connection):
                 out |= {(u, v): blob for u, v, blob in self._rows(query, part)}
         return dict(sorted(out.items()))
 
+    def overlapping(self, chunk_ids: Sequence[int]) -> list[tuple[int, int]]:
+        """Pairs of chunks (u <= v) that overlap, of which one is among these."""
+        out: set[tuple[int, int]] = set()
+        for start in range(0, len(chunk_ids), _BATCH):
+            part = tuple(int(k) for k in chunk_ids[start : start + _BATCH])
+            marks = ",".join("?" * len(part))
+            for column in ("u", "v"):
+                out.update(self._rows(f"SELECT u, v FROM overlaps WHERE {column} IN ({marks})", part))  # type: ignore[arg-type]
+        return sorted(out)
+
+    def overlap(self, pair: tuple[int, int]) -> bytes:
+        """How the local instances of one pair of chunks overlap, which must be known."""
+        return bytes(self._rows("SELECT scores FROM overlaps WHERE u = ? AND v = ?", pair)[0][0])
+
     def put_overlaps(self, overlaps: Mapping[tuple[int, int], bytes]) -> None:
         """Write how pairs of chunks overlap."""
         rows = [(u, v, blob) for (u, v), blob in overlaps.items()]
@@ -147,9 +161,13 @@ class LibraryVerbs(Connection):
 
     def put_groups(self, groups: Iterable[tuple[Sequence[Key], bool]]) -> None:
         """Write groups, each with whether it is shown; their members leave the groups that they were in."""
+        self.put_members((key, group[0], shown) for group, shown in groups for key in group)
+
+    def put_members(self, members: Iterable[tuple[Key, Key, bool]]) -> None:
+        """Write of local instances the first member of their group, and whether it is shown."""
         self._database.executemany(
             "INSERT OR REPLACE INTO members VALUES (?, ?, ?, ?, ?)",
-            [(k, n, *group[0], int(shown)) for group, shown in groups for k, n in group],
+            [(*key, *first, int(shown)) for key, first, shown in members],
         )
 
     def hidden_groups(self) -> int:

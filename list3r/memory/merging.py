@@ -4,110 +4,90 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.constraints import Constraints, Growing
 from list3r.memory.geometry import Array, Sim3
+from list3r.memory.meetings import Key, PairScores, box_iou, joined, pair_scores, score_all
+from list3r.memory.merge_nodes import Nodes
+from list3r.memory.merge_settings import MergeSettings
 from list3r.memory.records import MergeDecision
-from list3r.memory.shapes import ChunkShapes, Ints, coverage
+from list3r.memory.shapes import ChunkShapes, Ints
 
-Key = tuple[int, int]
-"""(chunk id, local id)."""
+__all__ = [
+    "Key",
+    "Links",
+    "MergeSettings",
+    "PairScores",
+    "box_iou",
+    "form_groups",
+    "links_of",
+    "merge_nodes",
+    "pair_scores",
+]
 
-
-@dataclass(frozen=True)
-class MergeSettings:
-    """What makes two local instances one thing."""
-
-    min_overlap: float = 0.3
-    """Of the less covered one, for two views of one thing."""
-    min_containment: float = 0.5
-    """Of the better covered one, for two views of one thing."""
-    part_containment: float = 0.8
-    """Of a smaller one inside a larger one, for a partial view."""
-    min_truncated: float = 0.5
-    """Share of its frames in which the image's border must cut a partial view."""
-    max_part_color: float = 22.0
-    """Between the median colours of a part and of the whole, CIE L*a*b* with lightness at half weight."""
-    min_part_size: float = 0.3
-    """Of a part that the border does not cut, over the size of the whole."""
-    min_cosine: float = 0.0
-    """Of the features; spaces without calibration only tell opposites apart."""
-    max_center_offset: float = 0.45
-    """Between the centres of two whole views of one thing that share no surface, over the diagonal of its extents."""
-    max_size_ratio: float = 2.5
-    """Of two whole views of one thing."""
-    min_shared_frames: int = 3
-    """Frames that two chunks share, before what the masks do in them counts."""
-    same_mask_iou: float = 0.5
-    """Mean IoU of the boxes in shared frames that makes up for poor overlap in space."""
-    max_whole_m: float = 1.6
-    """Diagonal up to which a view that the border does not cut is taken for whole; the far end of a larger thing is
-    hidden or out of range."""
-    max_conflicts: float = 0.25
-    """Share of the pairs across two clusters that may speak against joining them."""
-    max_angle_deg: float = 10.0
-    """Between the normals of two pieces of one plane."""
-    most_span_m: float = 20.0
-    """Along the longest edge of its box: a floor or wall that goes on beyond is continued by another one. So no thing
-    grows with the memory: its points stay dense, its box says where it is, and a new chunk touches only what is near.
-    """
+NONE, SAME, PART, PLANE = -1, 0, 1, 2
+"""What two local instances that meet may be: nothing to each other, or one thing for one of three reasons."""
+_REASON = (
+    "two views of one thing: the surfaces cover each other",
+    "a partial view: its surface lies on that of the whole",
+    "two pieces of one plane that touch",
+)
+_APART_IOU = 0.02
 
 
 @dataclass(frozen=True)
-class PairScores:
-    """E pairs of local instances that meet, of two chunks (or of one)."""
+class Links:
+    """What argues for each of M pairs of local instances that meet being one thing."""
 
-    i: Ints
-    """Position in the first chunk. Shape (E,)."""
-    j: Ints
-    """Position in the second chunk. Shape (E,)."""
-    i_on_j: Array
-    """Share of i's surface that lies on j. Shape (E,)."""
-    j_on_i: Array
-    """Share of j's surface that lies on i. Shape (E,)."""
-    shared: Ints
-    """Frames in which both are seen. Shape (E,)."""
+    a: Ints
+    """Position of the first one: in its chunk, or among the nodes. Shape (M,)."""
+    b: Ints
+    """Of the second one, which comes later. Shape (M,)."""
+    kind: NDArray[np.int8]
+    """NONE, SAME, PART or PLANE. Shape (M,)."""
+    score: Array
+    """By which those that are not NONE are taken, the largest first. Shape (M,)."""
+    low: Array
+    """Share of the less covered one's surface that lies on the other. Shape (M,)."""
+    high: Array
+    """The same of the better covered one. Shape (M,)."""
+    cosine: Array
+    """Of the features. Shape (M,)."""
     frame_iou: Array
-    """Mean IoU of their boxes in those frames. Shape (E,)."""
+    """Mean IoU of their boxes in the frames that two chunks share; NaN where they share too few. Shape (M,)."""
 
+    @staticmethod
+    def join(parts: Sequence[tuple[int, int, Links]]) -> Links:
+        """Those of many pairs of chunks, each with the numbers of the first nodes of its two chunks."""
+        sizes = [len(p.a) for _, _, p in parts]
+        starts = [np.repeat(np.array([p[n] for p in parts], np.int64), sizes) for n in (0, 1)]
+        return Links(
+            starts[0] + joined([p.a for _, _, p in parts], np.int64),
+            starts[1] + joined([p.b for _, _, p in parts], np.int64),
+            joined([p.kind for _, _, p in parts], np.int8),
+            joined([p.score for _, _, p in parts], np.float64),
+            joined([p.low for _, _, p in parts], np.float64),
+            joined([p.high for _, _, p in parts], np.float64),
+            joined([p.cosine for _, _, p in parts], np.float64),
+            joined([p.frame_iou for _, _, p in parts], np.float64),
+        )
 
-@dataclass(frozen=True)
-class _Edge:
-    a: int
-    b: int
-    score: float
-    kind: str
-    scores: dict[str, float]
+    def among(self, number: Ints) -> Links:
+        """Those of which both nodes have a new number, which is -1 for the others."""
+        a, b = number[self.a], number[self.b]
+        kept = np.flatnonzero((a >= 0) & (b >= 0))
+        rest = (getattr(self, name)[kept] for name in ("kind", "score", "low", "high", "cosine", "frame_iou"))
+        return Links(a[kept], b[kept], *rest)
 
-
-@dataclass(frozen=True)
-class Edge:
-    """A pair of local instances that argue for being one thing."""
-
-    a: Key
-    b: Key
-    score: float
-    kind: str
-    scores: dict[str, float]
-
-
-def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3) -> PairScores:
-    """Compare all local instances of two chunks; pairs whose surfaces nowhere meet are left out.
-
-    Pass the same chunk twice, with the identity, for the pairs within a chunk (i < j).
-    """
-    i_on_j = coverage(u, v, S_u_v.inverse())
-    j_on_i = coverage(v, u, S_u_v).T
-    meet = (i_on_j > 0) | (j_on_i > 0)
-    if u.chunk_id == v.chunk_id:
-        meet = np.triu(meet, 1)
-    shared, iou = _shared_frames(u, v)
-    i, j = np.nonzero(meet)
-    return PairScores(i, j, i_on_j[i, j], j_on_i[i, j], shared[i, j], iou[i, j])
+    def told(self, n: int) -> dict[str, float]:
+        """The numbers of one pair, for the log."""
+        names = {"overlap": self.low, "containment": self.high, "cosine": self.cosine, "score": self.score}
+        if not np.isnan(self.frame_iou[n]):
+            names["frame_iou"] = self.frame_iou
+        return {name: round(float(values[n]), 3) for name, values in names.items()}
 
 
 def merge_nodes(
@@ -130,215 +110,71 @@ def merge_nodes(
     """
     s = settings or MergeSettings()
     chunks = sorted(chunks, key=lambda c: c.chunk_id)
-    table = Nodes.of(chunks, S_world_chunk)
+    tables = {c.chunk_id: Nodes.of([c], S_world_chunk) for c in chunks}
     known = pairs if pairs is not None else score_all(chunks, S_world_chunk)
-    edges: list[_Edge] = []
-    overlap: dict[tuple[int, int], float] = {}
-    for (u, v), scores in sorted(known.items()):
-        if u in table.start and v in table.start:
-            edges += _edges(table, table.start[u], table.start[v], scores, overlap, s)
-    edges.sort(key=lambda e: (-e.score, e.a, e.b))
-    enemies = _enemies(table, cannot_link)
-    return _join(table, edges, overlap, enemies, s, None if word is None or not word else word.growing())
-
-
-def local_edges(
-    u: Nodes, v: Nodes, scores: PairScores, settings: MergeSettings
-) -> tuple[list[Edge], dict[tuple[Key, Key], float]]:
-    """The pairs of two chunks that argue for being one thing, and how far each pair overlaps, both ways."""
-    inside = u.keys == v.keys
-    table = u if inside else Nodes.join([u, v])
-    overlap: dict[tuple[int, int], float] = {}
-    edges = _edges(table, 0, 0 if inside else len(u.keys), scores, overlap, settings)
-    k = table.keys
-    return (
-        [Edge(k[e.a], k[e.b], e.score, e.kind, e.scores) for e in edges],
-        {(k[a], k[b]): share for (a, b), share in overlap.items()},
-    )
+    found = {
+        (u, v): links_of(tables[u], tables[v], p, s)
+        for (u, v), p in sorted(known.items())
+        if u in tables and v in tables
+    }
+    return form_groups(tables, found, None, cannot_link, s, word)
 
 
 def form_groups(
-    nodes: Nodes,
-    edges: Sequence[Edge],
-    overlap: Mapping[tuple[Key, Key], float],
+    tables: Mapping[int, Nodes],
+    links: Mapping[tuple[int, int], Links],
+    region: Collection[Key] | None,
     cannot_link: Sequence[tuple[Key, Key]],
     settings: MergeSettings,
     word: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """The same as `merge_nodes`, of these local instances alone, from edges that are known."""
-    at = {key: n for n, key in enumerate(nodes.keys)}
-    found = [_Edge(min(at[e.a], at[e.b]), max(at[e.a], at[e.b]), e.score, e.kind, e.scores) for e in edges]
-    found.sort(key=lambda e: (-e.score, e.a, e.b))
-    known: dict[tuple[int, int], float] = {}
-    for (a, b), share in overlap.items():
-        if a in at and b in at:
-            known[at[a], at[b]] = share
+    """The same as `merge_nodes`, from links of pairs of chunks that are known; of a `region` only, where one is given.
+
+    `tables` are the local instances of each chunk.
+    """
+    if not tables:
+        return [], []
+    nodes = Nodes.join([tables[k] for k in sorted(tables)])
+    start = nodes.start
+    every = Links.join([(start[u], start[v], x) for (u, v), x in links.items()])
+    if region is not None:
+        inside = np.array([k in region for k in nodes.keys], bool)
+        every = every.among(np.where(inside, np.cumsum(inside) - 1, -1))
+        nodes = nodes.only(region)
     growing = None if word is None or not word else word.growing()
-    return _join(nodes, found, known, _enemies(nodes, cannot_link), settings, growing)
-
-
-def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> dict[tuple[int, int], PairScores]:
-    """The scores of all pairs of chunks, by chunk ids (u <= v)."""
-    out = {}
-    for n, u in enumerate(chunks):
-        for v in chunks[n:]:
-            S_u_v = S_world_chunk[u.chunk_id].inverse() @ S_world_chunk[v.chunk_id]
-            out[(u.chunk_id, v.chunk_id)] = pair_scores(u, v, S_u_v)
-    return out
+    return _join(nodes, every, _enemies(nodes, cannot_link), settings, growing)
 
 
 # ---------------------------------------------------------------------------------------------- the evidence
 
 
-@dataclass(frozen=True)
-class Nodes:
-    """Local instances in one numbering, world coordinates: what merging asks about them."""
-
-    keys: list[Key]
-    start: dict[int, int]
-    center: Array
-    size: Array
-    plane: Array
-    truncated: Array
-    structure: NDArray[np.bool_]
-    feature: NDArray[np.float32]
-    tolerance: Array
-    unit: Array
-    lab: Array
-    low: Array
-    high: Array
-    """Corners of the boxes of their points, world. Shape (N, 3) each."""
-
-    @staticmethod
-    def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> Nodes:
-        keys: list[Key] = []
-        start, center, size, plane, tolerance, unit, low, high = {}, [], [], [], [], [], [], []
-        for c in chunks:
-            lower, upper = c.spans(S_world_chunk[c.chunk_id])
-            low.append(lower)
-            high.append(upper)
-            placed = S_world_chunk[c.chunk_id]
-            start[c.chunk_id] = len(keys)
-            keys += [(c.chunk_id, int(n)) for n in c.local_id]
-            center.append(placed.apply(c.center))
-            size.append(c.size * float(placed.scale))
-            normal = c.plane[:, :3] @ placed.rotation.T
-            plane.append(np.column_stack([normal, c.plane[:, 3] * float(placed.scale) - normal @ placed.translation]))
-            tolerance.append(np.full(len(c.local_id), 2.0 * c.grain * float(placed.scale)))
-            unit.append(np.full(len(c.local_id), c.unit * float(placed.scale)))
-        features = [c.feature for c in chunks if len(c.local_id)]
-        return Nodes(
-            keys,
-            start,
-            np.concatenate(center) if center else np.zeros((0, 3)),
-            np.concatenate(size) if size else np.zeros(0),
-            np.concatenate(plane) if plane else np.zeros((0, 4)),
-            np.concatenate([c.truncated for c in chunks]) if chunks else np.zeros(0),
-            np.concatenate([c.structure for c in chunks]) if chunks else np.zeros(0, bool),
-            np.concatenate(features) if features else np.zeros((0, 1), np.float32),
-            np.concatenate(tolerance) if tolerance else np.zeros(0),
-            np.concatenate(unit) if unit else np.zeros(0),
-            np.concatenate([c.lab for c in chunks]) if chunks else np.zeros((0, 3)),
-            np.concatenate(low) if low else np.zeros((0, 3)),
-            np.concatenate(high) if high else np.zeros((0, 3)),
-        )
-
-    @staticmethod
-    def join(parts: Sequence[Nodes]) -> Nodes:
-        """Those of several chunks, in the order of the chunks."""
-        start: dict[int, int] = {}
-        count = 0
-        for p in parts:
-            start |= {chunk: count + at for chunk, at in p.start.items()}
-            count += len(p.keys)
-        features = [p.feature for p in parts if len(p.keys)]
-        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
-        feature = np.concatenate(features) if features else np.zeros((0, 1), np.float32)
-        return Nodes(keys=[k for p in parts for k in p.keys], start=start, feature=feature, **joined)
-
-    def only(self, keys: Collection[Key]) -> Nodes:
-        """Some of them."""
-        at = np.array([n for n, k in enumerate(self.keys) if k in keys], np.int64)
-        chosen: dict[str, Any] = {name: getattr(self, name)[at] for name in (*_COLUMNS, "feature")}
-        return Nodes(keys=[self.keys[n] for n in at], start={}, **chosen)
-
-    def coplanar(self, a: Ints, b: Ints, angle_deg: float) -> NDArray[np.bool_]:
-        """Whether pairs of flat nodes lie in one plane; false where one is not flat."""
-        cosine = np.einsum("ij,ij->i", self.plane[a, :3], self.plane[b, :3])
-        off_b = np.abs(np.einsum("ij,ij->i", self.plane[a, :3], self.center[b]) + self.plane[a, 3])
-        off_a = np.abs(np.einsum("ij,ij->i", self.plane[b, :3], self.center[a]) + self.plane[b, 3])
-        near = np.maximum(off_a, off_b) <= 2.0 * np.maximum(self.tolerance[a], self.tolerance[b])
-        return np.asarray((cosine > np.cos(np.radians(angle_deg))) & near)
-
-
-_COLUMNS = ("center", "size", "plane", "truncated", "structure", "tolerance", "unit", "lab", "low", "high")
-
-
-def _edges(
-    t: Nodes, start_u: int, start_v: int, p: PairScores, overlap: dict[tuple[int, int], float], s: MergeSettings
-) -> list[_Edge]:
-    """The pairs that argue for being one thing. Also notes how far each pair overlaps, both ways, in `overlap`."""
-    a, b = p.i + start_u, p.j + start_v
+def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
+    """What argues for the local instances of two chunks that meet being one thing; `u` and `v` may be one chunk."""
+    a, b, inside = p.i, p.j, u.keys[:1] == v.keys[:1]
     low, high = np.minimum(p.i_on_j, p.j_on_i), np.maximum(p.i_on_j, p.j_on_i)
-    overlap.update(zip(zip(a.tolist(), b.tolist(), strict=True), low.tolist(), strict=True))
-    cosine = np.einsum("ij,ij->i", t.feature[a], t.feature[b]).astype(float)
-    compatible = cosine >= s.min_cosine
-    across = np.full(len(a), start_u != start_v)
+    cosine = np.einsum("ij,ij->i", u.feature[a], v.feature[b]).astype(float)
+    across = np.full(len(a), not inside)
     enough = (p.shared >= s.min_shared_frames) & across
-    alike = np.maximum(t.size[a], t.size[b]) < s.max_size_ratio * np.minimum(t.size[a], t.size[b])
-    one_mask, apart = enough & (p.frame_iou >= s.same_mask_iou), enough & (p.frame_iou < 0.02)
-    coplanar = t.coplanar(a, b, s.max_angle_deg)
-    both_structure, one_structure = t.structure[a] & t.structure[b], t.structure[a] ^ t.structure[b]
+    larger, smaller = np.maximum(u.size[a], v.size[b]), np.minimum(u.size[a], v.size[b])
+    alike = larger < s.max_size_ratio * smaller
+    one_mask, apart = enough & (p.frame_iou >= s.same_mask_iou), enough & (p.frame_iou < _APART_IOU)
+    coplanar = u.coplanar(a, b, s.max_angle_deg, v)
+    both_structure, one_structure = u.structure[a] & v.structure[b], u.structure[a] ^ v.structure[b]
     same = (low >= s.min_overlap) & (high >= s.min_containment) & (~one_structure | (low >= 0.5) & coplanar)
     same |= one_mask & alike & (high >= 0.2) & ~one_structure
     same &= across | (low >= s.min_containment)
-    cut = np.where(p.i_on_j >= p.j_on_i, t.truncated[a], t.truncated[b])
-    size = np.minimum(t.size[a], t.size[b]) / np.maximum(np.maximum(t.size[a], t.size[b]), 1e-12)
-    color = np.linalg.norm((t.lab[a] - t.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
+    cut = np.where(p.i_on_j >= p.j_on_i, u.truncated[a], v.truncated[b])
+    color = np.linalg.norm((u.lab[a] - v.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
     part = (high >= s.part_containment) & (color <= s.max_part_color) & ~one_structure & across
-    part &= (cut >= s.min_truncated) | (coplanar & (size >= s.min_part_size))
+    part &= (cut >= s.min_truncated) | (coplanar & (smaller / np.maximum(larger, 1e-12) >= s.min_part_size))
     piece = both_structure & coplanar & (high >= 0.05)
     base = np.sqrt(low * high)
     score = np.where(same, 0.5 + 0.5 * base, np.where(part, 0.3 + 0.2 * high, 0.2 + 0.2 * high))
     score += np.where(one_mask & alike, 0.5 * p.frame_iou, 0.0)
-    wanted = (same | part | piece) & compatible & ~(apart & ~both_structure)
-    out = []
-    for n in np.flatnonzero(wanted):
-        kind = "same" if same[n] else "part" if part[n] else "plane"
-        scores = {"overlap": low[n], "containment": high[n], "cosine": cosine[n], "score": score[n]}
-        if enough[n]:
-            scores["frame_iou"] = p.frame_iou[n]
-        rounded = {k: round(float(x), 3) for k, x in scores.items()}
-        out.append(_Edge(int(a[n]), int(b[n]), round(float(score[n]), 6), kind, rounded))
-    return out
-
-
-def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
-    """For all pairs: frames in which both are seen, and the mean IoU of their boxes there. Shape (N_u, N_v) each."""
-    shape = (len(u.local_id), len(v.local_id))
-    count, total = np.zeros(shape, np.int64), np.zeros(shape)
-    if u.session_id != v.session_id or not shape[0] or not shape[1]:
-        return count, total
-    frames_u, frames_v = np.concatenate(u.frames), np.concatenate(v.frames)
-    common = np.intersect1d(frames_u, frames_v)
-    boxes_u, boxes_v = np.concatenate(u.boxes_xyxy).astype(float), np.concatenate(v.boxes_xyxy).astype(float)
-    owner_u = np.repeat(np.arange(shape[0]), [len(f) for f in u.frames])
-    owner_v = np.repeat(np.arange(shape[1]), [len(f) for f in v.frames])
-    for frame in common:
-        at_u, at_v = np.flatnonzero(frames_u == frame), np.flatnonzero(frames_v == frame)
-        cell = np.ix_(owner_u[at_u], owner_v[at_v])
-        count[cell] += 1
-        total[cell] += box_iou(boxes_u[at_u], boxes_v[at_v])
-    return count, total / np.maximum(count, 1)
-
-
-def box_iou(a: Array, b: Array) -> Array:
-    """IoU of boxes xyxy. Shape (A, 4), (B, 4) -> (A, B)."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    inter = np.prod(np.clip(high - low, 0, None), axis=2)
-    area_a, area_b = np.prod(a[:, 2:] - a[:, :2], axis=1), np.prod(b[:, 2:] - b[:, :2], axis=1)
-    return np.asarray(inter / np.maximum(area_a[:, None] + area_b[None] - inter, 1e-9))
+    wanted = (same | part | piece) & (cosine >= s.min_cosine) & ~(apart & ~both_structure)
+    kind = np.where(wanted, np.where(same, SAME, np.where(part, PART, PLANE)), NONE).astype(np.int8)
+    frame_iou = np.where(enough, p.frame_iou, np.nan)
+    return Links(a, b, kind, np.round(score, 6).astype(np.float64), low, high, cosine, frame_iou)
 
 
 # ---------------------------------------------------------------------------------------------- the decision
@@ -354,77 +190,81 @@ def _enemies(t: Nodes, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]]
     return out
 
 
+class _Overlaps:
+    """How far pairs of nodes overlap, both ways."""
+
+    def __init__(self, links: Links, count: int) -> None:
+        code = links.a * count + links.b
+        order = np.argsort(code, kind="stable")
+        self._count, self._code, self._low = count, code[order], links.low[order]
+
+    def of(self, x: Ints, y: Ints) -> Array:
+        """Of pairs of nodes; 0 for those that do not meet. Shapes (P,) -> (P,)."""
+        if len(self._code) == 0:
+            return np.zeros(len(x))
+        code = np.minimum(x, y) * self._count + np.maximum(x, y)
+        at = np.minimum(np.searchsorted(self._code, code), len(self._code) - 1)
+        return np.asarray(np.where(self._code[at] == code, self._low[at], 0.0))
+
+
 def _join(
-    t: Nodes,
-    edges: Sequence[_Edge],
-    overlap: dict[tuple[int, int], float],
-    enemies: list[set[int]],
-    s: MergeSettings,
-    word: Growing | None = None,
+    t: Nodes, links: Links, enemies: list[set[int]], s: MergeSettings, word: Growing | None = None
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     group = list(range(len(t.keys)))
     members = {n: [n] for n in group}
     low, high = t.low.copy(), t.high.copy()
     foes = {n: set(enemies[n]) for n in group}
+    overlaps = _Overlaps(links, len(t.keys))
     decisions: list[MergeDecision] = []
     refused: set[tuple[int, int]] = set()
-    for e in edges:
-        a, b = sorted((group[e.a], group[e.b]))
-        if a == b or (a, b) in refused:
+    edges = np.flatnonzero(links.kind != NONE)
+    edges = edges[np.lexsort((links.b[edges], links.a[edges], -links.score[edges]))]
+    for n, x, y in zip(edges.tolist(), links.a[edges].tolist(), links.b[edges].tolist(), strict=True):
+        if group[x] == group[y]:
+            continue
+        a, b = sorted((group[x], group[y]))
+        if (a, b) in refused:
             continue
         against = word.objection(t.keys[a], t.keys[b]) if word is not None else ""
         span = float((np.maximum(high[a], high[b]) - np.minimum(low[a], low[b])).max())
         if not against and span > s.most_span_m * max(t.unit[a], t.unit[b]):
             against = f"together they would reach over {span:.0f} m"
-        against = against or _objection(t, members[a], members[b], foes[a], overlap, s)
-        name_a, name_b = _name(t.keys[e.a]), _name(t.keys[e.b])
+        against = against or _objection(t, members[a], members[b], foes[a], overlaps, s)
+        name_a, name_b = _name(t.keys[x]), _name(t.keys[y])
         if against:
             refused.add((a, b))
-            decisions.append(MergeDecision("refuse", name_a, name_b, e.scores, against))
+            decisions.append(MergeDecision("refuse", name_a, name_b, links.told(n), against))
             continue
-        decisions.append(MergeDecision("merge", name_a, name_b, e.scores, _REASONS[e.kind]))
+        decisions.append(MergeDecision("merge", name_a, name_b, links.told(n), _REASON[links.kind[n]]))
         if word is not None:
             word.join(t.keys[a], t.keys[b])
-        members[a] = sorted(members[a] + members.pop(b))
+        moved = members.pop(b)
+        members[a] = sorted(members[a] + moved)
         low[a], high[a] = np.minimum(low[a], low[b]), np.maximum(high[a], high[b])
         foes[a] |= foes.pop(b)
-        for n in members[a]:
-            group[n] = a
+        for m in moved:
+            group[m] = a
         refused = {pair for pair in refused if a not in pair and b not in pair}
     groups = sorted([t.keys[n] for n in ns] for ns in members.values())
     return groups, decisions
 
 
-_REASONS = {
-    "same": "two views of one thing: the surfaces cover each other",
-    "part": "a partial view: its surface lies on that of the whole",
-    "plane": "two pieces of one plane that touch",
-}
-
-
-def _objection(
-    t: Nodes,
-    a: list[int],
-    b: list[int],
-    foes_of_a: set[int],
-    overlap: dict[tuple[int, int], float],
-    s: MergeSettings,
-) -> str:
+def _objection(t: Nodes, a: list[int], b: list[int], foes_of_a: set[int], overlaps: _Overlaps, s: MergeSettings) -> str:
     """Why two groups must stay apart, or nothing."""
     seen_apart = foes_of_a.intersection(b)
     if seen_apart:
         return f"{_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
-    left, right = (x.ravel() for x in np.meshgrid(a, b, indexing="ij"))
-    whole = (t.truncated[left] < s.min_truncated) & (t.truncated[right] < s.min_truncated)
-    whole &= np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
+    one, other = (np.array(ns)[t.truncated[ns] < s.min_truncated] for ns in (a, b))
+    left, right = (x.ravel() for x in np.meshgrid(one, other, indexing="ij"))
+    whole = np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
     compared = np.flatnonzero(whole & ~t.coplanar(left, right, s.max_angle_deg))
     if len(compared) == 0:
         return ""
     x, y = left[compared], right[compared]
     smaller, larger = np.minimum(t.size[x], t.size[y]), np.maximum(t.size[x], t.size[y])
     offset = np.linalg.norm(t.center[x] - t.center[y], axis=1)
-    shared = np.array([overlap.get((min(p), max(p)), 0.0) for p in zip(x.tolist(), y.tolist(), strict=True)])
-    apart = (shared < 0.1) & (offset > s.max_center_offset * smaller) & (larger < s.max_size_ratio * smaller)
+    apart = (overlaps.of(x, y) < 0.1) & (offset > s.max_center_offset * smaller)
+    apart &= larger < s.max_size_ratio * smaller
     if apart.sum() > s.max_conflicts * len(compared):
         return f"{int(apart.sum())} of {len(compared)} pairs of whole views lie apart"
     return ""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Array, Sim3
-from list3r.memory.merging import Key, PairScores, box_iou
+from list3r.memory.meetings import Key, PairScores, box_iou
 from list3r.memory.records import MergeDecision, MotionTrack
 from list3r.memory.shapes import ChunkShapes
 

@@ -10,7 +10,7 @@ from scipy.spatial.distance import squareform
 
 from list3r.memory.constraints import Key
 from list3r.memory.geometry import Array
-from list3r.memory.merging import pair_scores
+from list3r.memory.meetings import pair_scores
 from list3r.memory.store import Store
 from list3r.memory.summaries import chunk_summaries
 

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from list3r.memory.change_records import Changes
-from list3r.memory.merging import Key
+from list3r.memory.meetings import Key
 from list3r.memory.records import ChunkRow
 from list3r.memory.store import Store
 
