@@ -7,7 +7,9 @@ which thing is told, so that the geometry and the rules are measured and not the
 measures both together). Walls and ceilings do not count, and all floors are one. A thing counts when it was seen in 12
 frames and once covered 300 pixels of 320 x 240.
 What stands half on a rug is not asked where it stands; next_to_decided leaves out pairs within 3 cm of the bound (two
-deviations of a measured gap).
+deviations of a measured gap). Every claim counts, whatever its confidence. near and attached_to (to the right wall)
+are measured beside them, and what is told when it is asked for: left, right, front and behind of things near each
+other from every 30th camera, and what is between two things.
 The same memory with gravity set to unknown must make no vertical claim.
 """
 
@@ -23,10 +25,11 @@ from typing import Any
 import cv2
 import numpy as np
 from machine import machine, write_json
+from relations_asked import asked
 from threadpoolctl import threadpool_limits
 
 from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
-from list3r.evaluation.relations import evaluate_relations
+from list3r.evaluation.relations import Triple, evaluate_relations
 from list3r.evaluation.scene import scene_relations
 from list3r.frames.chunks import plan_chunks
 from list3r.frames.source import SourceOptions, open_source
@@ -43,7 +46,8 @@ from list3r.simulation.gaps import surface_gap
 from list3r.simulation.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
-PREDICATES = ("on", "in", "next_to")
+PREDICATES = ("on", "in", "next_to", "near")
+ASKED = ("viewpoint", "between")
 CLOSE_M = 0.03
 """Pairs whose gap lies nearer to the bound of next_to than two deviations of a measured gap are close calls."""
 
@@ -61,7 +65,7 @@ def main() -> None:
             rows.append(measure(seed, words.poses, words.keep or Path(scratch)))
             print({k: v for k, v in rows[-1].items() if k not in ("wrong", "missed")})
     pooled = {}
-    for name in (*PREDICATES, "next_to_decided"):
+    for name in (*PREDICATES, "next_to_decided", "attached_to", *ASKED):
         true, claimed, correct = (sum(r[name][k] for r in rows) for k in ("true", "claimed", "correct"))
         pooled[name] = {
             "true": true,
@@ -95,9 +99,11 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
         matched = {k: one[v] for k, v in matched.items() if v in floors or not truth[v]["structure"]}
         true = [(one[s], p, one[o]) for s, p, o in _relations(walk)]
         torn = _between_rug_and_floor(seed)
-        true = [(s, p, o) for s, p, o in true if not (p == "on" and s in torn)]
-        claimed = [(s, p, o) for s, p, o in claimed if not (p == "on" and matched.get(s) in torn)]
-        errors = evaluate_relations(true, claimed, matched, PREDICATES)
+        errors = evaluate_relations(_without(true, torn), _without(claimed, torn, matched), matched, PREDICATES)
+        on_walls = {k: v for k, v in truth_of.items() if v in kept}
+        attached = evaluate_relations(_relations(walk), claimed, on_walls, ("attached_to",)).total
+        near = {(s, o) for s, p, o in true if p == "near"}
+        told_when_asked = asked(store, WalkSettings(seed=seed), matched, near)
         with store.transaction():
             store.set_value("gravity", "unknown")
         vertical = _vertical_without_gravity(store)
@@ -111,6 +117,9 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
     missed = {(s, o) for s, p, o in errors.missed if p == "next_to"} - close
     counted = {pair for pair in beside if set(pair) <= set(matched.values())}
     correct = len(counted) - len(missed)
+    row["attached_to"] = {"true": attached.true_count, "claimed": attached.estimated_count, "correct": attached.correct}
+    for name in ASKED:
+        row[name] = {k: told_when_asked[f"{name}_{k}"] for k in ("true", "claimed", "correct")}
     row["next_to_decided"] = {"true": len(counted), "claimed": correct + len(wrong), "correct": correct}
     row["wrong"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.wrong]
     row["missed"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.missed]
@@ -222,18 +231,30 @@ def _close_calls(seed: int) -> set[tuple[int, int]]:
     return close
 
 
-def _between_rug_and_floor(seed: int) -> set[int]:
-    """Things that stand with some feet on a rug and with some beside it, of which neither is the answer."""
+def _without(triples: list[Triple], torn: set[tuple[int, int]], truth_of: dict[int, int] | None = None) -> list[Triple]:
+    """The triples less what is not asked: on what things stand that are half on a rug, and whether they are near it."""
+    things = {thing for thing, _ in torn}
+    pairs = torn | {(rug, thing) for thing, rug in torn}
+    named = [(s, o) if truth_of is None else (truth_of.get(s), truth_of.get(o)) for s, _, o in triples]
+    return [
+        t
+        for t, (s, o) in zip(triples, named, strict=True)
+        if not (t[1] == "on" and s in things) and not (t[1] == "near" and (s, o) in pairs)
+    ]
+
+
+def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
+    """Things that stand with some feet on a rug and with some beside it, neither being the answer; with the rug."""
     things = WalkSettings(seed=seed).world().things
     torn = set()
-    for rug in (t.box() for t in things if t.label == "rug"):
+    for rug_id, rug in ((t.id, t.box()) for t in things if t.label == "rug"):
         for thing in things:
             feet = [b for b in thing.part_boxes() if b.center[2] - b.size[2] / 2 < 0.05]
             if thing.structure is None and thing.label != "rug" and feet:
                 away = [np.abs((b.center - rug.center) @ rug.rotation)[:2] - rug.size[:2] / 2 for b in feet]
                 over = [bool((a < 0).all()) for a in away]
                 if any(over) and not all(over):
-                    torn.add(thing.id)
+                    torn.add((thing.id, rug_id))
     return torn
 
 

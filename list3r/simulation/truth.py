@@ -14,6 +14,8 @@ from list3r.simulation.world import World
 
 NEXT_TO_M = (0.1, 0.4)
 """Things are next to each other up to half the mean of their longest edges, within these bounds, metres."""
+NEAR_M = (0.15, 0.4)
+"""The same for things that are near each other, in any direction."""
 SHARED_HEIGHT = 0.3
 """Least share of the shorter one's height that two things side by side have in common."""
 
@@ -71,10 +73,10 @@ def mover_truth(thing: Thing, T_world_object: NDArray[np.float64], seen: dict[st
 
 
 def true_relations(world: World) -> list[tuple[int, str, int]]:
-    """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `next_to` by gap, both ways.
+    """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `near` and `next_to` both ways.
 
-    `next_to` is the gap between surfaces against the size of the two, among things that share heights and of which
-    neither holds the other. Rugs are next to nothing: what touches them stands on them.
+    `near` is the gap between surfaces against the size of the two, among things of which neither holds the other;
+    `next_to` the same among those that share heights. Rugs are next to nothing: what touches them stands on them.
     """
     triples: list[tuple[int, str, int]] = []
     for thing in world.things:
@@ -84,24 +86,31 @@ def true_relations(world: World) -> list[tuple[int, str, int]]:
             triples.append((thing.id, "on", thing.support))
         if thing.attached is not None:
             triples.append((thing.id, "attached_to", thing.attached))
-    things = [t for t in world.things if t.structure is None and t.label != "rug"]
+    things = [t for t in world.things if t.structure is None]
     for k, a in enumerate(things):
         for b in things[:k]:
-            if _side_by_side(a, b):
-                triples += [(a.id, "next_to", b.id), (b.id, "next_to", a.id)]
+            for predicate in _close(a, b):
+                triples += [(a.id, predicate, b.id), (b.id, predicate, a.id)]
     return sorted(triples)
 
 
-def _side_by_side(a: Thing, b: Thing) -> bool:
+def _close(a: Thing, b: Thing) -> list[str]:
+    """Which of near and next_to two things are."""
     if a.id in (b.support, b.container) or b.id in (a.support, a.container):
-        return False
+        return []
     one, two = a.box(), b.box()
+    half = 0.25 * float(one.size.max() + two.size.max())
+    near, beside = float(np.clip(half, *NEAR_M)), float(np.clip(half, *NEXT_TO_M))
+    if footprint_gap(one, two) > near or (gap := surface_gap(a, b)) > near:
+        return []
+    rug = "rug" in (a.label, b.label)
+    return ["near", "next_to"] if gap <= beside and not rug and _share_heights(one, two) else ["near"]
+
+
+def _share_heights(one: OrientedBox, two: OrientedBox) -> bool:
     shared = min(one.center[2] + one.size[2] / 2, two.center[2] + two.size[2] / 2)
     shared -= max(one.center[2] - one.size[2] / 2, two.center[2] - two.size[2] / 2)
-    if shared < SHARED_HEIGHT * min(one.size[2], two.size[2]):
-        return False
-    limit = float(np.clip(0.25 * (one.size.max() + two.size.max()), *NEXT_TO_M))
-    return footprint_gap(one, two) <= limit and surface_gap(a, b) <= limit
+    return bool(shared >= SHARED_HEIGHT * min(one.size[2], two.size[2]))
 
 
 def footprint_gap(a: OrientedBox, b: OrientedBox) -> float:
