@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,11 @@ from list3r.memory.errors import SourceError
 _NOT_VIDEO = ("tty", "image2", "_pipe", "gif_pipe")
 _FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 _MISSING_SHARE = 0.02
+_PRIMING_S = 0.5
+"""Pictures hidden before the beginning that are no longer than this were not cut away by anyone: the clock of a phone's
+recording began later than its camera."""
+_WHOLE = {"ignore_editlist": "1"}
+"""Opens an MP4 with all of its pictures."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,8 @@ class Stamps:
     """The lens's 35 mm equivalent that phones write beside the video."""
     notes: tuple[str, ...] = ()
     _numbers: dict[int, int] = field(default_factory=dict, repr=False)
+    words: dict[str, str] = field(default_factory=dict)
+    """Options that the container is to be opened with."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -67,17 +74,27 @@ class Stamps:
 def list_stamps(path: Path) -> Stamps:
     """The clock of a video file. Raises `SourceError` for what is none."""
     try:
-        with av.open(str(path)) as container:
-            stream = picture_stream(container)
-            if stream is None or any(sign in container.format.name for sign in _NOT_VIDEO):
-                raise SourceError(_no_video(path, container))
-            found = [p for p in packets(container, stream) if p.size and not p.is_discard]
-            rows = [(p.pts, p.dts, bool(p.is_keyframe)) for p in found]
-            return _stamps(path, rows, container, stream)
+        found, hidden_s = _listed(path, {})
+        return _listed(path, _WHOLE)[0] if 0 < hidden_s <= _PRIMING_S else found
     except av.FFmpegError as error:
         headless = isinstance(error, av.InvalidDataError)
         reason = "it is none, or breaks off before its index" if headless else error.strerror
         raise SourceError(f"{path} is not a video that can be read ({reason}); is the copy complete?") from None
+
+
+def _listed(path: Path, words: dict[str, str]) -> tuple[Stamps, float]:
+    """The clock of a file, and for how many seconds before its beginning it has pictures that it does not show."""
+    with av.open(str(path), options=words) as container:
+        stream = picture_stream(container)
+        if stream is None or any(sign in container.format.name for sign in _NOT_VIDEO):
+            raise SourceError(_no_video(path, container))
+        found = [p for p in packets(container, stream) if p.size]
+        rows = [(p.pts, p.dts, bool(p.is_keyframe)) for p in found if not p.is_discard]
+        hidden = [p.pts for p in found if p.is_discard and p.pts is not None]
+        stamps = _stamps(path, rows, container, stream)
+        earlier = stamps.clock and bool(hidden) and max(hidden) < stamps.stamps[0]
+        hidden_s = float((stamps.stamps[0] - min(hidden)) * stamps.unit) if earlier else 0.0
+        return replace(stamps, words=words), hidden_s
 
 
 def picture_stream(container: Any) -> Any | None:

@@ -112,7 +112,7 @@ class VideoSource:
 
     def _decode_from(self, stamp: int | None, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame]]:
         """Frame numbers and pictures from the key frame at a stamp, or from the beginning."""
-        with av.open(str(self._path)) as container:
+        with av.open(str(self._path), options=self._stamps.words) as container:
             stream = picture_stream(container)
             assert stream is not None
             if threads:

@@ -16,6 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.sfm_turning import only_turns
 
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
 
@@ -92,7 +93,8 @@ def shared_rows(a: View, b: View) -> NDArray[np.int64]:
 def build_maps(
     problem: MapProblem, camera: Camera, *, free_camera: str = "", settings: MappingSettings | None = None
 ) -> list[SparseMap]:
-    """Maps of the keyframes, the largest first; several where they cannot be joined, none where nothing has depth.
+    """Maps of the keyframes, the largest first; several where they cannot be joined, none where nothing has depth or
+    the camera only turns.
 
     `free_camera` names what of the camera is estimated as well: "" nothing, "k1" the distortion, "focal" the focal
     length and the distortion.
@@ -105,6 +107,8 @@ def build_maps(
     pycolmap.IncrementalPipeline(_options(camera, free_camera, chosen), cache, manager).run()
     maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
     maps = [m for m in maps if len(m.points) >= chosen.least_points and len(m.T_map_cam) >= 2]
+    places = {key: view.xy for key, view in problem.views.items()}
+    maps = [m for m in maps if not only_turns(places, problem.pairs, m.T_map_cam, camera)]
     return sorted(maps, key=lambda m: (-len(m.T_map_cam), min(m.T_map_cam)))
 
 
