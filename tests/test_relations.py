@@ -295,6 +295,16 @@ def test_a_ball_on_a_flat_box_is_not_in_it() -> None:
     assert (3, "on", 2) in found and (3, "in", 2) not in found
 
 
+def test_a_bowl_beside_a_box_that_was_taken_for_part_of_the_cabinet_is_on_the_cabinet() -> None:
+    cabinet = [
+        Piece("cabinet", (0, 0, 0.4), (0.9, 0.42, 0.8), points=1500),
+        Piece("box", (-0.2, 0, 0.89), (0.24, 0.3, 0.18), points=300),
+    ]
+    bowl = body(3, Piece("bowl", (0.1, 0, 0.86), (0.24, 0.24, 0.1), round=True, points=500))
+    found = facts([body(1, FLOOR, structure="floor"), body(2, *cabinet), bowl])
+    assert (3, "on", 2) in found and (3, "in", 2) not in found
+
+
 def gap_of(*bodies: Body) -> float:
     """The gap that `near` was said with."""
     limit = float(np.clip(0.25 * (bodies[0].size + bodies[1].size), 0.15, 0.4))

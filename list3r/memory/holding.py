@@ -178,7 +178,7 @@ def _held_inside(scene: Scene, a: int, b: int) -> Sure | None:
         enclosed = np.radians(scene.s.enclosed_deg)
         if sides.open_rad <= enclosed and _rests_on(scene, a, b):
             return inside * (1.0 - sides.open_rad / (4 * np.pi)), 0.5 * (enclosed - sides.open_rad) * width
-        covered = _between_boards(scene, a, b, walled=sides.open_rad < np.pi)
+        covered = _between_boards(scene, a, b, walled=sides.share > 0.5 and sides.open_rad < np.pi)
         if covered is not None:
             return 0.9 * inside, covered
     if sides.share < scene.s.around and _is_hollow(scene, b):
