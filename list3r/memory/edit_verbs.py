@@ -10,8 +10,8 @@ from typing import Any
 from list3r.memory.codec import to_json
 from list3r.memory.constraints import Constraints, Edit, Key, standing
 from list3r.memory.errors import MemoryFileError, UnknownIdError
-from list3r.memory.instance_verbs import InstanceVerbs
 from list3r.memory.records import MergeDecision
+from list3r.memory.relation_verbs import RelationVerbs
 
 EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "undo")
 
@@ -27,7 +27,7 @@ class LogEntry:
     decision: MergeDecision
 
 
-class EditVerbs(InstanceVerbs):
+class EditVerbs(RelationVerbs):
     """Reading and writing what operators said. Writing verbs are called inside `transaction()`."""
 
     @property

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from list3r.memory.chunk_verbs import LocalNode
 from list3r.memory.geometry import Array, Sim3
+from list3r.memory.local_verbs import LocalNode
 
 
 @dataclass(frozen=True)

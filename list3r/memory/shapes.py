@@ -16,9 +16,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.chunk_verbs import LocalNode
 from list3r.memory.colors import lab_from_rgb
 from list3r.memory.geometry import Array, Sim3
+from list3r.memory.local_verbs import LocalNode
 
 Ints = NDArray[np.int64]
 
@@ -214,9 +214,10 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) ->
     return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
 
 
-_KEPT = 16
+_KEPT_BYTES = 32 << 20
 _known: OrderedDict[int, tuple[ChunkShapes, Ints, NDArray[np.int32]]] = OrderedDict()
-"""The grown cells of the chunks compared last: they take more memory than all else that is kept of a chunk."""
+"""The grown cells of the chunks compared last, as many as there is room for: they take more memory than all else of a
+chunk."""
 
 
 def _grown(shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
@@ -229,9 +230,11 @@ def _grown(shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
         owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
         order = np.argsort(keys, kind="stable")
         found = _known[id(shapes)] = (shapes, keys[order], owner[order])
+        held = sum(k.nbytes + n.nbytes for _, k, n in _known.values())
+        while held > _KEPT_BYTES and len(_known) > 1:
+            _, k, n = _known.popitem(last=False)[1]
+            held -= k.nbytes + n.nbytes
     _known.move_to_end(id(shapes))
-    while len(_known) > _KEPT:
-        _known.popitem(last=False)
     return found[1], found[2]
 
 
