@@ -36,11 +36,6 @@ def pictures(tmp_path: Path) -> Path:
     return neural_scenes.write_pictures(tmp_path / "pictures", neural_scenes.film())
 
 
-def words(**given: object) -> dict[str, object]:
-    """The options of a command as they come when none is given."""
-    return {**dict.fromkeys(model_options.WORDS), "device": "auto", "licence": "research", **given}
-
-
 def arguments(tmp_path: Path, name: str, *more: str) -> list[str]:
     return [
         "build",
@@ -135,11 +130,14 @@ def test_errors_are_one_line(pictures: Path, tmp_path: Path, capsys: pytest.Capt
 
 def test_explicit_options_win_over_the_preset(pictures: Path) -> None:
     info = open_source(pictures).info
-    settings, told = model_options.build_settings(info, words(preset="cpu"), poses="auto", pictures=True)
+    cut = model_options.CutWords
+    settings, told = model_options.build_settings(
+        info, model_options.ModelWords(preset="cpu"), cut(), poses="auto", pictures=True
+    )
     assert (settings.reconstruction, settings.discovery, settings.features) == ("auto", "geometric", "geometric")
     assert told == ["note: preset cpu: no weights"] and settings.chunks == ChunkSettings()
-    asked = words(preset="cpu", discovery="eomt", chunk=50)
-    settings, told = model_options.build_settings(info, asked, poses="auto", pictures=True)
+    asked = model_options.ModelWords(preset="cpu", discovery="eomt")
+    settings, told = model_options.build_settings(info, asked, cut(chunk=50), poses="auto", pictures=True)
     assert (settings.discovery, settings.features, settings.chunks) == ("eomt", "own", ChunkSettings(50, 15))
     assert settings.instance_weights == (("discovery/eomt", "tue-mps/coco_panoptic_eomt_large_640"),)
     assert "as asked" in told[0]

@@ -11,7 +11,7 @@ import typer
 from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import report_lines, run_build
-from list3r.cli.common import JsonOption, note, print_json
+from list3r.cli.common import JsonOption, note, print_json, spread
 from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
 from list3r.cli.finishing import finish
 from list3r.cli.scale_commands import ScaleAnchor, check_anchor
@@ -24,22 +24,11 @@ def register(app: typer.Typer) -> None:
     app.command("demo")(demo)
 
 
+@spread
 def inspect(
     source: src.SourceArgument,
-    kind: src.Kind = "auto",
-    every: src.Every = 1,
-    frames: src.Frames = None,
-    intrinsics: src.Intrinsics = None,
-    distortion: src.Distortion = None,
-    depth_intrinsics: src.DepthIntrinsics = None,
-    depth_to_color: src.DepthToColor = None,
-    registered: src.Registered = False,
-    depth_scale: src.DepthScale = None,
-    fps: src.Fps = None,
-    start: src.Start = None,
-    end: src.End = None,
-    sharpest: src.Sharpest = None,
-    max_side: src.MaxSide = None,
+    *,
+    words: src.SourceWords,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the colour camera and the depth-to-colour transform.")
     ] = False,
@@ -55,7 +44,7 @@ def inspect(
     from list3r.frames.inspection import describe, draw_registration, lines
     from list3r.frames.source import open_source
 
-    options = src.source_options(**_source_words(locals()))
+    options = words.options()
     opened = open_source(source, options)
     report = describe(opened.info)
     if calibrate:
@@ -71,37 +60,17 @@ def inspect(
         print("\n".join(lines(report)))
 
 
+@spread
 def build(
     source: src.SourceArgument,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
-    reconstruction: mod.Reconstruction = None,
-    preset: mod.Preset = None,
-    discovery: mod.Discovery = None,
-    tracking: mod.Tracking = None,
-    features: mod.Features = None,
-    device: mod.Device = "auto",
-    weights: mod.WeightsWords = None,
-    local_features: mod.LocalFeatures = "sift",
-    licence: mod.LicenceProfile = "research",
+    *,
+    models: mod.ModelWords,
     poses: Annotated[
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
     ] = "auto",
-    kind: src.Kind = "auto",
-    every: src.Every = 1,
-    frames: src.Frames = None,
-    intrinsics: src.Intrinsics = None,
-    distortion: src.Distortion = None,
-    depth_intrinsics: src.DepthIntrinsics = None,
-    depth_to_color: src.DepthToColor = None,
-    registered: src.Registered = False,
-    depth_scale: src.DepthScale = None,
-    fps: src.Fps = None,
-    start: src.Start = None,
-    end: src.End = None,
-    sharpest: src.Sharpest = None,
-    max_side: src.MaxSide = None,
-    chunk: mod.Chunk = None,
-    overlap: mod.Overlap = None,
+    words: src.SourceWords,
+    cut: mod.CutWords,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
@@ -120,15 +89,14 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    words = {name: value for name, value in locals().items() if name in mod.WORDS}
-    options = src.source_options(**_source_words(locals()))
+    options = words.options()
     from list3r.frames.source import open_source
 
     check_anchor(scale_anchor)
     check_detector(detector, detector_classes)
     info = open_source(source, options).info
     resumed = memory if resume and not force else None
-    settings, told = mod.build_settings(info, words, poses=poses, pictures=pictures, resumed=resumed)
+    settings, told = mod.build_settings(info, models, cut, poses=poses, pictures=pictures, resumed=resumed)
     if not json:
         for line in (*(f"note: {n}" for n in info.notes), *told):
             note(line)
@@ -163,23 +131,3 @@ def demo(
     report = run_demo(out, seed=seed, frames=frames, workers=workers, quiet=json)
     if json:
         print_json(report)
-
-
-def _source_words(words: dict[str, Any]) -> dict[str, Any]:
-    names = (
-        "kind",
-        "every",
-        "frames",
-        "intrinsics",
-        "distortion",
-        "depth_intrinsics",
-        "depth_to_color",
-        "registered",
-        "depth_scale",
-        "fps",
-        "start",
-        "end",
-        "sharpest",
-        "max_side",
-    )
-    return {name: words[name] for name in names}

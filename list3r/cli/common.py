@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextvars import ContextVar
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -65,6 +66,33 @@ def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
     asked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
     asked.__annotations__ = {**get_type_hints(command, include_extras=True), "at": option}
     return asked
+
+
+def spread(command: Callable[..., None]) -> Callable[..., None]:
+    """The same command with one option for each field of those of its parameters that are dataclasses of options.
+
+    `words: SourceWords` in its signature stands for all fields of `SourceWords`, in that place and order.
+    """
+    signature = inspect.signature(command, eval_str=True)
+    groups: dict[str, Any] = {n: p.annotation for n, p in signature.parameters.items() if is_dataclass(p.annotation)}
+    options: list[inspect.Parameter] = []
+    for name, parameter in signature.parameters.items():
+        if name not in groups:
+            options.append(parameter)
+            continue
+        types = get_type_hints(groups[name], include_extras=True)
+        for f in fields(groups[name]):
+            kind = inspect.Parameter.KEYWORD_ONLY
+            options.append(inspect.Parameter(f.name, kind, default=f.default, annotation=types[f.name]))
+
+    @functools.wraps(command)
+    def gathered(**words: Any) -> None:
+        made = {n: group(**{f.name: words.pop(f.name) for f in fields(group)}) for n, group in groups.items()}
+        command(**words, **made)
+
+    gathered.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
+    gathered.__annotations__ = {p.name: p.annotation for p in options}
+    return gathered
 
 
 def print_json(value: object) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from list3r.cli import source_options as src
-from list3r.cli.common import JsonOption, MemoryArgument, print_json, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, print_json, print_table, spread
 
 if TYPE_CHECKING:
     from list3r.detecting import DetectReport
@@ -41,12 +41,14 @@ def register(app: typer.Typer) -> None:
     app.command("detect")(detect)
 
 
+@spread
 def detect(
     memory: MemoryArgument,
     detector: Annotated[
         Path,
         typer.Option("--detector", metavar="FILE", help="A NanoDet detector for ncnn: .param, its .bin beside."),
     ],
+    *,
     detector_classes: ClassFile = None,
     source: Annotated[
         str | None,
@@ -57,33 +59,14 @@ def detect(
             show_default=False,
         ),
     ] = None,
-    kind: src.Kind = "auto",
-    every: src.Every = 1,
-    frames: src.Frames = None,
-    intrinsics: src.Intrinsics = None,
-    distortion: src.Distortion = None,
-    depth_intrinsics: src.DepthIntrinsics = None,
-    depth_to_color: src.DepthToColor = None,
-    registered: src.Registered = False,
-    depth_scale: src.DepthScale = None,
-    fps: src.Fps = None,
-    start: src.Start = None,
-    end: src.End = None,
-    sharpest: src.Sharpest = None,
-    max_side: src.MaxSide = None,
+    words: src.SourceWords,
     json: JsonOption = False,
 ) -> None:
     """Name the things of a memory: boxes of a detector vote over many frames. What an operator named keeps its name.
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
-    words = {
-        name: value
-        for name, value in locals().items()
-        if name not in ("memory", "detector", "detector_classes", "source", "json")
-    }
-    options = src.source_options(**words)
-    report = run_detector(memory, detector, detector_classes, source, options, quiet=json)
+    report = run_detector(memory, detector, detector_classes, source, words.options(), quiet=json)
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
         return

@@ -10,7 +10,7 @@ import typer
 
 from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
-from list3r.cli.common import JsonOption, note, print_json, print_table
+from list3r.cli.common import JsonOption, note, print_json, print_table, spread
 
 if TYPE_CHECKING:
     from list3r.chunk_stage import BuildSettings
@@ -93,30 +93,15 @@ def fetch_model(
         print_json(done)
 
 
+@spread
 def precompute(
     source: src.SourceArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
-    reconstruction: mod.Reconstruction = None,
-    device: mod.Device = "auto",
-    weights: mod.WeightsWords = None,
-    licence: mod.LicenceProfile = "research",
+    *,
+    geometry: mod.GeometryWords,
     poses: Annotated[str, typer.Option("--poses", help="estimate, given or auto.")] = "auto",
-    chunk: mod.Chunk = None,
-    overlap: mod.Overlap = None,
-    kind: src.Kind = "auto",
-    every: src.Every = 1,
-    frames: src.Frames = None,
-    intrinsics: src.Intrinsics = None,
-    distortion: src.Distortion = None,
-    depth_intrinsics: src.DepthIntrinsics = None,
-    depth_to_color: src.DepthToColor = None,
-    registered: src.Registered = False,
-    depth_scale: src.DepthScale = None,
-    fps: src.Fps = None,
-    start: src.Start = None,
-    end: src.End = None,
-    sharpest: src.Sharpest = None,
-    max_side: src.MaxSide = None,
+    cut: mod.CutWords,
+    words: src.SourceWords,
     force: Annotated[bool, typer.Option("--force", help="Write chunks anew that are there already.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -124,27 +109,11 @@ def precompute(
 
     Example: list3r precompute walk.mp4 --out walk-pi3/ --reconstruction pi3
     """
-    words = {**dict.fromkeys(mod.WORDS), **{k: v for k, v in locals().items() if k in mod.WORDS}}
-    options = src.source_options(
-        kind=kind,
-        every=every,
-        frames=frames,
-        intrinsics=intrinsics,
-        distortion=distortion,
-        depth_intrinsics=depth_intrinsics,
-        depth_to_color=depth_to_color,
-        registered=registered,
-        depth_scale=depth_scale,
-        fps=fps,
-        start=start,
-        end=end,
-        sharpest=sharpest,
-        max_side=max_side,
-    )
+    options = words.options()
     from list3r.frames.source import open_source
 
     info = open_source(source, options).info
-    settings, told = mod.build_settings(info, words, poses=poses, pictures=False)
+    settings, told = mod.build_settings(info, geometry.models(), cut, poses=poses, pictures=False)
     if not json:
         for line in told:
             note(line)

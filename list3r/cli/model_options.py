@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -87,20 +87,43 @@ Overlap = Annotated[
     ),
 ]
 
-WORDS = (
-    "reconstruction",
-    "preset",
-    "discovery",
-    "tracking",
-    "features",
-    "device",
-    "weights",
-    "local_features",
-    "licence",
-    "chunk",
-    "overlap",
-)
-"""Names of the options above, as arguments of a command."""
+
+@dataclass(frozen=True)
+class ModelWords:
+    """The options that choose models, as they were given."""
+
+    reconstruction: Reconstruction = None
+    preset: Preset = None
+    discovery: Discovery = None
+    tracking: Tracking = None
+    features: Features = None
+    device: Device = "auto"
+    weights: WeightsWords = None
+    local_features: LocalFeatures = "sift"
+    licence: LicenceProfile = "research"
+
+
+@dataclass(frozen=True)
+class GeometryWords:
+    """Those of them that say who reconstructs."""
+
+    reconstruction: Reconstruction = None
+    device: Device = "auto"
+    weights: WeightsWords = None
+    licence: LicenceProfile = "research"
+
+    def models(self) -> ModelWords:
+        """As the choice of all models."""
+        return ModelWords(**vars(self))
+
+
+@dataclass(frozen=True)
+class CutWords:
+    """The options that cut a video into chunks, as they were given."""
+
+    chunk: Chunk = None
+    overlap: Overlap = None
+
 
 USUAL_CHUNK, LONGEST_CHUNK, SHORTEST_CHUNK = 100, 240, 16
 """Frames: the paper's; the most that a GPU is filled with, from where passes grow slow and no figure shows a gain; the
@@ -108,32 +131,32 @@ fewest that make a chunk."""
 
 
 def build_settings(
-    info: SourceInfo, words: Mapping[str, Any], *, poses: str, pictures: bool, resumed: Path | None = None
+    info: SourceInfo, words: ModelWords, cut: CutWords, *, poses: str, pictures: bool, resumed: Path | None = None
 ) -> tuple[BuildSettings, list[str]]:
     """Settings of a build, and what the user should know of the models, one line each.
 
-    `words` are the options named in `WORDS`; `resumed` is a memory whose unfinished session says how it was cut.
+    `resumed` is a memory whose unfinished session says how it was cut.
     Raises `OptionError` for what is not known, not allowed or not installed, before anything is loaded or fetched.
     """
     from list3r.chunk_stage import BuildSettings
     from list3r.models.choice import check_allowed, parse_weights
     from list3r.models.licences import check_profile
 
-    check_profile(words["licence"])
+    check_profile(words.licence)
     selection = _selection(info, words)
-    asked = parse_weights(words["weights"])
+    asked = parse_weights(words.weights)
     if selection.discovery == selection.reconstruction == "precomputed" and "reconstruction" in asked:
         asked.setdefault("discovery", asked["reconstruction"])
-    chosen = check_allowed(selection, asked, words["licence"])
+    chosen = check_allowed(selection, asked, words.licence)
     notes = [f"note: {selection.why}"] if selection.why else []
     notes += _terms(selection, chosen)
-    kind, file = _local_features(words["local_features"] or "sift")
+    kind, file = _local_features(words.local_features)
     settings = BuildSettings(
         local_features=kind,
         feature_weights=file,
         reconstruction=selection.reconstruction,
         poses=poses,
-        device=words["device"],
+        device=words.device,
         weights=chosen.get("reconstruction"),
         discovery=selection.discovery,
         tracking=selection.tracking,
@@ -143,9 +166,8 @@ def build_settings(
         ),
         keep_pictures=pictures,
     )
-    length, overlap = words["chunk"], words["overlap"]
-    chunks = None if resumed is None or length is not None else _recorded(resumed)
-    chunks = chunks or _cut(settings, length, overlap)
+    chunks = None if resumed is None or cut.chunk is not None else _recorded(resumed)
+    chunks = chunks or _cut(settings, cut.chunk, cut.overlap)
     return replace(settings, chunks=chunks), notes
 
 
@@ -166,17 +188,17 @@ def _local_features(words: str) -> tuple[str, str | None]:
     return kind, str(path)
 
 
-def _selection(info: SourceInfo, words: Mapping[str, Any]) -> Selection:
+def _selection(info: SourceInfo, words: ModelWords) -> Selection:
     """The preset's models, or the classical ones, with what was asked for by name put in their place."""
     from list3r.models.device import find_gpu
     from list3r.models.presets import Selection, select
 
-    preset = words["preset"]
     chosen = Selection()
-    if preset is not None:
-        gpu = find_gpu(words["device"]) if preset == "auto" else None
-        chosen = select(preset, has_depth=info.has_depth, profile=words["licence"], gpu=gpu)
-    named = {k: words[k] for k in ("reconstruction", "discovery", "tracking", "features") if words[k] is not None}
+    if words.preset is not None:
+        gpu = find_gpu(words.device) if words.preset == "auto" else None
+        chosen = select(words.preset, has_depth=info.has_depth, profile=words.licence, gpu=gpu)
+    given = {k: getattr(words, k) for k in ("reconstruction", "discovery", "tracking", "features")}
+    named = {k: str(v) for k, v in given.items() if v is not None}
     if "discovery" in named and "features" not in named:
         neural = named["discovery"] != "geometric"
         if neural and chosen.features == "geometric":

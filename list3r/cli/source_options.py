@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -63,41 +64,45 @@ MaxSide = Annotated[
 ]
 
 
-def source_options(
-    *,
-    kind: str,
-    every: int,
-    frames: str | None,
-    intrinsics: str | None,
-    distortion: str | None,
-    depth_intrinsics: str | None,
-    depth_to_color: str | None,
-    registered: bool,
-    depth_scale: float | None,
-    fps: float | None,
-    start: float | None = None,
-    end: float | None = None,
-    sharpest: bool | None = None,
-    max_side: int | None = None,
-) -> SourceOptions:
-    """The words of the command line as options. Raises `OptionError` naming the option."""
-    from list3r.frames import options as words
+@dataclass(frozen=True)
+class SourceWords:
+    """The options above as they were given."""
 
-    first, stop = words.parse_range(frames) if frames else (None, None)
-    return words.SourceOptions(
-        kind=kind,
-        every=every,
-        start=first,
-        stop=stop,
-        intrinsics=words.parse_intrinsics(intrinsics, "--intrinsics") if intrinsics else None,
-        distortion=words.parse_distortion(distortion) if distortion else None,
-        depth_intrinsics=words.parse_intrinsics(depth_intrinsics, "--depth-intrinsics") if depth_intrinsics else None,
-        T_color_depth=words.parse_transform(depth_to_color, "--depth-to-color") if depth_to_color else None,
-        registered=registered,
-        depth_scale=depth_scale,
-        fps=fps,
-        start_s=start,
-        end_s=end,
-        sharpest=sharpest,
-        max_side=max_side,
-    )
+    kind: Kind = "auto"
+    every: Every = 1
+    frames: Frames = None
+    intrinsics: Intrinsics = None
+    distortion: Distortion = None
+    depth_intrinsics: DepthIntrinsics = None
+    depth_to_color: DepthToColor = None
+    registered: Registered = False
+    depth_scale: DepthScale = None
+    fps: Fps = None
+    start: Start = None
+    end: End = None
+    sharpest: Sharpest = None
+    max_side: MaxSide = None
+
+    def options(self) -> SourceOptions:
+        """What they mean. Raises `OptionError` naming the option."""
+        from list3r.frames import options as words
+
+        first, stop = words.parse_range(self.frames) if self.frames else (None, None)
+        color, depth, transform = self.intrinsics, self.depth_intrinsics, self.depth_to_color
+        return words.SourceOptions(
+            kind=self.kind,
+            every=self.every,
+            start=first,
+            stop=stop,
+            intrinsics=words.parse_intrinsics(color, "--intrinsics") if color else None,
+            distortion=words.parse_distortion(self.distortion) if self.distortion else None,
+            depth_intrinsics=words.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
+            T_color_depth=words.parse_transform(transform, "--depth-to-color") if transform else None,
+            registered=self.registered,
+            depth_scale=self.depth_scale,
+            fps=self.fps,
+            start_s=self.start,
+            end_s=self.end,
+            sharpest=self.sharpest,
+            max_side=self.max_side,
+        )

@@ -13,7 +13,7 @@ from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
-from list3r.cli.common import JsonOption, MemoryArgument, note, print_json, with_at
+from list3r.cli.common import JsonOption, MemoryArgument, note, print_json, spread, with_at
 from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
 from list3r.cli.finishing import finish
 from list3r.cli.scale_commands import ScaleAnchor, check_anchor
@@ -33,37 +33,17 @@ def register(app: typer.Typer) -> None:
                     command.callback = with_at(command.callback)
 
 
+@spread
 def update(
     memory: MemoryArgument,
     source: src.SourceArgument,
-    reconstruction: mod.Reconstruction = None,
-    preset: mod.Preset = None,
-    discovery: mod.Discovery = None,
-    tracking: mod.Tracking = None,
-    features: mod.Features = None,
-    device: mod.Device = "auto",
-    weights: mod.WeightsWords = None,
-    local_features: mod.LocalFeatures = "sift",
-    licence: mod.LicenceProfile = "research",
+    *,
+    models: mod.ModelWords,
     poses: Annotated[
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
     ] = "auto",
-    kind: src.Kind = "auto",
-    every: src.Every = 1,
-    frames: src.Frames = None,
-    intrinsics: src.Intrinsics = None,
-    distortion: src.Distortion = None,
-    depth_intrinsics: src.DepthIntrinsics = None,
-    depth_to_color: src.DepthToColor = None,
-    registered: src.Registered = False,
-    depth_scale: src.DepthScale = None,
-    fps: src.Fps = None,
-    start: src.Start = None,
-    end: src.End = None,
-    sharpest: src.Sharpest = None,
-    max_side: src.MaxSide = None,
-    chunk: mod.Chunk = None,
-    overlap: mod.Overlap = None,
+    words: src.SourceWords,
+    cut: mod.CutWords,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
@@ -78,15 +58,14 @@ def update(
 
     Example: list3r update house.l3r walk-2/
     """
-    words = {name: value for name, value in locals().items() if name in mod.WORDS}
-    options = src.source_options(**{name: value for name, value in locals().items() if name in _SOURCE_WORDS})
+    options = words.options()
     from list3r.frames.source import open_source
 
     check_anchor(scale_anchor)
     check_detector(detector, detector_classes)
     info = open_source(source, options).info
     resumed = memory if resume else None
-    settings, told = mod.build_settings(info, words, poses=poses, pictures=pictures, resumed=resumed)
+    settings, told = mod.build_settings(info, models, cut, poses=poses, pictures=pictures, resumed=resumed)
     if not json:
         for line in told:
             note(line)
@@ -113,24 +92,6 @@ def report_lines(memory: Path, report: UpdateReport) -> list[str]:
         f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
     ]
     return lines + [f"note: {line}" for line in report.notes]
-
-
-_SOURCE_WORDS = (
-    "kind",
-    "every",
-    "frames",
-    "intrinsics",
-    "distortion",
-    "depth_intrinsics",
-    "depth_to_color",
-    "registered",
-    "depth_scale",
-    "fps",
-    "start",
-    "end",
-    "sharpest",
-    "max_side",
-)
 
 
 def _run(memory: Path, source: str, *, quiet: bool, **arguments: Any) -> UpdateReport:
