@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar, Unpack
@@ -23,7 +24,7 @@ from list3r.queries.camera import Camera, camera_at_pose, camera_at_time, camera
 from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, find
 from list3r.queries.free_words import WordEncoder
-from list3r.queries.match import FilterOptions, Match
+from list3r.queries.match import FilterOptions, Match, Matches
 from list3r.queries.nearest import nearest
 from list3r.queries.path import path
 from list3r.queries.relations import Place, Relations, relations
@@ -48,7 +49,8 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
 
     @functools.wraps(method)
     def guarded(self: SceneMemory, /, *args: P.args, **kwargs: P.kwargs) -> R:
-        with self._lock:
+        # Of what another process writes meanwhile an answer must see one state; a writer has no other beside it.
+        with self._lock, nullcontext() if self.store.writable else self.store.snapshot():
             return method(self, *args, **kwargs)
 
     return guarded
@@ -79,16 +81,19 @@ def build(
     workers: int | None = None,
     resume: bool = False,
     force: bool = False,
+    licence: str = "research",
 ) -> SceneMemory:
     """Build the memory of a video or folder and open it.
 
     `options` says what is known of the source (intrinsics, depth scale, ...), `settings` how it is worked on.
-    `resume` goes on with a build that was interrupted; `force` replaces an existing memory.
+    `resume` goes on with a build that was interrupted; `force` replaces an existing memory. `licence` is what networks
+    may be under: permissive (any use, no account), research (non-commercial, gated and own terms too) or any.
     Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`, each with the way to mend it.
     """
     from list3r import pipeline
 
-    pipeline.build(source, memory, options=options, settings=settings, workers=workers, resume=resume, force=force)
+    run = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    pipeline.build(source, memory, force=force, licence=licence, **run)
     return open(memory)
 
 
@@ -100,6 +105,7 @@ def update(
     settings: BuildSettings | None = None,
     workers: int | None = None,
     resume: bool = False,
+    licence: str = "research",
 ) -> SceneMemory:
     """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
 
@@ -108,7 +114,8 @@ def update(
     """
     from list3r import updating
 
-    updating.update(memory, source, options=options, settings=settings, workers=workers, resume=resume)
+    run = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    updating.update(memory, source, licence=licence, **run)
     return open(memory)
 
 
@@ -178,7 +185,7 @@ class SceneMemory(MemoryEdits):
         *,
         max_distance: float | None = None,
         **filters: Unpack[FilterOptions],
-    ) -> list[Match]:
+    ) -> Matches:
         """The k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
 
         Distances are between surfaces and between centres. For the filters (`structure`, `min_confidence`, `state`,
@@ -187,7 +194,7 @@ class SceneMemory(MemoryEdits):
             >>> memory.nearest((0.5, 1.2, 0.8), k=3, color="red", max_distance=1.0)
         """
         if isinstance(target, str):
-            encoder = self._words()
+            encoder = self.word_encoder()
             return nearest(self.store, words=target, k=k, max_distance=max_distance, encoder=encoder, **filters)
         if isinstance(target, int | np.integer):
             return nearest(self.store, instance_id=int(target), k=k, max_distance=max_distance, **filters)
@@ -272,9 +279,9 @@ class SceneMemory(MemoryEdits):
             >>> memory.find("white mug on table")
             >>> memory.find("the biggest red thing near the door", k=1)
         """
-        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self._words())
+        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self.word_encoder())
 
-    def _words(self) -> WordEncoder | None:
+    def word_encoder(self) -> WordEncoder | None:
         """What compares free words, where the memory was embedded by a text and image model."""
         from list3r.embedding import stored_words
 
@@ -384,10 +391,10 @@ class SceneMemory(MemoryEdits):
         with self.store.snapshot():
             return export_memory(self.store, format, path)
 
-    @_alone
     def close(self) -> None:
         """Close the file."""
-        self.store.close()
+        with self._lock:
+            self.store.close()
 
     def __enter__(self) -> Self:
         return self

@@ -80,7 +80,8 @@ def nearest(
         if words is None and point is None and id is None:
             raise OptionError("say what to be near to: --point x,y,z, --id ID, or words such as mug")
         origin = None if point is None else parse_point(point, "--point")
-        matches = ask(scene.store, words=words, point=origin, instance_id=id, **filters)
+        encoder = None if words is None else scene.word_encoder()
+        matches = ask(scene.store, words=words, point=origin, instance_id=id, encoder=encoder, **filters)
         print_matches(matches, scene.units, json)
 
 
@@ -252,8 +253,6 @@ def find(
         )
         return
     print_matches(found, units, json=False)
-    for line in found.notes:
-        note(f"note: {line}")
 
 
 def seen(

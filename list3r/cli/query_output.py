@@ -83,7 +83,9 @@ def view_dict(view: BestView | None) -> dict[str, Any] | None:
 
 
 def print_matches(matches: Sequence[Match], units: str, json: bool) -> None:
-    """Matches as a table, or as JSON."""
+    """Matches as a table, or as JSON; what is to be said of all of them goes to standard error."""
+    for line in getattr(matches, "notes", ()):
+        note(f"note: {line}")
     if json:
         print_json([match_dict(m, units) for m in matches])
         return

@@ -6,29 +6,27 @@ import contextlib
 import os
 import sqlite3
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-from urllib.parse import quote
 
-from list3r.memory.codec import MAX_BLOB_BYTES, from_json, to_json
+from list3r.memory.codec import from_json, to_json
 from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.memory_file import (
+    connected,
+    explained,
+    identified,
+    migrate,
+    migrated_copy,
+    use_write_ahead_log,
+    write_empty,
+)
 from list3r.memory.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, unbelieved
-from list3r.memory.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
-from list3r.memory.sums import Sums, write_all
+from list3r.memory.schema import SCHEMA_VERSION
+from list3r.memory.sums import Sums
 from list3r.memory.word_index import WordIndex, up_to_date, write_words
 from list3r.memory.writer_lock import WriterLock, lock_path
-
-PAGE_BYTES = 16384
-"""Pages of new files. A row of a clustered table stays in its page up to a quarter of it. Vectors of up to 1,000
-numbers do; in pages of 4 KiB each of 256 takes a page of overflow, four times the room and one more page to read.
-"""
-_CACHE_KIB = 65536
-"""Pages that a connection keeps."""
-_WAIT_S = 30.0
-"""How long one process waits for what another holds only for a moment."""
 
 
 class Connection:
@@ -51,6 +49,11 @@ class Connection:
         self.unsettled = 0
         """How often a chunk was unsettled, see `memory.library_verbs`."""
 
+    @property
+    def writable(self) -> bool:
+        """Whether this is the one connection that may write."""
+        return self._lock is not None
+
     @classmethod
     def create(cls, path: str | Path) -> Self:
         """A new, empty memory, open for writing. Raises `MemoryFileError` when the path is taken or not writable.
@@ -68,7 +71,7 @@ class Connection:
             if path.exists():
                 raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
             remove_memory(new)
-            _write_empty(path, new)
+            write_empty(path, new)
             new.rename(path.resolve())
             return cls._connect(path, lock)
         except BaseException:
@@ -94,40 +97,40 @@ class Connection:
         try:
             return cls._connect(path, WriterLock(path.resolve()))
         except FAILURES as error:
-            raise MemoryFileError(_explain(path, error)) from error
+            raise MemoryFileError(explained(path, error)) from error
 
     @classmethod
     def _open_to_read(cls, path: Path) -> Self:
         try:
-            database = _database(path, "ro")
+            database = connected(path, "ro")
             try:
-                version = _identify(path, database)
+                version = identified(path, database)
             except sqlite3.OperationalError as error:
                 database.close()
                 if getattr(error, "sqlite_errorname", "") not in _UNFINISHED or not _writable_now(cls, path):
                     raise
-                database = _database(path, "ro")
-                version = _identify(path, database)
+                database = connected(path, "ro")
+                version = identified(path, database)
             except BaseException:
                 database.close()
                 raise
             if version < SCHEMA_VERSION:
                 database.close()
-                database = _database(path, "ro") if _writable_now(cls, path) else _migrated_copy(path)
+                database = connected(path, "ro") if _writable_now(cls, path) else migrated_copy(path)
             database.execute("PRAGMA query_only=ON")
             return cls(path, database, None)
         except FAILURES as error:
-            raise MemoryFileError(_explain(path, error)) from error
+            raise MemoryFileError(explained(path, error)) from error
 
     @classmethod
     def _connect(cls, path: Path, lock: WriterLock) -> Self:
         database: sqlite3.Connection | None = None
         try:
-            database = _database(path, "rw")
-            version = _identify(path, database)
+            database = connected(path, "rw")
+            version = identified(path, database)
             if version < SCHEMA_VERSION:
-                _migrate(database, version)
-            _use_write_ahead_log(database)
+                migrate(database, version)
+            use_write_ahead_log(database)
             opened = cls(path, database, lock)
             if not up_to_date(database):
                 with opened.transaction():
@@ -139,7 +142,7 @@ class Connection:
                 database.close()
             lock.release()
             if isinstance(error, FAILURES):
-                raise MemoryFileError(_explain(path, error)) from error
+                raise MemoryFileError(explained(path, error)) from error
             raise
 
     def close(self) -> None:
@@ -189,7 +192,7 @@ class Connection:
                 self._database.execute("COMMIT")
             except sqlite3.Error as error:
                 self._roll_back()
-                raise MemoryFileError(_explain(self.path, error)) from error
+                raise MemoryFileError(explained(self.path, error)) from error
             finally:
                 self._writing = False
 
@@ -238,7 +241,7 @@ class Connection:
                     raise MemoryFileError(_damaged(self.path, found))
             return rows
         except FAILURES as error:
-            raise MemoryFileError(_explain(self.path, error)) from error
+            raise MemoryFileError(explained(self.path, error)) from error
 
     def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
@@ -246,7 +249,7 @@ class Connection:
             try:
                 bad = unbelieved(self._database, table, rows)
             except FAILURES as error:
-                raise MemoryFileError(_explain(self.path, error)) from error
+                raise MemoryFileError(explained(self.path, error)) from error
             if bad:
                 raise MemoryFileError(_damaged(self.path, f"{table} {bad[0]}: the row is not as it was written"))
         return rows
@@ -272,100 +275,6 @@ def _size(database: sqlite3.Connection) -> int:
     return int(pages[0]) * int(pages[1])
 
 
-def _explain(path: Path, error: Exception) -> str:
-    text = str(error)
-    if "not a database" in text:
-        return f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`"
-    if "full" in text or "disk I/O" in text:
-        return f"{path} could not be written, the disk is full or failing ({text}); free some space and go on"
-    if "readonly" in text:
-        return f"{path} is read-only; make it writable or copy it"
-    if "locked" in text:
-        return f"{path} is being written by another process; wait for it to end"
-    return f"{path}: {text}; run `list3r verify {path}`, `list3r repair {path}` saves what is sound"
-
-
-def _database(path: Path, mode: str) -> sqlite3.Connection:
-    """A connection that runs nothing that the file brings along and holds no value larger than a blob may be."""
-    uri = f"file:{quote(str(path.resolve()))}?mode={mode}"
-    database = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_WAIT_S, check_same_thread=False)
-    protect(database)
-    return database
-
-
-def protect(database: sqlite3.Connection) -> None:
-    """Settings under which the file of a stranger may be read."""
-    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOB_BYTES + 2**20)
-    for setting in ("trusted_schema=OFF", "cell_size_check=ON", "temp_store=MEMORY", f"cache_size=-{_CACHE_KIB}"):
-        database.execute(f"PRAGMA {setting}")
-
-
-def _identify(path: Path, database: sqlite3.Connection) -> int:
-    """The schema version of a memory. Raises `MemoryFileError` for what is none, is newer, or holds what none does."""
-    application = int(database.execute("PRAGMA application_id").fetchone()[0])
-    version = int(database.execute("PRAGMA user_version").fetchone()[0])
-    if application != APPLICATION_ID:
-        if path.stat().st_size < _SMALLEST:
-            raise MemoryFileError(f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`")
-        raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory")
-    if version > SCHEMA_VERSION:
-        raise MemoryFileError(
-            f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
-        )
-    if version < 1:
-        raise MemoryFileError(f"{path} has schema version {version}, which there never was; the file is damaged")
-    check_schema(path, database, version)
-    return version
-
-
-_SMALLEST = 512
-"""Bytes of the smallest SQLite file."""
-
-
-def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None:
-    """Raise `MemoryFileError` when the file holds anything else than its schema: tables, triggers, views, indices."""
-    expected, found = expected_schema(version), read_schema(database)
-    for kind, name in sorted(found.keys() - expected.keys()):
-        raise MemoryFileError(f"{path} holds a {kind} {name!r}, which no memory has; it is not opened")
-    for kind, name in sorted(expected.keys()):
-        if found.get((kind, name)) != expected[kind, name]:
-            state = "is not the one of" if (kind, name) in found else "is missing for"
-            raise MemoryFileError(
-                f"{path}: the {kind} {name} {state} schema version {version}; the file is damaged or not ours"
-            )
-
-
-def _write_empty(path: Path, new: Path) -> None:
-    """A memory without rows, whole and on the disk. Raises `MemoryFileError`."""
-    try:
-        os.close(os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644))
-        database = _database(new, "rw")
-        try:
-            database.execute(f"PRAGMA page_size = {PAGE_BYTES}")
-            database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            _migrate(database, 0)
-        finally:
-            database.close()
-    except OSError as error:
-        raise MemoryFileError(f"{path} cannot be created: {error.strerror}") from error
-    except sqlite3.Error as error:
-        raise MemoryFileError(_explain(path, error)) from error
-
-
-def _use_write_ahead_log(database: sqlite3.Connection) -> None:
-    """Readers may hold the file for a moment as the journal changes; that is waited for."""
-    end = time.monotonic() + _WAIT_S
-    while True:
-        try:
-            database.execute("PRAGMA journal_mode=WAL").fetchall()
-            break
-        except sqlite3.OperationalError as error:
-            if "locked" not in str(error) or time.monotonic() > end:
-                raise
-            time.sleep(0.01)
-    database.execute("PRAGMA synchronous=NORMAL")
-
-
 def _writable_now(kind: type[Connection], path: Path) -> bool:
     """Open for writing and close, which migrates and recovers a file; False where that may not be now."""
     if not (os.access(path, os.W_OK) and path.stat().st_mode & 0o222):
@@ -375,34 +284,3 @@ def _writable_now(kind: type[Connection], path: Path) -> bool:
     except MemoryFileError:
         return False
     return True
-
-
-def _migrated_copy(path: Path) -> sqlite3.Connection:
-    """A copy of an older file in the present schema, in a nameless file of SQLite that ends with the connection."""
-    with contextlib.closing(_database(path, "ro")) as source:
-        copy = sqlite3.connect("", isolation_level=None, check_same_thread=False)
-        try:
-            source.backup(copy)
-            protect(copy)
-            _migrate(copy, _identify(path, copy))
-        except BaseException:
-            copy.close()
-            raise
-        return copy
-
-
-def _migrate(database: sqlite3.Connection, version: int) -> None:
-    """Bring a file forward to the present schema, in one transaction."""
-    database.execute("BEGIN IMMEDIATE")
-    try:
-        for migration in MIGRATIONS[version:]:
-            for statement in migration.split(";"):
-                database.execute(statement)
-        write_words(database)
-        write_all(database)
-        database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-        database.execute("COMMIT")
-    except BaseException:
-        if database.in_transaction:
-            database.execute("ROLLBACK")
-        raise

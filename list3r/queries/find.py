@@ -13,10 +13,10 @@ from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.memory.words import split_words, vocabulary
 from list3r.queries.camera import camera_of_frame
-from list3r.queries.free_words import WordEncoder
+from list3r.queries.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.gather import Gathered, gather
 from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
-from list3r.queries.match import Match, checked_count, checked_instance
+from list3r.queries.match import Match, Matches, checked_count, checked_instance
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
 from list3r.queries.surfaces import distance_between
 from list3r.queries.viewpoint import VIEWPOINT, between
@@ -30,15 +30,13 @@ _ALIKE = 0.1
 """Sizes that differ by less than this share are equally the biggest."""
 
 
-class Found(list[Match]):
-    """Ranked answers with what can be said of the question as a whole."""
+class Found(Matches):
+    """Ranked answers; `notes` say which words nothing bears, which relations are not known, how many are equal."""
 
     def __init__(
         self, matches: Iterable[Match] = (), notes: Sequence[str] = (), unknown_words: Sequence[str] = ()
     ) -> None:
-        super().__init__(matches)
-        self.notes = tuple(dict.fromkeys(notes))
-        """What a reader should know: words that nothing bears, relations that are not known, several equal answers."""
+        super().__init__(matches, notes)
         self.unknown_words = tuple(dict.fromkeys(unknown_words))
         """Words that nothing in the memory bears."""
 
@@ -185,23 +183,22 @@ def _bears(search: _Search, n: int, words: Sequence[str]) -> bool:
 
 def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
     """Things by the likeness of their vectors to the phrase; None where no vectors of the encoder's space are there."""
-    encoder = search.encoder
-    if encoder is None or encoder.space not in search.store.embedding_spaces():
+    if search.encoder is None:
         return None
+    text = " ".join(phrase.words)
     try:
-        query = np.asarray(encoder.encode(" ".join(phrase.words)), dtype=np.float64)
+        cosine = named_by_vectors(search.store, search.encoder, text)
     except OptionError as error:  # the memory has come to a machine without the model's weights
         search.notes.append(f"free words are not compared: {error}")
         return None
-    ids, vectors = search.store.embeddings(encoder.space)
-    lengths = np.linalg.norm(vectors, axis=1) * np.linalg.norm(query)
-    cosine = vectors @ query / np.maximum(lengths, 1e-12)
+    if cosine is None:
+        return None
     if search.gathered is not None:
-        _look_at_too(search, ids[cosine >= encoder.min_cosine].tolist())
+        _look_at_too(search, list(cosine))
     return [
-        _Candidate(search.things[n], float(c), (f"like {' '.join(phrase.words)!r}: cosine {c:.2f} in {encoder.space}",))
-        for n, c in zip(ids.tolist(), cosine.tolist(), strict=True)
-        if c >= encoder.min_cosine and n in search.things and search.things[n].structure is None
+        _Candidate(search.things[n], c, (like(text, c, search.encoder.space),))
+        for n, c in cosine.items()
+        if n in search.things and search.things[n].structure is None
     ]
 
 

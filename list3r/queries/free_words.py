@@ -28,13 +28,20 @@ class WordEncoder(Protocol):
         ...
 
 
-def named_by_vectors(store: Store, encoder: WordEncoder, words: str) -> dict[int, float]:
-    """Cosine of every thing that a text may name, by id; none where the memory has no vectors of the space."""
+def named_by_vectors(store: Store, encoder: WordEncoder, words: str) -> dict[int, float] | None:
+    """Cosine of every thing that a text may name, by id, the ids ascending; None where the memory has no vectors of the
+    encoder's space. Raises `OptionError` where the encoder's weights are not there.
+    """
     if encoder.space not in store.embedding_spaces():
-        return {}
+        return None
+    query = np.asarray(encoder.encode(words), np.float64)
     ids, vectors = store.embeddings(encoder.space)
-    if not len(ids):
-        return {}
-    cosine = vectors.astype(np.float64) @ np.asarray(encoder.encode(words), np.float64)
+    lengths = np.linalg.norm(vectors, axis=1) * np.linalg.norm(query)
+    cosine = vectors @ query / np.maximum(lengths, 1e-12)
     fits = cosine >= encoder.min_cosine
     return dict(zip(ids[fits].tolist(), cosine[fits].tolist(), strict=True))
+
+
+def like(words: str, cosine: float, space: str) -> str:
+    """Why a thing that the words do not name is an answer all the same."""
+    return f"like {words!r}: cosine {cosine:.2f} in {space}"

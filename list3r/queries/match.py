@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypedDict
 
@@ -41,6 +41,15 @@ class Match:
     def best_view(self) -> BestView | None:
         """The picture to look at: of the frame asked about, else where the thing is seen best."""
         return self.view or self.instance.best_view
+
+
+class Matches(list[Match]):
+    """Answers, the best first, with what can be said of the question as a whole."""
+
+    def __init__(self, matches: Iterable[Match] = (), notes: Sequence[str] = ()) -> None:
+        super().__init__(matches)
+        self.notes = tuple(dict.fromkeys(notes))
+        """What a reader should know, such as what was left out."""
 
 
 class FilterOptions(TypedDict, total=False):

@@ -14,12 +14,13 @@ from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.best_first import box_gaps, nearest_first
-from list3r.queries.free_words import WordEncoder, named_by_vectors
+from list3r.queries.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.gather import is_large
 from list3r.queries.match import (
     FilterOptions,
     Filters,
     Match,
+    Matches,
     checked_count,
     checked_instance,
     checked_length,
@@ -30,6 +31,8 @@ from list3r.queries.words import STRUCTURE, wanted_words, word_score
 
 _LOADED = 5_000
 """Instances that are looked at because of what they are called, in a memory that holds many."""
+_NAMED = 100_000
+"""Instances that may bear one word, at the most."""
 
 
 def nearest(
@@ -42,7 +45,7 @@ def nearest(
     max_distance: float | None = None,
     encoder: WordEncoder | None = None,
     **options: Unpack[FilterOptions],
-) -> list[Match]:
+) -> Matches:
     """The k things nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
     With `words` only things whose label or description bears one of them; with words alone those that they name best
@@ -68,23 +71,23 @@ def nearest(
     place = None if point is None else checked_point(point, "point")
     if words is None:
         near = _near(store, origin, place, k, max_distance, filters)
-        return [_match(i, distance, "", origin, place) for distance, i in near]
+        return Matches(_match(i, distance, "", origin, place) for distance, i in near)
     if is_large(store) and (origin is not None or place is not None) and _common(store, words):
         filters = replace(filters, label=" ".join([*([filters.label] if filters.label else []), words]))
         near = _near(store, origin, place, k, max_distance, filters)
-        return [_match(i, distance, f"named {words}", origin, place) for distance, i in near]
-    others = [i for i in filters.select(_bearers(store, words, filters)) if origin is None or i.id != origin.id]
+        return Matches(_match(i, distance, f"named {words}", origin, place) for distance, i in near)
+    notes: list[str] = []
+    others = [i for i in _bearers(store, words, filters, notes) if origin is None or i.id != origin.id]
     named = _named(others, words)
     if not named and encoder is not None:
-        others = [i for i in filters.select(store.instances()) if origin is None or i.id != origin.id]
-        named = _alike(store, others, words, encoder)
+        named = _alike(store, encoder, words, filters, notes)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
-        return [Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]]
-    bearing = [i for i, _, _ in named if origin is None or i.component == origin.component]
+        return Matches((Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]), notes)
+    bearing = [i for i, _, _ in named if origin is None or (i.id != origin.id and i.component == origin.component)]
     reasons = {i.id: reason for i, _, reason in named}
     found = _by_distance(bearing, _measure(store, origin, place), _aabb(origin, place), k, max_distance)
-    return [_match(i, distance, reasons[i.id], origin, place) for distance, i in found]
+    return Matches((_match(i, distance, reasons[i.id], origin, place) for distance, i in found), notes)
 
 
 def _common(store: Store, words: str) -> bool:
@@ -92,28 +95,32 @@ def _common(store: Store, words: str) -> bool:
     return len(store.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
 
 
-def _bearers(store: Store, words: str, filters: Filters) -> list[Instance]:
-    """All instances; of a memory that holds too many those that bear the most of the words and pass the filters."""
+def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
+    """What passes the filters: all; of a memory that holds too many those that bear the most of the words."""
     if not is_large(store):
-        return store.instances()
-    for ids in store.bearing_most(wanted_words(words), 20 * _LOADED):
-        found = filters.select(store.instances_of(ids[:_LOADED]))
-        if _named(found, words):
-            return found
+        return filters.select(store.instances())
+    for ids in store.bearing_most(wanted_words(words), _NAMED + 1):
+        for start in range(0, len(ids), _LOADED):
+            found = filters.select(store.instances_of(ids[start : start + _LOADED]))
+            if _named(found, words):
+                if len(ids) > start + _LOADED:
+                    count = f"more than {_NAMED}" if len(ids) > _NAMED else f"{len(ids)}"
+                    notes.append(f"{count} things may be meant by {words!r}; {start + _LOADED} of them were looked at")
+                return found
     return []
 
 
 def _alike(
-    store: Store, instances: Sequence[Instance], words: str, encoder: WordEncoder | None
+    store: Store, encoder: WordEncoder, words: str, filters: Filters, notes: list[str]
 ) -> list[tuple[Instance, float, str]]:
     """Things whose vectors fit words that nothing bears."""
     try:
-        cosine = {} if encoder is None else named_by_vectors(store, encoder, words)
-    except OptionError:  # the memory has come to a machine without the model's weights: only plain words answer
-        cosine = {}
-    return [
-        (i, round(cosine[i.id], 4), f"like {words!r}: cosine {cosine[i.id]:.2f}") for i in instances if i.id in cosine
-    ]
+        cosine = named_by_vectors(store, encoder, words) or {}
+    except OptionError as error:  # the memory has come to a machine without the model's weights
+        notes.append(f"free words are not compared: {error}")
+        return []
+    alike = filters.select(store.instances_of(list(cosine)))
+    return [(i, round(cosine[i.id], 4), like(words, cosine[i.id], encoder.space)) for i in alike]
 
 
 def _near(

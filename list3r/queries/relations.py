@@ -70,9 +70,10 @@ def relations(
         raise OptionError(f"{predicate} does not depend on who looks; leave out the viewpoint")
     if (predicate == "between") != (other is not None):
         raise OptionError("between takes two things, object and other (--object A --and B), and nothing else takes two")
-    subjects, objects = _ids(store, subject), _ids(store, object)
+    notes: list[str] = []
+    subjects, objects = _ids(store, subject, notes), _ids(store, object, notes)
     if predicate == "between":
-        found = _between(store, subjects, objects, _ids(store, other))
+        found = _between(store, subjects, objects, _ids(store, other, notes))
     elif viewpoint is None:
         found = _stored(store, subjects, predicate, objects)
     else:
@@ -83,7 +84,7 @@ def relations(
         (r for r in found if r.confidence >= min_confidence),
         key=lambda r: (-r.confidence, r.subject, r.predicate, r.object),
     )
-    return Relations(kept, found.state, found.reason)
+    return Relations(kept, found.state, "; ".join([*([found.reason] if found.reason else []), *notes]))
 
 
 def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
@@ -114,14 +115,17 @@ def _parse_place(store: Store, text: str) -> int | Camera | list[float]:
         raise OptionError(f"viewpoint {text!r}: an id, camera, camera:FRAME, or a point such as 0,0,1.5") from None
 
 
-def _ids(store: Store, what: int | str | None) -> list[int] | None:
+def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | None:
     """The ids that a number or words stand for; None for whatever."""
     if what is None:
         return None
     if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):
         wanted = set(wanted_words(what))
         if is_large(store):
-            return sorted(store.bearing(sorted(wanted), _MOST_NAMED))
+            found = store.bearing(sorted(wanted), _MOST_NAMED + 1)
+            if len(found) > _MOST_NAMED:
+                notes.append(f"more than {_MOST_NAMED} things are {what!r}; {_MOST_NAMED} of them were looked at")
+            return sorted(found[:_MOST_NAMED])
         return [i.id for i in store.instances() if wanted <= words_of(i)]
     return [checked_instance(store, int(what.removeprefix("#")) if isinstance(what, str) else what).id]
 
