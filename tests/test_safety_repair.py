@@ -12,8 +12,8 @@ import pytest
 
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.connection import PAGE_BYTES
 from list3r.memory.errors import MemoryFileError
+from list3r.memory.memory_file import PAGE_BYTES
 from list3r.memory.records import Instance
 from list3r.memory.repair import repair
 from list3r.memory.store import Store

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from list3r.memory.codec import checksum, pack_sim3, unpack
-from list3r.memory.connection import check_schema, protect
 from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
+from list3r.memory.memory_file import check_schema, protect
 from list3r.memory.read_checks import FAILURES, GEOMETRY_BYTES
 from list3r.memory.schema import SCHEMA_VERSION
 from list3r.memory.store import Store
