@@ -6,8 +6,11 @@ The chunks are made up (things, floors, samples, keyframes of a walk) and go thr
 build: edge to the chunk before, revisits, pose graph, library. Three walks: `rooms`, on into new rooms for ever;
 `corridor`, along one floor; `stay`, to and fro in one room, where every chunk touches all that is there. Every chunk
 sees 12 things and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by
-turn. Printed are medians: user seconds of processor time of placing (edges, revisits, graph) and of the library, things
-written anew; what the process had grown by when the memory was made, and its peak then.
+turn. With `--sessions 2` the memory is that of a session that has ended, and the chunks that are added are the first of
+a later one, which walks the way again from its middle; what has changed is told when that session ends, which is timed
+too (`end_s`). `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user seconds of
+processor time of placing (edges, revisits, graph) and of the library, things written anew; what the process had grown
+by when the memory was made, and its peak then.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import pstats
 import resource
 import tempfile
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +29,8 @@ import numpy as np
 from machine import machine, write_json
 
 from list3r import mapping
+from list3r.memory import edits
+from list3r.memory.consolidation import consolidate
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.memory.store import Store
 
@@ -48,11 +54,14 @@ def main() -> None:
     parser.add_argument("--walks", default="rooms,corridor,stay", help="some of rooms, corridor, stay")
     parser.add_argument("--stay-chunks", type=int, default=100, help="most chunks of the walk that stays")
     parser.add_argument("--repeat", type=int, default=15, help="chunks that are added to each memory and timed")
+    parser.add_argument(
+        "--sessions", type=int, default=1, help="2: the chunks that are added belong to a later session"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--profile", action="store_true", help="where the time of the largest memory went")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
-    found = {}
+    found: dict[str, list[dict[str, Any]]] = {}
     print(machine())
     for name in words.walks.split(","):
         sizes = [int(n) for n in words.chunks.split(",") if name != "stay" or int(n) <= words.stay_chunks]
@@ -79,13 +88,16 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
                 add(stores[n], chunk(k, name, words.seed))
             resident[n], peak[n] = round(resident_mb() - before, 1), peak_mb()
             size_mb[n] = round(path.stat().st_size / 1e6, 1)
+            if words.sessions > 1:
+                end(stores[n], 1)
+                begin(stores[n], words.repeat)
         rows: dict[int, list[dict[str, float]]] = {n: [] for n in sizes}
         for turn in range(words.repeat):
             for n in sizes:
-                result = chunk(n + turn, name, words.seed)
+                result = chunk(n + turn, name, words.seed) if words.sessions == 1 else again(n, turn, name, words.seed)
                 if words.profile and n == sizes[-1]:
                     watched.enable()
-                rows[n].append(add(stores[n], result))
+                rows[n].append(add(stores[n], result, words.sessions))
                 watched.disable()
         if words.profile:
             pstats.Stats(watched).sort_stats("cumtime").print_stats(60)
@@ -94,6 +106,9 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
             row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instance_count())}
             for key in ("placing_s", "library_s", "all_s"):
                 row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
+            if words.sessions > 1:
+                row["end_s"] = end(stores[n], 2)
+            row["edit_s"], row["undo_s"] = edited(stores[n])
             row["written"] = int(np.median([r["written"] for r in rows[n]]))
             out.append({**row, "memory_mb": resident[n], "peak_mb": peak[n], "file_mb": size_mb[n]})
     return out
@@ -106,8 +121,60 @@ def begin(store: Store, chunks: int) -> None:
         store.add_session("walk", "synthetic", {}, HOP * chunks + FRAMES)
 
 
-def add(store: Store, result: ChunkResult) -> dict[str, float]:
-    """Add one chunk as a build does: user seconds of placing it and of the library, things written."""
+def end(store: Store, session: int) -> float:
+    """End a session: user seconds of the library, its changes told."""
+    started = user_s()
+    with store.transaction():
+        consolidate(store)
+        store.complete_session(session)
+    return round(user_s() - started, 3)
+
+
+def edited(store: Store) -> tuple[float, float]:
+    """User seconds of an operator's merge of two things, and of its undo."""
+    a, b = (i.id for i in store.instances(structure=False)[:2])
+    started = user_s()
+    edits.merge(store, a, b, "benchmark")
+    merged = user_s()
+    edits.undo(store, None, "benchmark")
+    return round(merged - started, 3), round(user_s() - merged, 3)
+
+
+def again(n: int, turn: int, name: str, seed: int) -> ChunkResult:
+    """Chunk `turn` of a later session, which sees what the first one saw from its middle on, with other errors."""
+    made = chunk(n // 2 + turn, name, seed)
+    rng = np.random.default_rng([seed, 8, turn])
+    off = rng.normal(0.0, 0.003, 3)
+    frames = np.arange(HOP * turn, HOP * turn + FRAMES)
+
+    def seen(found: LocalInstance) -> LocalInstance:
+        points = found.support.points + off + rng.normal(0.0, 0.002, found.support.points.shape)
+        support = replace(found.support, points=points.astype(np.float32))
+        return replace(found, support=support, track=replace(found.track, frames=frames))
+
+    library = replace(made.library, instances=tuple(map(seen, made.library.instances)))
+    keyframes = tuple(
+        replace(k, frame_index=int(f))
+        for k, f in zip(made.keyframes, frames[:: FRAMES // len(made.keyframes)], strict=False)
+    )
+    shift = int(frames[0]) - int(made.frame_indices[0])
+    samples = replace(made.samples, frame=made.samples.frame + shift, camera_frames=frames.astype(np.int64))
+    return replace(
+        made,
+        index=turn,
+        frame_indices=frames,
+        times_s=frames / 30.0,
+        library=library,
+        keyframes=keyframes,
+        samples=samples,
+    )
+
+
+def add(store: Store, result: ChunkResult, session: int = 1) -> dict[str, float]:
+    """Add one chunk as a build does: user seconds of placing it and of the library, things written.
+
+    A chunk of a later session is placed where it is: its keyframes have nothing to be recognised by.
+    """
     library_s = 0.0
     consolidate = mapping.consolidate
 
@@ -121,7 +188,14 @@ def add(store: Store, result: ChunkResult) -> dict[str, float]:
     before, started = len(store.vectors_touched), user_s()
     mapping.consolidate = timed  # type: ignore[assignment]
     try:
-        mapping.add_chunk(store, 1, result)
+        if session == 1:
+            mapping.add_chunk(store, session, result)
+        else:
+            with store.transaction():
+                chunk_id = store.add_chunk(session, result)
+                first = min(c.component for c in store.chunks())
+                store.place_chunks({chunk_id: store.chunks()[0].S_world_chunk}, {chunk_id: first})
+                mapping.consolidate(store, chunk_id)
     finally:
         mapping.consolidate = consolidate
     taken = user_s() - started
