@@ -53,13 +53,12 @@ class ChangedPlaceSettings:
     """Its second longest side."""
     largest_m: float = 1.2
     """Diagonal of the largest; what is larger is a door, a curtain, or an error of placing."""
-    explained: float = 0.5
-    """Share of an instance that must be seen through for it to stand for what is gone there."""
-    replaced_m: float = 0.03
-    """Within this of what the other session shows to be new, a thing was replaced;"""
+    explained: float = 0.7
+    """Share of an instance that must lie at what is gone, or at what came in its place, for it to stand for what is
+    gone there; of what the other session tells about."""
     mixed: float = 0.2
-    """elsewhere, share of a found thing that lies on another instance of the chunk, of which most stayed, for the two
-    to be kept apart."""
+    """Share of a found thing that lies on another instance of the chunk, which does not stand for it, for the two to
+    be kept apart."""
     scrap: float = 0.35
     """Share of a cluster up to which what stands for it is a scrap of the thing, which is found anew as a whole."""
     part: float = 0.3
@@ -101,18 +100,21 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         return 0
     keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
     upright = store.get_value("gravity", "unknown") != "unknown"
-    asked: list[tuple[ChunkRow, list[View], float, Array]] = []
+    asked: list[tuple[ChunkRow, list[View], float, _Seen]] = []
     for chunk in near:
         others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
         if others and store.feature_space(chunk.chunk_id) == FEATURE_SPACE:
             unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
             own = views_of([chunk], keyframes, unit)
-            asked.append((chunk, own, unit, _gone(_ask(own, views_of(others, keyframes, unit), unit, s), s)))
+            asked.append((chunk, own, unit, _ask(own, views_of(others, keyframes, unit), unit, s)))
     added = 0
-    for chunk, own, unit, gone in asked:
-        came = [g for c, _, _, g in asked if _is(c, session_id) != _is(chunk, session_id) and len(g)]
+    gone = {chunk.chunk_id: _gone(seen, s) for chunk, _, _, seen in asked}
+    for chunk, own, unit, seen in asked:
+        came = [gone[c.chunk_id] for c, *_ in asked if _is(c, session_id) != _is(chunk, session_id)]
         nodes = store.local_nodes([chunk.chunk_id])
-        clusters = _unexplained(gone, nodes, chunk, unit, s)
+        place = _Change(gone[chunk.chunk_id], came, _told(seen, s), unit, s)
+        standing = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
+        clusters = _unexplained(place, nodes, standing, chunk)
         if not clusters:
             continue
         frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
@@ -123,9 +125,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
             thing = maker.make(following, cluster)
             if thing is not None:
                 store.add_local_instance(chunk.chunk_id, thing)
-                # Where a thing stands in the place of another, each hides part of the other's absence: no mixture.
-                if all(float(np.min(cKDTree(g).query(cluster)[0])) > s.replaced_m * unit for g in came):
-                    store.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, in_chunk, s))
+                store.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, standing, in_chunk, s))
                 following += 1
                 added += 1
     return added
@@ -230,21 +230,52 @@ def _is_thing(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
     return len(points) >= s.least_cells and sides[1] >= s.least_side_m * unit and not large
 
 
-def _unexplained(
-    points: Array, nodes: Sequence[LocalNode], chunk: ChunkRow, unit: float, s: ChangedPlaceSettings
-) -> list[Array]:
+def _told(seen: _Seen, s: ChangedPlaceSettings) -> Array:
+    """The surfaces that the other sessions tell of, one way or the other. Shape (K, 3)."""
+    return np.asarray(seen.points[seen.free + seen.met >= s.least_told])
+
+
+class _Change:
+    """What one chunk shows to have changed, world coordinates.
+
+    `gone` are its surfaces that the other sessions see through, `came` theirs that it sees through, `told` its surfaces
+    of which the others tell anything. Shapes (N, 3).
+    """
+
+    def __init__(
+        self, gone: Array, came: Sequence[Array], told: Array, unit: float, settings: ChangedPlaceSettings
+    ) -> None:
+        self.gone, self.unit, self.settings = gone, unit, settings
+        self._gone, self._told = cKDTree(gone), cKDTree(told)
+        self._either = cKDTree(np.concatenate([gone, *came]))
+
+    def explains(self, support: Array) -> bool:
+        """Whether all of an instance has changed: what is not seen through lies where something else stands now.
+
+        Two solid things that stood at one place leave surfaces that both sessions measure, so an instance is not asked
+        to be seen through as a whole; what reaches beyond the change is a mixture of what went with what stayed.
+        """
+        reach, link = 1.5 * self.settings.voxel_m * self.unit, self.settings.link_m * self.unit
+        if len(support) == 0 or len(self.gone) == 0:
+            return False
+        near = np.asarray(self._either.query(support, distance_upper_bound=link)[0] < np.inf)
+        if float(np.mean(near)) >= self.settings.explained or not near.any():
+            return bool(near.any())
+        known = np.asarray(self._told.query(support, distance_upper_bound=reach)[0] < np.inf)
+        return bool(known.any() and float(np.mean(near[known])) >= self.settings.explained)
+
+
+def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[bool], chunk: ChunkRow) -> list[Array]:
     """Clusters of surfaces that are gone and that no instance of the chunk stands for. Shapes (N, 3)."""
+    s, unit, points = place.settings, place.unit, place.gone
     clusters = _clusters(points, unit, s)
     if not clusters:
         return []
-    tree, reach = cKDTree(points), 1.5 * s.voxel_m * unit
+    reach = 1.5 * s.voxel_m * unit
     stood_for = np.zeros(len(points), bool)
-    for node in nodes:
-        support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
-        if len(support) == 0:
-            continue
-        inside = np.asarray(tree.query(support, distance_upper_bound=reach)[0] < np.inf)
-        if float(np.mean(inside)) >= s.explained:
+    for node, stands in zip(nodes, standing, strict=True):
+        if stands:
+            support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
             stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
     out = []
     for rows in clusters:
@@ -257,17 +288,16 @@ def _unexplained(
 
 
 def _mixed_with(
-    thing: LocalInstance, nodes: Sequence[LocalNode], unit: float, s: ChangedPlaceSettings
+    thing: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
 ) -> list[tuple[int, int]]:
     """Pairs of a thing with the chunk's instances that hold part of it beside what stayed: they are not this thing."""
-    tree, reach = cKDTree(thing.support.points), 1.5 * s.voxel_m * unit
+    reach = 1.5 * s.voxel_m * unit
     out = []
-    for node in nodes:
-        if len(node.support.points) == 0:
+    for node, stands in zip(nodes, standing, strict=True):
+        if stands or len(node.support.points) == 0:
             continue
-        inside = np.asarray(tree.query(node.support.points, distance_upper_bound=reach)[0] < np.inf)
         covered = cKDTree(node.support.points).query(thing.support.points, distance_upper_bound=reach)[0] < np.inf
-        if float(np.mean(inside)) < s.explained and float(np.mean(covered)) >= s.mixed:
+        if float(np.mean(covered)) >= s.mixed:
             out.append((node.local_id, thing.local_id))
     return out
 

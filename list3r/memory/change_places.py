@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.memory.bodies import fit_box
 from list3r.memory.change_records import ChangeSettings
@@ -16,7 +17,7 @@ from list3r.memory.records import ChunkRow
 from list3r.memory.shapes import ChunkShapes
 from list3r.memory.store import Store
 from list3r.memory.summaries import ChunkSummary, world_unit
-from list3r.memory.visibility import Look, View, changed_points, look, views_of
+from list3r.memory.visibility import Look, View, changed_points, look, seen_through_share, tally, views_of
 
 _SPREAD = 0.02
 """Share of points outside the box at either end by which things are compared."""
@@ -60,6 +61,7 @@ class Places:
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
         self._views: dict[tuple[int, int], list[View]] = {}
+        self._share: dict[tuple[Key, int, bool], float] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
@@ -70,7 +72,25 @@ class Places:
         if before:
             earlier = [s for s in owner if s < session]
             wanted = max(earlier) if earlier else session
-        return [k for k, s in zip(self.groups[n], owner, strict=True) if s == wanted]
+        inside = [k for k, s in zip(self.groups[n], owner, strict=True) if s == wanted]
+        return self._pure(n, inside, session, before=before)
+
+    def _pure(self, n: int, members: list[Key], session: int, *, before: bool) -> list[Key]:
+        """Those that hold least of what stayed, where what they show has changed: not what is mixed with a table."""
+        if len(members) < 2:
+            return members
+        shares = np.array([self._shares(key, n, session, before=before) for key in members])
+        common = float(np.average(shares, weights=[len(self._points_of(key)) + 1 for key in members]))
+        if common < self._s.seen_through / 2:
+            return members
+        return [k for k, share in zip(members, shares.tolist(), strict=True) if share >= self._s.pure * common]
+
+    def _shares(self, key: Key, n: int, session: int, *, before: bool) -> float:
+        """Share of the surface of one member that is seen through."""
+        name = (key, session, before)
+        if name not in self._share:
+            self._share[name] = self._changed(self._points_of(key), n, session, before=before)
+        return self._share[name]
 
     def points(self, n: int, session: int, *, before: bool) -> Array:
         """Some surface points, world coordinates. Shape (N, 3)."""
@@ -105,6 +125,32 @@ class Places:
             if found.verdict != "unseen":
                 return found
         return Look("unseen", 0.0, ())
+
+    def changed(self, n: int, session: int, *, before: bool) -> float:
+        """Share of its surface that is seen through, of what is told: of what was, by a session that comes after;
+        of what is, by the sessions before.
+        """
+        return self._changed(self.points(n, session, before=before), n, session, before=before)
+
+    def explained(self, n: int, new: Sequence[int], session: int) -> float:
+        """Share of the surface that a thing had which is seen through or lies at what is new there, of what is told."""
+        points = self.points(n, session, before=True)
+        free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
+        known = free + met > 0
+        if not known.any():
+            return 0.0
+        surfaces = [self.points(m, session, before=False) for m in new]
+        near = np.zeros(len(points), bool)
+        if any(len(x) for x in surfaces):
+            reach = self._s.replaced_link_m * self.unit
+            tree = cKDTree(np.concatenate(surfaces))
+            near = np.asarray(tree.query(points, distance_upper_bound=reach)[0] < np.inf)
+        return float(np.mean((near | (free > met))[known]))
+
+    def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
+        lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)
+        shares = (seen_through_share(points, views, self._s.visibility) for views in lists)
+        return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[View]]:
         """The views of the sessions before, in the world of a thing, the last session first."""

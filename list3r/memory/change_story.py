@@ -60,10 +60,10 @@ class Story:
         """What one session has changed."""
         p = self._p
         components = {c.component for c in p.rows.values() if c.session_id == session}
-        gone = self._missing(session, components)
         fresh = [n for n, s in enumerate(p.sessions) if s[0] == session and p.component[n] in components]
         fresh = [n for n in fresh if self._counts[n] and p.known_before(n, session)]
         looks = {n: p.look_before(n, session) for n in fresh}
+        gone = self._missing(session, components, [n for n in fresh if looks[n].verdict != "unseen"])
         left = {thing.now: p.box(thing.now, session, before=True) for thing, _ in gone}
         came = {n: p.box(n, session, before=False) for n in fresh}
         found_gone = {thing.now: found for thing, found in gone}
@@ -92,7 +92,7 @@ class Story:
             for place, box in left.items()
         )
 
-    def _missing(self, session: int, components: set[int]) -> list[tuple[_Thing, Look]]:
+    def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_Thing, Look]]:
         """The things that are gone from where they were; all others that were known are given their state."""
         p = self._p
         gone: list[tuple[_Thing, Look]] = []
@@ -106,11 +106,20 @@ class Story:
                 thing.state = "unseen"
                 if self._movable[thing.now] and p.frames(thing.now, session) >= self._s.least_frames:
                     found = p.look_after(thing.now, session)
-                    if found.verdict == "gone":
+                    if found.verdict == "gone" or self._taken(thing.now, found, fresh, session):
                         gone.append((thing, found))
                     elif found.verdict == "there" and self._counts[thing.now]:
                         self._still_there(thing, session, found)
         return gone
+
+    def _taken(self, n: int, found: Look, fresh: Sequence[int], session: int) -> bool:
+        """Whether something new stands where a thing was: what is not seen through of it lies at that."""
+        p, s = self._p, self._s
+        if found.verdict == "unseen" or p.changed(n, session, before=True) < s.seen_through:
+            return False
+        new = [m for m in fresh if p.component[m] == p.component[n]]
+        new = [m for m in new if p.changed(m, session, before=False) >= s.seen_through / 2]
+        return p.explained(n, new, session) >= s.explained
 
     def _things(self) -> list[_Thing]:
         return [thing for n, thing in sorted(self._thing.items()) if thing.places[0] == n]

@@ -92,7 +92,7 @@ def _derive_whole(
     motions = {(k, n): track for k, v in held.items() for n, track in v.motions.items()}
     shapes = {k: v.shapes for k, v in held.items()}
     pairs = without_moving(_known_pairs(store, settled, held), shapes, motions)
-    pairs = across_sessions(pairs, shapes, s.changes)
+    pairs = across_sessions(store, chunks, pairs, held, s.changes)
     word = store.constraints()
     groups, decisions = _partition(chunks, held, pairs, s.merging, word)
     groups, movers, joined = _with_movers(store, groups, chunks, held, motions, word, s)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import ChunkRow, Keyframe
 
+Ints = NDArray[np.int64]
+
 
 @dataclass(frozen=True)
 class VisibilitySettings:
@@ -135,12 +137,25 @@ def tell(points: Array, view: View, s: VisibilitySettings) -> NDArray[np.int8]:
 
 def changed_points(points: Array, views: Iterable[View], s: VisibilitySettings) -> NDArray[np.bool_]:
     """The points of a surface of which no more frames say that they are still there than that they are not. (N,)."""
-    balance = np.zeros(len(points), np.int64)
+    free, met = tally(points, views, s)
+    return np.asarray(free >= met)
+
+
+def tally(points: Array, views: Iterable[View], s: VisibilitySettings) -> tuple[Ints, Ints]:
+    """How many frames see through each point of a surface, and how many see it. Shapes (N,), (N,)."""
+    free, met = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
         told = tell(points, view, s)
-        balance += told == FREE
-        balance -= told == MET
-    return np.asarray(balance >= 0)
+        free += told == FREE
+        met += told == MET
+    return free, met
+
+
+def seen_through_share(points: Array, views: Iterable[View], s: VisibilitySettings) -> float | None:
+    """Share of a surface that more frames see through than see, of what they tell of; None where that is too little."""
+    free, met = tally(points, views, s)
+    known = free + met > 0
+    return float(np.mean(free[known] > met[known])) if known.sum() >= s.least_points else None
 
 
 def _told(points: Array, view: View, s: VisibilitySettings) -> tuple[int, int]:

@@ -1,0 +1,94 @@
+"""What stands in the place of what is gone: facts on rooms of boxes that are alike but for one thing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.memory.consolidation import consolidate
+from list3r.memory.geometry import Sim3
+from list3r.memory.merging import pair_scores
+from list3r.memory.seen_through import seen_through
+from list3r.memory.store import Store
+from list3r.memory.summaries import chunk_summaries
+from list3r.memory.visibility import View, VisibilitySettings, seen_through_share, tally
+from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
+
+TABLE = (0.0, 0.0, 0.75)
+S = VisibilitySettings()
+
+
+def _view(depth: float, frame: int = 0) -> View:
+    picture = np.full((120, 160), depth, np.float32)
+    return View(1, frame, Sim3.identity(), 1.0, picture, (130.0, 130.0, 79.5, 59.5))
+
+
+def _patch(z: float = 2.0) -> np.ndarray:
+    side = np.linspace(-0.06, 0.06, 6)
+    return np.array([[x, y, z] for x in side for y in side])
+
+
+def test_a_point_counts_the_frames_that_see_it_and_that_see_through_it() -> None:
+    free, met = tally(_patch(), [_view(2.0), _view(2.6, 1), _view(2.6, 2), _view(1.2, 3)], S)
+    assert set(free.tolist()) == {2}
+    assert set(met.tolist()) == {1}
+
+
+@pytest.mark.parametrize(("depths", "share"), [((2.0, 2.01), 0.0), ((2.6, 2.6), 1.0), ((1.2, 0.0), None), ((), None)])
+def test_a_surface_is_seen_through_or_not_or_nothing_is_told(depths: tuple[float, ...], share: float | None) -> None:
+    assert seen_through_share(_patch(), [_view(d, k) for k, d in enumerate(depths)], S) == share
+
+
+def _two(path: Path, second: dict[str, Box], first: dict[str, Box] | None = None) -> Path:
+    with Store.create(path) as store:
+        for room, start in ((first or dict(ROOM), 0.4), (second, 1.0)):
+            with store.transaction():
+                add_session(store, room, np.concatenate([cameras(TABLE, start), cameras(TABLE, start + 0.1)]))
+                place_together(store)
+                consolidate(store)
+    return path
+
+
+def _without(name: str) -> dict[str, Box]:
+    return {k: b for k, b in ROOM.items() if k != name}
+
+
+LOW = Box((0.05, -0.15, 0.78), (0.24, 0.16, 0.08), ROOM["green"].rgb)
+"""Stands where the green box stood and looks like it, but is lower and wider."""
+
+
+def test_what_stays_is_seen_through_by_nobody(tmp_path: Path) -> None:
+    with Store.open(_two(tmp_path / "a.l3r", dict(ROOM))) as store:
+        chunks, summaries = store.chunks(), dict(chunk_summaries(store).items())
+        u, v = (c.chunk_id for c in chunks)
+        pairs = {(u, v): pair_scores(summaries[u].shapes, summaries[v].shapes, Sim3.identity())}
+        through = seen_through(store, chunks, pairs, summaries, S)
+        assert through
+        assert max(through.values()) < 0.02
+        assert [e.kind for e in store.events(2) if e.kind != "seen_again"] == []
+
+
+def test_a_thing_of_the_same_look_in_the_place_of_another_is_not_seen_again(tmp_path: Path) -> None:
+    """Depth tells them apart, although colour does not."""
+    with Store.open(_two(tmp_path / "a.l3r", {**_without("green"), "low": LOW})) as store:
+        again = [e.from_box.center for e in store.events(2) if e.kind == "seen_again" and e.from_box is not None]
+        assert min(float(np.linalg.norm(c - ROOM["green"].center)) for c in again) > 0.1
+
+
+def test_two_that_change_places_both_move(tmp_path: Path) -> None:
+    """Either stands where the other stood, so neither place is empty."""
+    shapes = {"red": (0.26, 0.10, 0.14), "blue": (0.10, 0.26, 0.14)}
+    place = {"red": (-0.5, 0.15, 0.81), "blue": (0.5, 0.2, 0.81)}
+    before = {**ROOM, **{k: Box(place[k], shapes[k], ROOM[k].rgb) for k in shapes}}
+    after = {**before, "red": Box(place["blue"], shapes["red"], ROOM["red"].rgb)}
+    after["blue"] = Box(place["red"], shapes["blue"], ROOM["blue"].rgb)
+    with Store.open(_two(tmp_path / "a.l3r", after, before)) as store:
+        moved = [e for e in store.events(2) if e.kind == "moved"]
+        assert [e.kind for e in store.events(2) if e.kind not in ("seen_again", "moved")] == []
+        assert len(moved) == 2
+        for event in moved:
+            assert event.from_box is not None
+            assert event.to_box is not None
+            assert 0.9 < float(np.linalg.norm(event.to_box.center - event.from_box.center)) < 1.1
