@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import shutil
 import subprocess
 import sys
@@ -103,26 +102,27 @@ def _kill_runs(
     kills: int,
     rng: random.Random,
 ) -> Result:
+    remove_memory(whole)
     begin(whole)
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(alone, check=True, capture_output=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    length = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    first = chunks_in(whole)
+    pace = _pace(alone, whole)
     with Store.open(whole) as store:
         wanted = scene_dict(store)
+    remove_memory(memory)
     begin(memory)
-    first = chunks_in(memory)
     counts: Counter[str] = Counter()
     problems: list[str] = []
     while True:
         least = chunks_in(memory)
         process = subprocess.Popen(resumed, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        if counts["kills"] < kills and _runs_for(process, rng.uniform(0.1, 1.0) * length):
+        if counts["kills"] < kills and _reaches(process, memory, *_moment(pace, first, least, rng)):
             before = chunks_in(memory)
             process.kill()
             process.communicate()
             counts["kills"] += 1
             counts["with chunks committed"] += before > first
+            counts["with chunks committed by the killed run"] += before > least
+            counts["after the last chunk"] += before == first + len(pace) - 1
             problems += judge(memory, max(least, before))
             continue
         text = process.communicate()[1]
@@ -140,24 +140,62 @@ def _kill_runs(
         begin(memory)
 
 
+def _pace(command: list[str], memory: Path) -> list[float]:
+    """Run to the end; processor seconds to the first chunk that is committed, from each to the next, and to the end."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    held, spent, at = chunks_in(memory), 0.0, [0.0]
+    while process.poll() is None:
+        spent = max(spent, _spent_s(process))
+        now = chunks_in(memory)
+        at += [spent] * (now - held)
+        held = now
+        time.sleep(0.01)
+    if process.returncode != 0:
+        raise SystemExit(f"{' '.join(command)}: {process.communicate()[1].strip()}")
+    return [b - a for a, b in zip(at, [*at[1:], spent], strict=True)]
+
+
+def _moment(pace: list[float], first: int, held: int, rng: random.Random) -> tuple[int, float]:
+    """When to kill: some time after so many chunks are committed. All stretches between commits come up alike often, so
+    that most kills meet a memory that is being written; the one before the first commit is the longest.
+    """
+    stretch = rng.randrange(held - first, len(pace))
+    return first + stretch, rng.uniform(0.0, 1.0) * pace[0 if stretch == held - first else stretch]
+
+
+def _reaches(process: subprocess.Popen[str], memory: Path, chunks: int, cpu_s: float) -> bool:
+    """Wait until so many chunks are committed and so much of a processor was used since; False when it ends before."""
+    while process.poll() is None:
+        if chunks_in(memory) >= chunks:
+            return _runs_for(process, _spent_s(process) + cpu_s)
+        time.sleep(0.01)
+    return False
+
+
 def _runs_for(process: subprocess.Popen[str], cpu_s: float) -> bool:
     """Wait until a process and its children have used so much of a processor; False when it ends before.
 
     Not by the clock, so that the moment of a kill does not depend on what else the machine does.
     """
     while process.poll() is None:
-        if sum(map(_cpu_s, [process.pid, *descendants(process.pid)])) >= cpu_s:
+        if _spent_s(process) >= cpu_s:
             return True
         time.sleep(0.01)
     return False
 
 
+def _spent_s(process: subprocess.Popen[str]) -> float:
+    """Processor seconds of a process and of its children that run."""
+    return sum(map(_cpu_s, [process.pid, *descendants(process.pid)]))
+
+
 def _cpu_s(pid: int) -> float:
+    """Of the process and of its children that have ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:  # it has ended meanwhile
         return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 # ------------------------------------------------------------------------------------------- single transactions

@@ -3,7 +3,8 @@ bytes, truncation.
 
     python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --json benchmarks/results/safety.json
 
-Every process is real.
+Every process is real. The whole takes about half an hour on a quiet core; a part is written to the file as it is done,
+and the same command with --resume goes on after the last one.
 """
 
 from __future__ import annotations
@@ -13,16 +14,19 @@ import json
 import multiprocessing
 import random
 import shutil
+import subprocess
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 from queue import Empty
 from typing import Any
 
 import numpy as np
-from kills import kill_builds, kill_commands, kill_edits, kill_updates, kill_writes
+from kills import build_command, kill_builds, kill_commands, kill_edits, kill_updates, kill_writes, update_command
+from machine import machine, write_json
 
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.connection import remove_memory
@@ -30,6 +34,7 @@ from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.records import Observation, Relation
 from list3r.memory.repair import repair
 from list3r.memory.store import Store
+from list3r.simulation.dataset import WalkSettings, write_walk
 
 Result = dict[str, Any]
 
@@ -280,48 +285,88 @@ def main() -> None:
     parser.add_argument("--flips", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--resume", action="store_true", help="keep the parts that the file holds already")
     words = parser.parse_args()
-    from machine import machine, write_json
-
     print(machine())
-    result: Result = {}
+    asked = {"kills": words.kills, "minutes": words.minutes, "flips": words.flips, "seed": words.seed}
+    result: Result = {"asked": asked}
+    if words.resume and words.json is not None and words.json.exists():
+        held = json.loads(words.json.read_text(encoding="utf-8"))
+        if held.pop("machine") != machine() or held["asked"] != asked:
+            raise SystemExit(f"{words.json} was measured on another machine or asked for something else")
+        result = held
     with tempfile.TemporaryDirectory() as name:
-        for key, value in _parts(Path(name), words):
-            result[key] = value
-            print(key, json.dumps(value, indent=2), flush=True)
-            write_json(words.json, result)
-    if any(isinstance(v, dict) and v["problems"] for v in result.values()):
+        for key, part in _parts(Path(name), words):
+            if key not in result:
+                result[key] = part()
+                print(key, json.dumps(result[key], indent=2), flush=True)
+                write_json(words.json, result)
+    if any(isinstance(v, dict) and v.get("problems") for v in result.values()):
         raise SystemExit(1)
 
 
-def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Any]]:
-    """Name and result of each part, as it is done."""
-    from list3r.simulation.dataset import WalkSettings, write_walk
-
+def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Name of each part and what does it, in order; what several need is made when the first of them does."""
     seed, runs = words.seed, 3 * words.kills // 10
     edits, writes = (words.kills - 2 * runs) // 4, (words.kills - 2 * runs) // 4
-    first = write_walk(folder / "first", WalkSettings(seed=3, frames=36, size=(128, 96)), workers=1)
-    second = WalkSettings(seed=3, walk_seed=4, start=6, frames=24, size=(128, 96))
-    yield "kills while building", kill_builds(first, folder, runs, seed)
-    memory = folder / "whole.l3r"
-    again = write_walk(folder / "second", second, workers=1)
-    yield "kills while updating", kill_updates(memory, again, folder, runs, seed + 1)
-    updated = folder / "updated.l3r"
+    made = _Memories(folder)
+    yield "kills while building", lambda: kill_builds(made.first, folder, runs, seed)
+    yield "kills while updating", lambda: kill_updates(made.built, made.second, folder, runs, seed + 1)
     for part, kill, count in (
         ("kills while writing", kill_writes, writes),
         ("kills while editing", kill_edits, edits),
         ("kills of commands that edit", kill_commands, words.kills - 2 * runs - edits - writes),
     ):
         # A file of its own for each: what a killed writer left beside one belongs to no other.
-        yield part, kill(Path(shutil.copy(updated, folder / f"{kill.__name__}.l3r")), count, seed + 2)
-    yield "flips", flip(memory, folder, words.flips, seed)
-    yield "repairs", repair_flips(memory, folder, words.flips // 10, seed + 1)
-    yield "file_mb", round(memory.stat().st_size / 1e6, 2)
+        yield part, lambda k=kill, n=count: k(_copy(made.updated, k.__name__), n, seed + 2)
+    yield "flips", lambda: flip(made.built, folder, words.flips, seed)
+    yield "repairs", lambda: repair_flips(made.built, folder, words.flips // 10, seed + 1)
+    yield "file_mb", lambda: round(made.built.stat().st_size / 1e6, 2)
+    yield "verify_s", lambda: _verify_s(made.built)
+    yield "readers", lambda: write_and_read(_copy(made.built, "read"), 60 * words.minutes)
+
+
+class _Memories:
+    """Two videos of one home, the memory of the first, and that of both; each made when it is asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @cached_property
+    def first(self) -> Path:
+        """36 frames, 4 chunks."""
+        return write_walk(self.folder / "first", WalkSettings(seed=3, frames=36, size=(128, 96)), workers=1)
+
+    @cached_property
+    def second(self) -> Path:
+        """40 frames, 5 chunks, along another path."""
+        settings = WalkSettings(seed=3, walk_seed=4, start=6, frames=40, size=(128, 96))
+        return write_walk(self.folder / "second", settings, workers=1)
+
+    @cached_property
+    def built(self) -> Path:
+        """The memory of the first video."""
+        memory = self.folder / "built.l3r"
+        subprocess.run(build_command(self.first, memory), check=True, capture_output=True)
+        return memory
+
+    @cached_property
+    def updated(self) -> Path:
+        """The memory of both videos."""
+        memory = Path(shutil.copy(self.built, self.folder / "both.l3r"))
+        subprocess.run(update_command(self.second, memory), check=True, capture_output=True)
+        return memory
+
+
+def _copy(memory: Path, name: str) -> Path:
+    return Path(shutil.copy(memory, memory.with_name(f"{name}.l3r")))
+
+
+def _verify_s(memory: Path) -> float:
     started = time.process_time()
     with Store.open(memory) as store:
         store.verify()
-    yield "verify_s", round(time.process_time() - started, 3)
-    yield "readers", write_and_read(folder / "killed.l3r", 60 * words.minutes)
+    return round(time.process_time() - started, 3)
 
 
 if __name__ == "__main__":
