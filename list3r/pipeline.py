@@ -21,6 +21,7 @@ from list3r.frames.source import SourceOptions
 from list3r.mapping import finish_session
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.store import Store
+from list3r.models.licences import DEFAULT_PROFILE
 from list3r.reconstruction.registry import entry
 from list3r.session_stage import Job, Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare, shot_cuts
 
@@ -64,6 +65,7 @@ def build(
     workers: int | None = None,
     resume: bool = False,
     force: bool = False,
+    licence: str = DEFAULT_PROFILE,
     debug_dir: str | Path | None = None,
     progress: Progress | None = None,
     look: Look | None = None,
@@ -74,7 +76,7 @@ def build(
     memory in which cameras are placed, which `resume` goes on with.
     """
     started = time.monotonic()
-    job = prepare(source, options, settings, workers)
+    job = prepare(source, options, settings, workers, licence)
     if debug_dir is not None:
         _make_folder(Path(debug_dir))
     with open_target(Path(memory), job.info, job.settings, resume=resume, force=force) as target:
@@ -119,7 +121,7 @@ def _finish(store: Store, info: SourceInfo, plan: Plan, started: float) -> Build
         why = lost_reasons(store, plan.session)
         hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
         raise TrackingError(
-            f"the camera could not be followed in any of the {len(frames)} frames of {info.path}; "
+            f"the camera could not be followed in any frame of {info.path} ({_count(len(frames), 'frame')}); "
             + "; ".join(filter(None, (*why[:1], hint)))
         )
     with threadpool_limits(1):

@@ -40,7 +40,11 @@ class CalibrationSettings:
     """Largest k1 believed."""
     least_shift_px: float = 0.3
     """Distortion that shifts the corners of the picture by less is none."""
-    most_focal_ratio: float = 1.15
+    window_sigma: float = 0.09
+    """Standard deviation of the logarithm of one window's focal length (redkitchen, 60 to 100 frames: 0.087)."""
+    window_weight: float = 4.0
+    """So many windows' worth is that belief when the windows of a video tell their own spread."""
+    doubted_sigmas: float = 2.5
     """A given focal length farther off than this is doubted aloud."""
     tracks: TrackSettings = field(default_factory=TrackSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
@@ -57,6 +61,8 @@ class Calibration:
     """Windows that it stands on; 0 where none could be mapped and the camera is as it was."""
     focal_px: float | None
     """Focal length by the pictures alone, None where they did not tell."""
+    focal_sigma: float | None = None
+    """Standard deviation of its logarithm."""
     notes: tuple[str, ...] = ()
     """What the user should know, one sentence each."""
 
@@ -75,18 +81,20 @@ def calibrate(
     if found is None:
         return _nothing(start, known)
     windows, free, k1 = found
+    sigma = _focal_sigma(windows, chosen)
+    told = f"{free.fx:.0f} px, give or take {100 * sigma:.0f} %"
     if not known:
-        said = f"the camera was estimated from the pictures: focal length {free.fx:.0f} px, distortion k1 {k1:.3f}"
-        return Calibration(_lens(free, k1, chosen), len(windows), free.fx, (said,))
-    if abs(np.log(free.fx / start.fx)) > np.log(chosen.most_focal_ratio):
+        said = f"the camera was estimated from the pictures: focal length {told}; distortion k1 {k1:.3f}"
+        return Calibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, (said,))
+    if abs(np.log(free.fx / start.fx)) > chosen.doubted_sigmas * sigma:
         said = (
-            f"the given focal length {start.fx:.0f} px does not fit the pictures, which say about {free.fx:.0f} px; "
+            f"the given focal length {start.fx:.0f} px does not fit the pictures, which say about {told}; "
             "check --intrinsics, or leave it out"
         )
-        return Calibration(start, len(windows), free.fx, (said,))
+        return Calibration(start, len(windows), free.fx, sigma, (said,))
     _, k1 = _adjust_together(windows, start, False, chosen)
     lens = start if abs(k1) > chosen.distortion_range else _lens(start, k1, chosen)
-    return Calibration(lens, len(windows), free.fx)
+    return Calibration(lens, len(windows), free.fx, sigma)
 
 
 _Windows = list[tuple[MapProblem, SparseMap]]
@@ -122,7 +130,14 @@ def _nothing(start: Camera, known: bool) -> Calibration:
     if known:
         return Calibration(start, 0, None)
     said = f"the camera could not be estimated; a focal length of {start.fx:.0f} px is a guess: give --intrinsics"
-    return Calibration(start, 0, None, (said,))
+    return Calibration(start, 0, None, notes=(said,))
+
+
+def _focal_sigma(windows: _Windows, settings: CalibrationSettings) -> float:
+    """Standard deviation of the logarithm of the focal length of all windows, from how far they differ."""
+    logs = np.log([found.camera.fx for _, found in windows])
+    square = settings.window_weight * settings.window_sigma**2 + float(((logs - logs.mean()) ** 2).sum())
+    return float(np.sqrt(square / (settings.window_weight + len(logs) - 1) / len(logs)))
 
 
 def _spans(count: int, settings: CalibrationSettings) -> list[tuple[int, int]]:
