@@ -17,9 +17,11 @@ import numpy as np
 from list3r.memory.change_places import Places
 from list3r.memory.change_records import Change, Changes, ChangeSettings
 from list3r.memory.change_story import Story
+from list3r.memory.geometry import Sim3
 from list3r.memory.merging import Key, PairScores
 from list3r.memory.records import ChangeEvent, ChunkRow
-from list3r.memory.seen_through import seen_through
+from list3r.memory.seen_through import SeenThrough
+from list3r.memory.shapes import ChunkShapes
 from list3r.memory.store import Store
 from list3r.memory.summaries import ChunkSummary
 
@@ -29,19 +31,18 @@ _LIGHTNESS = np.array([0.5, 1.0, 1.0])
 
 
 def across_sessions(
-    store: Store,
-    chunks: Sequence[ChunkRow],
     pairs: Mapping[tuple[int, int], PairScores],
-    summaries: Mapping[int, ChunkSummary],
+    shapes: Mapping[int, ChunkShapes],
+    S_graph_chunk: Mapping[int, Sim3],
+    seen: SeenThrough,
     settings: ChangeSettings,
 ) -> dict[tuple[int, int], PairScores]:
     """Scores of pairs without those that plainly are two things of two sessions at one place."""
-    if len({c.session_id for c in chunks}) < 2:
+    if len({s.session_id for s in shapes.values()}) < 2:
         return dict(pairs)
-    through = seen_through(store, chunks, pairs, summaries, settings.visibility)
     out = {}
     for (u, v), p in pairs.items():
-        a, b = summaries[u].shapes, summaries[v].shapes
+        a, b = shapes[u], shapes[v]
         if a.session_id == b.session_id:
             out[u, v] = p
             continue
@@ -50,10 +51,9 @@ def across_sessions(
         whole &= np.maximum(size_a, size_b) < settings.small_m
         color = np.linalg.norm((a.lab[p.i] - b.lab[p.j]) * _LIGHTNESS, axis=1)
         ratio = np.maximum(size_a, size_b) / np.maximum(np.minimum(size_a, size_b), 1e-9)
-        changed_a = np.array([through.get((u, i, b.session_id), 0.0) for i in p.i.tolist()])
-        changed_b = np.array([through.get((v, j, a.session_id), 0.0) for j in p.j.tolist()])
+        changed = seen.shares(a, b, p, S_graph_chunk[v].inverse() @ S_graph_chunk[u])
         keep = ~(whole & ((color > settings.other_color) | (ratio > settings.other_size)))
-        one, both = np.maximum(changed_a, changed_b), np.minimum(changed_a, changed_b)
+        one, both = np.maximum(*changed), np.minimum(*changed)
         keep &= (one < settings.seen_through) | (~whole & (both < settings.seen_through / 2))
         out[u, v] = PairScores(*(x[keep] for x in (p.i, p.j, p.i_on_j, p.j_on_i, p.shared, p.frame_iou)))
     return out

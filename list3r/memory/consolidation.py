@@ -35,6 +35,7 @@ from list3r.memory.moving import Mover, Tracks, join_movers, without_moving
 from list3r.memory.records import ChunkRow, MergeDecision, MotionTrack, Observation, Relation
 from list3r.memory.relation_scene import Measured
 from list3r.memory.relations import relations
+from list3r.memory.seen_through import SeenThrough
 from list3r.memory.settling import Settled, neighbours, settle
 from list3r.memory.store import Store
 from list3r.memory.structure import classify_structure, flagged_only
@@ -92,7 +93,8 @@ def _derive_whole(
     motions = {(k, n): track for k, v in held.items() for n, track in v.motions.items()}
     shapes = {k: v.shapes for k, v in held.items()}
     pairs = without_moving(_known_pairs(store, settled, held), shapes, motions)
-    pairs = across_sessions(store, chunks, pairs, held, s.changes)
+    seen = SeenThrough(store, s.changes.visibility)
+    pairs = across_sessions(pairs, shapes, settled.S_graph_chunk, seen, s.changes)
     word = store.constraints()
     groups, decisions = _partition(chunks, held, pairs, s.merging, word)
     groups, movers, joined = _with_movers(store, groups, chunks, held, motions, word, s)

@@ -21,6 +21,7 @@ from list3r.memory.merge_nodes import Nodes
 from list3r.memory.merging import NONE, Links, form_groups, links_of
 from list3r.memory.moving import Mover, Tracks, join_movers, tied_movers, without_moving
 from list3r.memory.records import MergeDecision, MotionTrack
+from list3r.memory.seen_through import SeenThrough
 from list3r.memory.settling import neighbours
 from list3r.memory.shapes import ChunkShapes
 from list3r.memory.store import Store
@@ -83,6 +84,7 @@ class Region:
         self._extents = np.array([r.extent for r in self._rows.values()])
         self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
         self._word = store.constraints()
+        self._seen_through = SeenThrough(store, self._s.changes.visibility)
         self._placed: dict[int, Sim3] = {}
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._paired: set[int] = set()
@@ -149,7 +151,9 @@ class Region:
         if found is None or any(a is not b for a, b in zip(found.rows, rows, strict=True)) or found.stamp != stamp:
             shapes = {k: self._shapes(k) for k in pair}
             known = {pair: unpack_scores(self._store.overlap(pair))}
-            scores = across_sessions(without_moving(known, shapes, self._motions(pair)), shapes, self._s.changes)[pair]
+            known = without_moving(known, shapes, self._motions(pair))
+            graph = {k: self._rows[k].S_graph_chunk for k in pair}
+            scores = across_sessions(known, shapes, graph, self._seen_through, self._s.changes)[pair]
             u, v = (self._nodes_of(k) for k in pair)
             found = kept[pair] = _Pair(rows, stamp, scores, links_of(u, v, scores, self._s.merging))
         kept.move_to_end(pair)

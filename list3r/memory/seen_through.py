@@ -6,55 +6,51 @@ other. That is asked of depth alone, so it holds for two things that look alike 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import OrderedDict
 
 import numpy as np
 
+from list3r.memory.geometry import Array, Sim3
 from list3r.memory.merging import PairScores
-from list3r.memory.records import ChunkRow
+from list3r.memory.shapes import ChunkShapes
 from list3r.memory.store import Store
-from list3r.memory.summaries import ChunkSummary, world_unit
-from list3r.memory.visibility import View, VisibilitySettings, seen_through_share, views_of
+from list3r.memory.visibility import View, VisibilitySettings, chunk_views, seen_through_share
 
-Through = dict[tuple[int, int, int], float]
-"""By chunk, position in it, and other session: share of its points that are seen through, of those it tells about."""
+_KEPT = 64
+"""Chunks whose depth pictures are kept at hand."""
 
 
-def seen_through(
-    store: Store,
-    chunks: Sequence[ChunkRow],
-    pairs: Mapping[tuple[int, int], PairScores],
-    summaries: Mapping[int, ChunkSummary],
-    settings: VisibilitySettings,
-    least_overlap: float = 0.2,
-) -> Through:
-    """Ask the chunks of other sessions that hold something at the place of an instance about that instance.
+class SeenThrough:
+    """Asks the keyframes of one chunk about the instances of another one."""
 
-    Only instances that meet one of another session are asked about, and only in the chunks where it was found, so the
-    cost depends on what two sessions share. An instance of which nothing is told has no entry.
-    """
-    rows = {c.chunk_id: c for c in chunks}
-    asked: dict[tuple[int, int, int], set[int]] = {}
-    for (u, v), p in pairs.items():
-        if rows[u].session_id == rows[v].session_id:
-            continue
-        meet = np.maximum(p.i_on_j, p.j_on_i) >= least_overlap
-        for i, j in zip(p.i[meet].tolist(), p.j[meet].tolist(), strict=True):
-            asked.setdefault((u, i, rows[v].session_id), set()).add(v)
-            asked.setdefault((v, j, rows[u].session_id), set()).add(u)
-    unit = world_unit(chunks, summaries)
-    views: dict[int, list[View]] = {}
-    out: Through = {}
-    for key, others in sorted(asked.items()):
-        shapes = summaries[key[0]].shapes
-        if shapes.structure[key[1]]:
-            continue
-        start, stop = np.searchsorted(shapes.owner, [key[1], key[1] + 1])
-        points = rows[key[0]].S_world_chunk.apply(shapes.points[start:stop])
-        for other in sorted(others):
-            if other not in views:
-                views[other] = views_of([rows[other]], {other: store.keyframes(other)}, unit)
-        share = seen_through_share(points, [v for other in sorted(others) for v in views[other]], settings)
-        if share is not None:
-            out[key] = share
-    return out
+    def __init__(self, store: Store, settings: VisibilitySettings, least_overlap: float = 0.2) -> None:
+        self._store, self._s, self._least = store, settings, least_overlap
+        self._views: OrderedDict[int, list[View]] = OrderedDict()
+
+    def shares(self, u: ChunkShapes, v: ChunkShapes, p: PairScores, S_v_u: Sim3) -> tuple[Array, Array]:
+        """For each pair of instances of two chunks the share of either that the other chunk sees through.
+
+        Of what that chunk tells about; 0 where it tells too little, where the two hardly meet, and for structure.
+        Shape (E,) each.
+        """
+        meet = np.maximum(p.i_on_j, p.j_on_i) >= self._least
+        return self._of(u, v, p.i, meet, S_v_u), self._of(v, u, p.j, meet, S_v_u.inverse())
+
+    def _of(self, own: ChunkShapes, other: ChunkShapes, at: np.ndarray, meet: np.ndarray, S_other_own: Sim3) -> Array:
+        out = np.zeros(len(at))
+        for n in np.unique(at[meet]).tolist():
+            if not own.structure[n]:
+                start, stop = np.searchsorted(own.owner, [n, n + 1])
+                points = S_other_own.apply(own.points[start:stop])
+                out[meet & (at == n)] = seen_through_share(points, self._views_of(other), self._s) or 0.0
+        return out
+
+    def _views_of(self, shapes: ChunkShapes) -> list[View]:
+        """The keyframes of a chunk, in its own coordinates."""
+        k = shapes.chunk_id
+        if k not in self._views:
+            self._views[k] = chunk_views(shapes.session_id, self._store.keyframes(k), shapes.unit)
+        self._views.move_to_end(k)
+        while len(self._views) > _KEPT:
+            self._views.popitem(last=False)
+        return self._views[k]

@@ -84,6 +84,16 @@ def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyfra
     return out
 
 
+def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> list[View]:
+    """The keyframes of one chunk that have depth, with the chunk's own frame as the world; `unit` is a metre there."""
+    kept = [k for k in keyframes if k.depth_small.size]
+    S_cam_chunk = [Sim3.from_matrix(k.T_chunk_cam).inverse() for k in kept]
+    return [
+        View(session_id, k.frame_index, S, unit, k.depth_small, k.camera_small)
+        for k, S in zip(kept, S_cam_chunk, strict=True)
+    ]
+
+
 def look(points: Array, views: Iterable[View], settings: VisibilitySettings | None = None) -> Look:
     """Ask frames about surface points of one thing, world coordinates, shape (N, 3)."""
     s = settings or VisibilitySettings()
