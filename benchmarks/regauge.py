@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="only the first so many")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
-    options, settings = SourceOptions(), BuildSettings(keep_pictures=False)
+    options, settings = SourceOptions(), BuildSettings("rgbd", keep_pictures=False)
     source = open_source(words.source, options)
     count = min(source.info.frame_count, words.frames or source.info.frame_count)
     tasks = [ChunkTask(str(words.source), options, span, settings) for span in plan_chunks(count, settings.chunks)]

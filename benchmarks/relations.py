@@ -129,7 +129,7 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
 
 def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str) -> dict[tuple[int, int], int]:
     """Add all chunks with told masks; the true id of every local instance."""
-    settings = BuildSettings(poses=poses, keep_pictures=False)
+    settings = BuildSettings("rgbd", poses, keep_pictures=False)
     source = open_source(walk, SourceOptions())
     with store.transaction():
         store.set_value("scale_kind", "metric")

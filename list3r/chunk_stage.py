@@ -36,8 +36,8 @@ from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 class BuildSettings:
     """What shapes a memory. Two builds of one source with equal settings give equal memories."""
 
-    reconstruction: str = "rgbd"
-    """The reconstruction model."""
+    reconstruction: str = "auto"
+    """The reconstruction model; auto: rgbd where the source has depth, else sfm (see `session_stage`)."""
     poses: str = "estimate"
     """given or estimate."""
     device: str = "auto"

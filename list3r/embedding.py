@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import OptionError
 from list3r.memory.store import Store
+from list3r.models.licences import DEFAULT_PROFILE, choose_weights
 
 if TYPE_CHECKING:
     from list3r.models.text_image import TextImageModel
@@ -50,35 +51,43 @@ class _View:
 
 
 def embed_memory(
-    path: Path, weights: str, device: str = "auto", progress: Callable[[int, int], None] | None = None
+    path: Path,
+    weights: str | None = None,
+    device: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    model: str = "siglip2",
+    licence: str = DEFAULT_PROFILE,
 ) -> EmbedReport:
     """Give every thing of a memory a vector in the model's space; one step, all or nothing.
 
-    `weights` is a folder or a name of the hub's cache, which the memory remembers, so that words can be compared later.
-    Raises `OptionError` when the memory keeps no pictures or the weights cannot be loaded, `MemoryFileError`.
+    `weights` are a folder or a repository instead of the model's own; the memory remembers them by commit, so that
+    words can be compared later. Raises `OptionError` when the memory keeps no pictures, the licence profile forbids the
+    weights or they cannot be had or loaded, `MemoryFileError`.
     """
     from list3r.models.cache import locate
     from list3r.models.text_image import TextImageModel
 
+    weights = _weights(model, weights, licence)
     with Store.open(path, writable=True) as store:
         views = _views(store)
         if not views:
             raise OptionError(f"{path} keeps no pictures of its things; build it without --no-pictures")
-        model = TextImageModel(locate(weights), device)
+        network = TextImageModel(locate(weights), device)
         sums: dict[int, NDArray[np.float64]] = {}
         for done, (chunk_id, wanted) in enumerate(sorted(views.items())):
-            _look(store, chunk_id, wanted, model, sums)
+            _look(store, chunk_id, wanted, network, sums)
             if progress is not None:
                 progress(done + 1, len(views))
         ids = sorted(sums)
         vectors = np.array([sums[i] / max(float(np.linalg.norm(sums[i])), 1e-9) for i in ids], np.float32)
         with store.transaction():
-            store.put_embeddings(model.space, ids, vectors)
+            store.put_embeddings(network.space, ids, vectors)
             known = dict(store.get_value("text_models", {}))
-            known[model.space] = weights
+            known[network.space] = weights
             store.set_value("text_models", known)
         everything = len(store.instances())
-    return EmbedReport(model.space, len(ids), everything - len(ids))
+    return EmbedReport(network.space, len(ids), everything - len(ids))
 
 
 class StoredWords:
@@ -127,6 +136,21 @@ def stored_words(store: Store, device: str = "auto") -> StoredWords | None:
         if space in spaces:
             return StoredWords(space, str(weights), device)
     return None
+
+
+def _weights(model: str, asked: str | None, licence: str) -> str:
+    """The weights of a text and image model, a path or `owner/name@commit`. Raises `OptionError`."""
+    from list3r.models.cache import resolve
+    from list3r.models.cards import CARDS, find_card
+    from list3r.models.choice import check_package
+
+    card = find_card(model, "text")
+    if card is None:
+        known = " or ".join(sorted(c.name for c in CARDS if c.part == "text"))
+        raise OptionError(f"--model {model} compares no words with pictures; choose {known}")
+    chosen = choose_weights(card, asked, licence, "--model")
+    check_package(card)
+    return resolve(asked, chosen, f"--model {model}")
 
 
 def _views(store: Store) -> dict[int, list[_View]]:

@@ -7,7 +7,9 @@ frames -> chunks -> reconstruction + local instance library        (any process,
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -158,13 +160,22 @@ def _notes(store: Store, session: int, lost: int, bad: int, components: int) -> 
     if lost and store.get_value("poses") == "given":
         notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
     elif lost:
-        notes.append(f"the camera could not be followed in {_count(lost, 'frame')}; they have no pose")
+        where = _runs([f.frame_index for f in store.frames(session) if f.state == "lost"])
+        notes.append(f"the camera could not be followed in {_count(lost, 'frame')} ({where}); they have no pose")
     notes += lost_reasons(store, session)
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
     if store.get_value("gravity") == "unknown":
         notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
     return tuple(notes)
+
+
+def _runs(numbers: Sequence[int], most: int = 5) -> str:
+    """Ascending numbers in words: those that follow each other by their first and last."""
+    breaks = [k for k in range(1, len(numbers)) if numbers[k] != numbers[k - 1] + 1]
+    runs = [(numbers[a], numbers[b - 1]) for a, b in pairwise([0, *breaks, len(numbers)])]
+    shown = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in runs[:most])
+    return shown + (f" and {len(runs) - most} more stretches" if len(runs) > most else "")
 
 
 def _count(number: int, what: str) -> str:

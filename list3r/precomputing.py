@@ -16,6 +16,7 @@ from list3r.frames.cuts import find_cuts
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, TrackingError
+from list3r.models.licences import DEFAULT_PROFILE
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.precomputed_files import (
     MANIFEST,
@@ -53,6 +54,7 @@ def precompute(
     info: SourceInfo,
     *,
     force: bool = False,
+    licence: str = DEFAULT_PROFILE,
     progress: Callable[[int, int], None] | None = None,
 ) -> PrecomputeReport:
     """Reconstruct every chunk of a source and write one file for each into `out`; finished files are kept.
@@ -61,7 +63,7 @@ def precompute(
     """
     settings = resolve_settings(settings, info)
     check_buildable(info, settings)
-    settings = with_weights(settings)
+    settings = with_weights(settings, licence)
     opened = open_source(source, options)
     cuts = () if settings.poses == "given" else tuple(find_cuts(opened))
     spans = plan_chunks(info.frame_count, settings.chunks, cuts)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,7 +92,7 @@ def build(
     """
     from list3r import pipeline
 
-    run = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
     pipeline.build(source, memory, force=force, licence=licence, **run)
     return open(memory)
 
@@ -114,7 +114,7 @@ def update(
     """
     from list3r import updating
 
-    run = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
     updating.update(memory, source, licence=licence, **run)
     return open(memory)
 

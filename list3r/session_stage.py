@@ -23,7 +23,9 @@ from list3r.memory.errors import OptionError
 from list3r.memory.records import ChunkResult
 from list3r.memory.store import Store
 from list3r.models.cards import find_card
-from list3r.models.choice import pinned_weights
+from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
+from list3r.models.licences import DEFAULT_PROFILE
+from list3r.models.presets import Selection
 from list3r.reconstruction.registry import MODELS, entry
 from list3r.workers import OrderedPool, default_workers
 
@@ -64,7 +66,11 @@ class Plan:
 
 
 def prepare(
-    source: str | Path, options: SourceOptions | None, settings: BuildSettings | None, workers: int | None
+    source: str | Path,
+    options: SourceOptions | None,
+    settings: BuildSettings | None,
+    workers: int | None,
+    licence: str = DEFAULT_PROFILE,
 ) -> Job:
     """Open a source and make everything definite that was left open. Raises `SourceError` and `OptionError`."""
     options = options or SourceOptions()
@@ -73,7 +79,7 @@ def prepare(
     check_buildable(info, settings)
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: at least 1 process is needed")
-    return Job(source, options, with_weights(settings), info, workers)
+    return Job(source, options, with_weights(settings, licence), info, workers)
 
 
 def plan_session(
@@ -205,18 +211,20 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
     check_choice(settings.discovery, settings.tracking, settings.features)
 
 
-def with_weights(settings: BuildSettings) -> BuildSettings:
+def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:
     """The settings with the weights of every network named by their commit, fetched where they are not in the cache.
 
-    Raises `OptionError` when a package is missing or weights can be had neither from the disk nor from the hub.
+    Raises `OptionError` for what the licence profile forbids, when a package is missing, or when weights can be had
+    neither from the disk nor from the hub.
     """
+    chosen = Selection(settings.reconstruction, settings.discovery, settings.tracking, settings.features)
     known = dict(settings.instance_weights)
-    for option in ("discovery", "tracking", "features"):
-        name = getattr(settings, option)
-        found = pinned_weights(option, name, known.get(f"{option}/{name}"))
-        if found is not None:
-            known[f"{option}/{name}"] = found
-    weights = pinned_weights("reconstruction", settings.reconstruction, settings.weights)
+    asked = {name: known[key] for name in PARTS_OF_OPTIONS if (key := f"{name}/{getattr(chosen, name)}") in known}
+    if settings.weights is not None:
+        asked["reconstruction"] = settings.weights
+    found = pinned_weights(chosen, asked, licence)
+    weights = found.pop("reconstruction", None)
+    known |= {f"{name}/{getattr(chosen, name)}": where for name, where in found.items()}
     return replace(settings, weights=weights, instance_weights=tuple(sorted(known.items())))
 
 

@@ -21,6 +21,7 @@ from list3r.mapping import finish_session
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Edge
 from list3r.memory.store import Store
+from list3r.models.licences import DEFAULT_PROFILE
 from list3r.session_stage import Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare
 
 
@@ -61,6 +62,7 @@ def update(
     settings: BuildSettings | None = None,
     workers: int | None = None,
     resume: bool = False,
+    licence: str = DEFAULT_PROFILE,
     progress: Progress | None = None,
     look: Look | None = None,
 ) -> UpdateReport:
@@ -70,7 +72,7 @@ def update(
     was and the chunks that were finished, which `resume` goes on with.
     """
     started = time.monotonic()
-    job = prepare(source, options, settings, workers)
+    job = prepare(source, options, settings, workers, licence)
     with Store.open(memory, writable=True) as store:
         session = _session(store, job.info, job.settings, resume=resume)
         plan = plan_session(store, session, job, look)

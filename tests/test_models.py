@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
@@ -15,6 +15,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+import list3r
+from list3r.chunk_stage import BuildSettings
+from list3r.embedding import embed_memory
 from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
 from list3r.memory.errors import OptionError
 from list3r.models.cache import (
@@ -45,6 +48,8 @@ from list3r.models.device import Gpu
 from list3r.models.licences import PROFILES, choose_weights, objection, terms
 from list3r.models.presets import Selection, obstacle, select
 from list3r.reconstruction.registry import MODELS
+from list3r.session_stage import prepare, with_weights
+from tests import neural_scenes
 
 GPU = Gpu("a GPU", 24_000.0, 23_000.0)
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -128,7 +133,9 @@ def test_a_profile_takes_the_first_weights_that_it_allows() -> None:
     both = card(APACHE, Weights("a/nc", CC_BY_NC), Weights("a/free", APACHE))
     free = choose_weights(both, None, "permissive", "--x")
     assert free is not None and free.repository == "a/free"
-    assert choose_weights(both, "someone/else", "permissive", "--x") is None
+    with pytest.raises(OptionError, match="someone/else are under other"):
+        choose_weights(both, "someone/else", "permissive", "--x")
+    assert choose_weights(both, "/my/own", "permissive", "--x") is None
     with pytest.raises(OptionError, match="a/nc"):
         choose_weights(both, "a/nc@main", "permissive", "--x")
 
@@ -335,14 +342,44 @@ def test_what_is_forbidden_or_missing_is_refused_before_anything_is_fetched() ->
     assert check_allowed(Selection(discovery="eomt"), {}, "permissive") == {
         "discovery": "tue-mps/coco_panoptic_eomt_large_640"
     }
-    assert check_allowed(Selection(discovery="eomt"), {"discovery": "x/y"}, "permissive") == {"discovery": "x/y"}
+    own = {"discovery": "x/y"}
+    assert check_allowed(Selection(discovery="eomt"), own, "research") == own
+    with pytest.raises(OptionError, match="x/y are under other"):
+        check_allowed(Selection(discovery="eomt"), own, "permissive")
 
 
 def test_weights_of_a_build_are_named_by_commit(tmp_path: Path) -> None:
     put("tue-mps/coco_panoptic_eomt_large_640")
-    assert pinned_weights("discovery", "eomt", None) == f"tue-mps/coco_panoptic_eomt_large_640@{COMMIT}"
-    assert pinned_weights("discovery", "geometric", None) is None
-    assert pinned_weights("reconstruction", "precomputed", str(tmp_path)) == str(tmp_path.resolve())
+    named = {"discovery": f"tue-mps/coco_panoptic_eomt_large_640@{COMMIT}"}
+    assert pinned_weights(Selection(discovery="eomt"), {}, "permissive") == named
+    assert pinned_weights(Selection(), {}, "permissive") == {}
+    asked = {"reconstruction": str(tmp_path)}
+    assert pinned_weights(Selection("precomputed"), asked, "permissive") == asked
+
+
+def test_python_builds_video_without_depth_by_default(tmp_path: Path) -> None:
+    source = neural_scenes.write_pictures(tmp_path / "pictures", neural_scenes.film())
+    for settings in (None, BuildSettings(), BuildSettings(poses="auto")):
+        job = prepare(source, None, settings, None)
+        assert (job.settings.reconstruction, job.settings.poses) == ("sfm", "estimate")
+
+
+def test_python_obeys_the_licence_profile_as_the_commands_do(tmp_path: Path, make_memory: Callable[..., Path]) -> None:
+    settings = BuildSettings(discovery="sam3", features="own", device="cpu")
+    refused = r"--licence permissive does not allow --discovery sam3.*SAM License"
+    with pytest.raises(OptionError, match=refused):
+        with_weights(settings, "permissive")
+    source = neural_scenes.write_pictures(tmp_path / "pictures", neural_scenes.film())
+    with pytest.raises(OptionError, match=refused):
+        list3r.build(source, tmp_path / "m.l3r", settings=settings, licence="permissive")
+    memory = make_memory()
+    with pytest.raises(OptionError, match=refused):
+        list3r.update(memory, source, settings=settings, licence="permissive")
+    with pytest.raises(OptionError, match=r"--licence permissive does not allow --model siglip2.*see its repository"):
+        embed_memory(memory, "someone/else", licence="permissive")
+    with pytest.raises(OptionError, match="--licence free is not known"):
+        list3r.build(source, tmp_path / "m.l3r", licence="free")
+    assert not (tmp_path / "m.l3r").exists()
 
 
 def test_unknown_names_list_the_known_ones() -> None:

@@ -101,7 +101,7 @@ def build(
         for line in (*(f"note: {n}" for n in info.notes), *told):
             note(line)
     run = {"options": options, "settings": settings, "workers": workers, "resume": resume, "force": force}
-    report = run_build(source, memory, quiet=json, debug_dir=debug, **run)
+    report = run_build(source, memory, quiet=json, debug_dir=debug, licence=models.licence, **run)
     after: dict[str, Any] = {"scale_anchor": scale_anchor, "detector": detector, "classes": detector_classes}
     notes, failure = finish(memory, source, options, quiet=json, **after)
     report = replace(report, notes=(*report.notes, *notes))

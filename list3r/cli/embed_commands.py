@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, print_json
+from list3r.cli.model_options import LicenceProfile
 
 
 def register(app: typer.Typer) -> None:
@@ -22,6 +23,7 @@ def embed(
         typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
     ] = None,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto.")] = "auto",
+    licence: LicenceProfile = "research",
     json: JsonOption = False,
 ) -> None:
     """Look at the stored pictures of every thing with a text and image model; then free words find things.
@@ -31,21 +33,14 @@ def embed(
     from tqdm import tqdm
 
     from list3r.embedding import embed_memory
-    from list3r.memory.errors import OptionError
-    from list3r.models.cache import resolve
-    from list3r.models.cards import find_card
 
-    card = find_card(model, "text")
-    if card is None:
-        raise OptionError(f"--model {model} compares no words with pictures; choose siglip2 or clip")
-    name = resolve(weights, card.weights[0], f"--model {model}")
     with tqdm(total=1, desc="embed", unit="chunk", disable=None if not json else True) as bar:
 
         def shown(done: int, total: int) -> None:
             bar.total, bar.n = total, done
             bar.refresh()
 
-        report = embed_memory(memory, name, device, shown)
+        report = embed_memory(memory, weights, device, shown, model=model, licence=licence)
     if json:
         print_json(vars(report))
         return

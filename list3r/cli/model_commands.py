@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -117,7 +118,7 @@ def precompute(
     if not json:
         for line in told:
             note(line)
-    report = _write_all(source, out, options, settings, info, force=force, quiet=json)
+    report = _write_all(source, out, options, settings, info, force=force, licence=geometry.licence, quiet=json)
     if json:
         print_json(report)
         return
@@ -136,6 +137,7 @@ def _write_all(
     info: SourceInfo,
     *,
     force: bool,
+    licence: str,
     quiet: bool,
 ) -> dict[str, Any]:
     from tqdm import tqdm
@@ -149,7 +151,7 @@ def _write_all(
             bar.update(done - bar.n)
             bar.refresh()
 
-        return write(source, out, options, settings, info, force=force, progress=progress).as_dict()
+        return write(source, out, options, settings, info, force=force, licence=licence, progress=progress).as_dict()
 
 
 def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
@@ -181,17 +183,35 @@ def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
 def _wanted(name: str, licence: str) -> list[Weights]:
     """The weights that a name means. Raises `OptionError` for what is unknown or not allowed."""
     from list3r.memory.errors import OptionError
-    from list3r.models.cards import OTHER, Weights, cards_named
+    from list3r.models.cards import cards_named
     from list3r.models.licences import check_profile, choose_weights
 
     check_profile(licence)
     if "/" in name:
-        repository, _, revision = name.partition("@")
-        return [Weights(repository, OTHER, revision=revision or "main")]
+        return [_named(name, licence)]
     found = {w.repository: w for c in cards_named(name) if (w := choose_weights(c, None, licence, "model")) is not None}
     if not found:
         raise OptionError(f"{name} has no weights of its own; give yours with --weights")
     return list(found.values())
+
+
+def _named(name: str, licence: str) -> Weights:
+    """Weights that are named by their repository. Raises `OptionError` for what the profile does not allow."""
+    from list3r.memory.errors import OptionError
+    from list3r.models.cache import split_name
+    from list3r.models.cards import CARDS, OTHER, UNPINNED, Weights, find_weights
+    from list3r.models.licences import choose_weights
+
+    parts = split_name(name)
+    if parts is None:
+        raise OptionError(f"{name} is no repository; its name is owner/name or owner/name@revision")
+    for card in CARDS:
+        if (known := find_weights(card, parts[0])) is not None:
+            choose_weights(card, name, licence, "model")
+            return replace(known, revision=known.revision if parts[1] == UNPINNED else parts[1])
+    if licence == "permissive":
+        raise OptionError(f"--licence permissive does not allow {name}, whose licence is not known here")
+    return Weights(parts[0], OTHER, revision=parts[1])
 
 
 def _size(facts: dict[str, Any]) -> str:

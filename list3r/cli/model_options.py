@@ -140,9 +140,7 @@ def build_settings(
     """
     from list3r.chunk_stage import BuildSettings
     from list3r.models.choice import check_allowed, parse_weights
-    from list3r.models.licences import check_profile
 
-    check_profile(words.licence)
     selection = _selection(info, words)
     asked = parse_weights(words.weights)
     if selection.discovery == selection.reconstruction == "precomputed" and "reconstruction" in asked:

@@ -69,7 +69,8 @@ def update(
     if not json:
         for line in told:
             note(line)
-    report = _run(memory, source, quiet=json, options=options, settings=settings, workers=workers, resume=resume)
+    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    report = _run(memory, source, quiet=json, licence=models.licence, **run)
     after: dict[str, Any] = {"scale_anchor": scale_anchor, "detector": detector, "classes": detector_classes}
     notes, failure = finish(memory, source, options, quiet=json, **after)
     report = replace(report, notes=(*report.notes, *notes))

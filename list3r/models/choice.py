@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from list3r.memory.errors import OptionError
 from list3r.models.cache import resolve
-from list3r.models.cards import ModelCard, find_card
-from list3r.models.licences import choose_weights
+from list3r.models.cards import ModelCard
+from list3r.models.licences import check_profile, choose_weights
 from list3r.models.presets import Selection, missing_package
 
 PARTS_OF_OPTIONS = {
@@ -41,6 +41,7 @@ def check_allowed(selection: Selection, asked: Mapping[str, str], profile: str) 
 
     Nothing is loaded or fetched. Raises `OptionError` for what the profile forbids and for packages that are missing.
     """
+    check_profile(profile)
     chosen = dict(asked)
     for option, card in selection.cards():
         name = option.removeprefix("--")
@@ -58,14 +59,14 @@ def check_package(card: ModelCard) -> None:
         raise OptionError(f"{card.name} needs the package {missing}: {card.install}")
 
 
-def pinned_weights(option: str, name: str, asked: str | None) -> str | None:
-    """The weights of one model as a path or `owner/name@commit`, fetched where they are not in the cache.
+def pinned_weights(selection: Selection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
+    """The weights of every model, by option, as a path or `owner/name@commit`; what is not in the cache is fetched.
 
-    None for a model without a card, which needs none. Raises `OptionError`.
+    Nothing is fetched before all of them are allowed. Raises `OptionError` as `check_allowed` and `cache.resolve` do.
     """
-    card = find_card(name, PARTS_OF_OPTIONS[option])
-    if card is None:
-        return asked
-    check_package(card)
-    known = choose_weights(card, asked, "any", f"--{option}")
-    return resolve(asked, known, f"--{option} {name}")
+    allowed = check_allowed(selection, asked, profile)
+    for option, card in selection.cards():
+        name = option.removeprefix("--")
+        known = choose_weights(card, allowed.get(name), profile, option)
+        allowed[name] = resolve(allowed.get(name), known, f"{option} {card.name}")
+    return allowed

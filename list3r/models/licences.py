@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from list3r.memory.errors import OptionError
-from list3r.models.cards import Licence, ModelCard, Weights, find_weights
+from list3r.models.cache import split_name
+from list3r.models.cards import OTHER, Licence, ModelCard, Weights, find_weights
 
 PROFILES = ("permissive", "research", "any")
 """permissive: code and weights that anyone may use for anything, without an account. research: also non-commercial,
@@ -49,14 +52,13 @@ def _wrong(licence: Licence, profile: str) -> str | None:
 def choose_weights(card: ModelCard, asked: str | None, profile: str, option: str) -> Weights | None:
     """The weights to use: those asked for by repository, else the first of the card that the profile allows.
 
-    None where the user brings weights of his own. Raises `OptionError`, naming the model, its licence and what is
-    allowed instead, when the profile forbids it.
+    None where the user brings weights of his own. A repository that the card does not name has terms of its own.
+    Raises `OptionError`, naming the model, its licence and what is allowed instead, when the profile forbids it.
     """
+    candidates: list[Weights | None] = list(card.weights) or [None]
     if asked is not None:
-        known = find_weights(card, asked.split("@")[0])
-        candidates: list[Weights | None] = [known]
-    else:
-        candidates = list(card.weights) or [None]
+        name = None if Path(asked).expanduser().exists() else split_name(asked)
+        candidates = [None if name is None else find_weights(card, name[0]) or Weights(name[0], OTHER)]
     reasons = [objection(card, w, profile) for w in candidates]
     for weights, reason in zip(candidates, reasons, strict=True):
         if reason is None:
