@@ -314,8 +314,8 @@ def gap_of(*bodies: Body) -> float:
 @pytest.mark.parametrize("points", [150, 600, 4000])
 def test_a_gap_does_not_depend_on_how_densely_the_surfaces_were_seen(points: int) -> None:
     left = body(2, Piece("left", (0, 0, 0.2), (0.4, 0.4, 0.4), points=points), view=0.6)
-    right = body(3, Piece("right", (0.6, 0, 0.2), (0.4, 0.4, 0.4), points=points), view=0.6)
-    assert gap_of(left, right) == pytest.approx(0.2, abs=0.02)
+    right = body(3, Piece("right", (0.55, 0, 0.2), (0.4, 0.4, 0.4), points=points), view=0.6)
+    assert gap_of(left, right) == pytest.approx(0.15, abs=0.02)
 
 
 def test_readings_amidst_the_edge_between_two_things_do_not_bring_them_nearer() -> None:
@@ -361,3 +361,17 @@ def test_only_what_is_round_has_an_axis() -> None:
         assert round_axis(other.points, 0.015) is None
     assert round_axis(np.zeros((60, 3)), 0.015) is None
     assert round_axis(np.column_stack([np.zeros((60, 2)), np.linspace(0, 1, 60)]), 0.015) is None
+
+
+def test_what_is_measured_at_the_bound_is_not_said() -> None:
+    def at(gap: float) -> list[Body]:
+        return [
+            body(2, Piece("left", (0, 0, 0.2), (0.4, 0.4, 0.4), points=3000)),
+            body(3, Piece("right", (0.4 + gap, 0, 0.2), (0.4, 0.4, 0.4), points=3000)),
+        ]
+
+    said = [
+        [r for r in relations(at(gap), gravity_known=True) if r.predicate == "next_to"] for gap in (0.16, 0.2, 0.24)
+    ]
+    assert len(said[0]) == 2 and all(r.confidence >= 0.6 for r in said[0]) and not said[2]
+    assert not [r for r in said[1] if r.confidence < 0.6]

@@ -152,11 +152,12 @@ def _beside(scene: Scene, holding: set[tuple[int, int]], gravity_known: bool) ->
         if (a, b) in holding:
             continue
         gap, near, beside = scene.gap(a, b), float(reach[a, b]), float(close[a, b])
-        if gap > near:
-            continue
-        out += _both(scene.bodies, a, "near", b, certainty(near - gap, noise), near - gap)
-        if gap <= beside and (not gravity_known or _side_by_side(scene, a, b)):
-            out += _both(scene.bodies, a, "next_to", b, certainty(beside - gap, noise), beside - gap)
+        for predicate, bound in (("near", near), ("next_to", beside)):
+            confidence = certainty(bound - gap, noise)
+            if confidence < s.sure:
+                break
+            if predicate == "near" or not gravity_known or _side_by_side(scene, a, b):
+                out += _both(scene.bodies, a, predicate, b, confidence, bound - gap)
     return out
 
 
