@@ -111,3 +111,17 @@ def test_what_makes_no_sense_is_said_in_one_line(ask: Any, arguments: tuple[obje
     status, out, err = ask(*arguments)
     assert status == 2 and out == ""
     assert err.startswith("error: ") and err.count("\n") == 1
+
+
+def test_words_that_nothing_bears_are_named(ask: Any) -> None:
+    for arguments in (("nearest", "zebra"), ("relations", "--subject", "zebra"), ("find", "zebra")):
+        status, out, err = ask(*arguments)
+        assert status == 0 and "bears the word 'zebra'" in err and "zebra" not in out
+    status, out, _ = ask("nearest", "zebra", "--json")
+    assert status == 0 and json.loads(out) == []
+
+
+def test_a_box_has_six_numbers(ask: Any) -> None:
+    status, _, err = ask("within", "--box", "0,0,0,1,1")
+    assert status == 2 and "six numbers" in err and len(err.splitlines()) == 1
+    assert ask("within", "--box", "1.5,-1,0,2.5,1,2")[0] == 0

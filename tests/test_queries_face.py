@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -127,3 +128,21 @@ def test_a_camera_has_one_name(memory: SceneMemory) -> None:
     for wrong in ({}, {"frame": 1, "time_s": 0.1}, {"position": (0, 0, 0)}, {"quat_wxyz": (1, 0, 0, 0), "frame": 1}):
         with pytest.raises(OptionError):
             memory.camera(**wrong)  # type: ignore[arg-type]
+
+
+def test_an_answer_sees_one_state_of_the_file(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = Path(shutil.copy(room, tmp_path / "both.l3r"))
+    with Store.open(path, writable=True) as writer, list3r.open(path) as memory:
+        boxes_in_box = memory.store.boxes_in_box
+
+        def and_then_a_writer(*corners: object, **filters: object) -> object:
+            found = boxes_in_box(*corners, **filters)  # type: ignore[arg-type]
+            with writer.transaction():
+                writer.drop_instance(TWIN, None)
+            return found
+
+        with monkeypatch.context() as patch:
+            patch.setattr(memory.store, "boxes_in_box", and_then_a_writer)
+            before = {m.instance.id for m in memory.within(center=(2.0, 0.0, 0.7), radius=0.5)}
+        after = {m.instance.id for m in memory.within(center=(2.0, 0.0, 0.7), radius=0.5)}
+        assert TWIN in before and after == before - {TWIN}

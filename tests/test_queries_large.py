@@ -136,3 +136,31 @@ def test_a_camera_sees_what_it_saw(store: Store, depth: float | None, monkeypatc
             patch.setattr(visibility, "_MANY", 0)
             few = {m.instance.id for m in visible(store, camera, min_visible=0.0, max_depth=depth)}
         assert few <= {row[0] for row in found}
+
+
+def test_what_is_left_out_is_said(store: Store, large: pytest.MonkeyPatch) -> None:
+    large.setattr(gather, "EVERYTHING", 10)
+    large.setattr("list3r.queries.relations._MOST_NAMED", 20)
+    large.setattr("list3r.queries.nearest._LOADED", 20)
+    assert "more than 20 things are 'red'; 20 of them" in relations(store, subject="red").reason
+    assert relations(store, subject=7).reason == ""
+    found = nearest(store, words="red box")
+    assert len(found) == 5 and "may be meant by 'red box'; 20 of them were looked at" in found.notes[0]
+    assert nearest(store, words="red box", point=(4, 4, 1)).notes == ()
+
+
+def test_named_things_that_pass_the_filters_are_found_behind_those_that_do_not(
+    store: Store, large: pytest.MonkeyPatch
+) -> None:
+    sure = {m.instance.id for m in nearest(store, words="red", min_confidence=0.85, k=COUNT)}
+    large.setattr(gather, "EVERYTHING", 10)
+    large.setattr("list3r.queries.nearest._LOADED", 1)
+    found = nearest(store, words="red", min_confidence=0.85, k=1)
+    assert len(found) == 1 and found[0].instance.id in sure
+
+
+def test_what_nothing_bears_is_said(store: Store, large: pytest.MonkeyPatch) -> None:
+    large.setattr(gather, "EVERYTHING", 10)
+    assert nearest(store, words="red zebra", point=(4, 4, 1)).notes == ()
+    for said in (nearest(store, words="zebra").notes[0], relations(store, subject="zebra").reason):
+        assert said.startswith("nothing in this memory bears the word 'zebra'; things here are called: ")

@@ -8,7 +8,7 @@ import inspect
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -40,11 +40,16 @@ _AT: ContextVar[int | None] = ContextVar("at", default=None)
 """The session after which the world is asked about, for the command that runs."""
 
 
-def open_memory(path: Path) -> SceneMemory:
-    """The memory behind a path, for reading: as it is, or as it was after the session of `--at`."""
+@contextlib.contextmanager
+def open_memory(path: Path) -> Iterator[SceneMemory]:
+    """The memory behind a path, for reading: as it is, or as it was after the session of `--at`.
+
+    All that is read belongs to one state, whatever a build or an update commits meanwhile.
+    """
     from list3r.scene_memory import open as open_scene
 
-    return open_scene(path, at=_AT.get())
+    with open_scene(path, at=_AT.get()) as scene, scene.store.snapshot():
+        yield scene
 
 
 def with_at(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -126,6 +126,8 @@ def within(
         raise OptionError("give one region: --box, --point with --radius, --view or --pose")
     if box is not None:
         parts = box.split(",")
+        if len(parts) != 6:
+            raise OptionError(f"--box {box!r}: six numbers with commas are needed, the lower and the upper corner")
         region["lower"] = parse_point(",".join(parts[:3]), "--box")
         region["upper"] = parse_point(",".join(parts[3:]), "--box")
     elif point is not None and radius is not None:

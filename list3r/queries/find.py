@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -11,7 +10,7 @@ import numpy as np
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store import Store
-from list3r.memory.words import split_words, vocabulary
+from list3r.memory.words import vocabulary
 from list3r.queries.camera import camera_of_frame
 from list3r.queries.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.gather import Gathered, gather
@@ -20,7 +19,7 @@ from list3r.queries.match import Match, Matches, checked_count, checked_instance
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
 from list3r.queries.surfaces import distance_between
 from list3r.queries.viewpoint import VIEWPOINT, between
-from list3r.queries.words import STRUCTURE
+from list3r.queries.words import STRUCTURE, not_borne
 
 _BY_STRUCTURE_M = 0.4
 """What is nearer than this to a wall is near it: the memory stores that of things only."""
@@ -141,11 +140,8 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
         if by_vector is not None:
             return by_vector
         search.unknown += unknown
-        bear = ", ".join(repr(w) for w in unknown)
         named = search.things.values() if search.gathered is None else search.store.instances_of(search.gathered.sample)
-        names = ", ".join(_names(named))
-        hint = f"; things here are called: {names}" if names else ""
-        search.notes.append(f"nothing in this memory bears the word{'s' if len(unknown) > 1 else ''} {bear}{hint}")
+        search.notes.append(not_borne(unknown, named))
         return []
     structure = not STRUCTURE.isdisjoint(phrase.words) or bool(
         phrase.words
@@ -168,13 +164,6 @@ def _unknown(search: _Search, words: Sequence[str]) -> list[str]:
         known = search.store.known_words(words)
         return [w for w in words if w not in known]
     return [w for w in words if not any(w in v for v in search.vocabulary.values())]
-
-
-def _names(things: Iterable[Instance], most: int = 12) -> list[str]:
-    """What most things are called: the last words of labels and descriptions."""
-    said = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
-    count = Counter(word for words in said for word in words)
-    return [word for word, _ in sorted(count.items(), key=lambda c: (-c[1], c[0]))[:most]]
 
 
 def _bears(search: _Search, n: int, words: Sequence[str]) -> bool:

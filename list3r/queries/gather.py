@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.grammar import Clause, Phrase
 from list3r.queries.match import checked_instance
@@ -60,6 +61,11 @@ class Gathered:
 def is_large(store: Store) -> bool:
     """Whether a memory holds too much to look at all of it."""
     return store.largest_id() > EVERYTHING
+
+
+def sample(store: Store) -> list[Instance]:
+    """All instances, or some of all in a memory that holds too many."""
+    return store.instances_of(store.sample_ids(_SAMPLE)) if is_large(store) else store.instances()
 
 
 def gather(store: Store, phrase: Phrase) -> Gathered | None:

@@ -15,7 +15,7 @@ from list3r.memory.records import Instance
 from list3r.memory.store import Store
 from list3r.queries.best_first import box_gaps, nearest_first
 from list3r.queries.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.gather import is_large
+from list3r.queries.gather import is_large, sample
 from list3r.queries.match import (
     FilterOptions,
     Filters,
@@ -27,7 +27,7 @@ from list3r.queries.match import (
     checked_point,
 )
 from list3r.queries.surfaces import STRAY, distance_between, distance_to_point, surface_of
-from list3r.queries.words import STRUCTURE, wanted_words, word_score
+from list3r.queries.words import STRUCTURE, not_borne, wanted_words, word_score
 
 _LOADED = 5_000
 """Instances that are looked at because of what they are called, in a memory that holds many."""
@@ -81,6 +81,8 @@ def nearest(
     named = _named(others, words)
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
+    if not named and (unknown := [w for w in wanted_words(words) if w not in store.known_words([w])]):
+        notes.append(not_borne(unknown, sample(store)))
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         return Matches((Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]), notes)

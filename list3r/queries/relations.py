@@ -13,10 +13,10 @@ from list3r.memory.relation_scene import RelationSettings
 from list3r.memory.relations import PREDICATES
 from list3r.memory.store import Store
 from list3r.queries.camera import Camera, camera_of_frame, last_camera
-from list3r.queries.gather import is_large
+from list3r.queries.gather import is_large, sample
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
-from list3r.queries.words import wanted_words, words_of
+from list3r.queries.words import not_borne, wanted_words, words_of
 
 VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "under", "attached_to"))
 """Predicates that exist only where gravity is known or estimated."""
@@ -125,8 +125,12 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
             found = store.bearing(sorted(wanted), _MOST_NAMED + 1)
             if len(found) > _MOST_NAMED:
                 notes.append(f"more than {_MOST_NAMED} things are {what!r}; {_MOST_NAMED} of them were looked at")
-            return sorted(found[:_MOST_NAMED])
-        return [i.id for i in store.instances() if wanted <= words_of(i)]
+            found = sorted(found[:_MOST_NAMED])
+        else:
+            found = [i.id for i in store.instances() if wanted <= words_of(i)]
+        if not found and (unknown := sorted(wanted - store.known_words(wanted))):
+            notes.append(not_borne(unknown, sample(store)))
+        return found
     return [checked_instance(store, int(what.removeprefix("#")) if isinstance(what, str) else what).id]
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.words import split_words
@@ -53,3 +56,12 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
             hit.append(word)
         total += best
     return total / len(wanted), hit
+
+
+def not_borne(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:
+    """What to say where nothing bears some words: that, and what most things are called (the last words of names)."""
+    said = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
+    count = Counter(word for last in said for word in last)
+    names = ", ".join(word for word, _ in sorted(count.items(), key=lambda c: (-c[1], c[0]))[:most])
+    bear = f"word{'s' if len(words) > 1 else ''} {', '.join(map(repr, words))}"
+    return f"nothing in this memory bears the {bear}" + (f"; things here are called: {names}" if names else "")
