@@ -255,3 +255,14 @@ def test_point_maps_are_aligned_with_outliers_and_any_scale_of_confidence() -> N
     assert np.abs(error[:6]).max() < 3e-3
     with pytest.raises(DegenerateError, match="no pixel"):
         align_point_maps(maps_u, 0 * confidence, maps_v, confidence, metric=False)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_is_flat_is_never_mirrored(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    p_u = rng.uniform(-1, 1, (900, 3)) * [1.0, 0.8, 0.0] + [0.0, 0.0, 2.0]
+    S_v_u = Sim3.exp([0.3, -0.1, 0.2, *rng.normal(size=3), 0.0])
+    noisy = S_v_u.apply(p_u) + 0.002 * rng.normal(size=p_u.shape)
+    found = align(p_u, noisy, np.ones(900), np.repeat(np.arange(30), 30), metric=True).S_v_u
+    assert np.linalg.det(found.rotation) > 0
+    assert np.abs(found.rotation - S_v_u.rotation).max() < 0.01

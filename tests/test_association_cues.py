@@ -204,3 +204,28 @@ def test_covariances_compose_as_errors_do() -> None:
     assert composed is not None
     assert np.allclose(np.cov(np.array(errors).T), composed, rtol=0.15, atol=2e-7)
     assert composed_covariance(replace(first, covariance=None), second) is None
+
+
+def test_the_uncertainty_of_a_way_is_that_of_its_errors() -> None:
+    rng = np.random.default_rng(2)
+    steps = [Sim3.exp(0.5 * rng.normal(size=7)) for _ in range(2)]
+    way = predict(
+        [edge_between(0, 1, steps[0], 1e-3), edge_between(2, 1, steps[1], 1e-3)],
+        0,
+        2,
+        ChainSettings(shift=0.0, turn_deg=0.0, log_scale=0.0),
+    )
+    assert way is not None
+    errors = []
+    for _ in range(3000):
+        a, b = (S @ Sim3.exp(1e-3 * rng.normal(size=7)) for S in steps)
+        errors.append((way.S_v_u.inverse() @ b.inverse() @ a).log())
+    assert np.allclose(np.cov(np.array(errors).T), way.covariance, rtol=0.15, atol=2e-7)
+
+
+def test_each_instance_is_matched_once() -> None:
+    """Two twins here, one of them there: only the one that looks more like it counts."""
+    u, v = instances(2, 0), instances(1, 0)
+    alike = replace(u, feature=np.array([[1.0, 0.0], [0.8, 0.6]]))
+    cues = compare_instances(alike, replace(v, feature=np.array([[1.0, 0.0]])))
+    assert cues.pairs == ((0, 0),) and cues.s_sem == pytest.approx(1.0)

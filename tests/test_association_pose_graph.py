@@ -11,7 +11,8 @@ from scipy.stats import chi2
 from list3r.association.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
 from list3r.association.edge_information import WeightSettings, support_of
 from list3r.association.graph_growth import extend
-from list3r.association.graph_solver import GraphProblem, adjoint, stack
+from list3r.association.graph_solver import GraphProblem, adjoint, stack, take
+from list3r.association.loop_trust import Tree, chain_squares
 from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3, skew
@@ -288,3 +289,25 @@ def test_an_edge_that_is_not_finite_is_refused_by_name() -> None:
     ):
         with pytest.raises(DegenerateError, match="chunks 2 and 3"):
             solved(truth, [*edges[:2], broken, *edges[3:]])
+
+
+def test_loops_lie_as_far_from_their_chain_as_its_uncertainty_says() -> None:
+    """Squared Mahalanobis distances over many draws of noise have the mean of a chi-square: the freedoms."""
+    rng = np.random.default_rng(3)
+    truth = stack([Sim3.exp(0.4 * rng.normal(size=7)) for _ in range(6)])
+    u, v = np.array([0, 1, 2, 1, 4, 3]), np.array([1, 2, 3, 4, 5, 5])
+    sigma = np.array([0.03, 0.01, 0.01, 0.01, 0.01, 0.005])
+    tree = Tree(np.array([0, 0, 1, 2, 1, 4]), np.array([-1, 0, 1, 2, 3, 4]), np.arange(6))
+    loop = np.arange(6) == 5
+    squares = []
+    for _ in range(300):
+        measured = [
+            take(truth, v[k]).inverse() @ take(truth, u[k]) @ Sim3.exp(sigma[k] * rng.normal(size=7)) for k in range(6)
+        ]
+        poses = [take(truth, np.array(0))]
+        for row in range(1, 6):
+            poses.append(poses[tree.parent[row]] @ measured[tree.edge[row]].inverse())
+        information = np.eye(7) / sigma[:, None, None] ** 2
+        problem = GraphProblem.build(u, v, stack(measured), information, np.arange(6) == 0)
+        squares.append(chain_squares(problem, stack(poses), tree, loop)[0])
+    assert np.mean(squares) == pytest.approx(7.0, abs=0.7)

@@ -17,6 +17,7 @@ from list3r.exporters.palette import instance_color
 from list3r.exporters.ply import PlySettings, write_ply
 from list3r.exporters.tum import write_tum
 from list3r.memory.errors import OptionError
+from list3r.memory.geometry import Sim3
 from list3r.memory.store import Store
 from tests.test_exporters import write_split_memory
 
@@ -56,7 +57,10 @@ def test_ply_says_its_unit_and_component(tmp_path: Path) -> None:
     assert b"not placed against the main one" in other.read_bytes()
 
 
-def test_tum_is_the_trajectory_of_the_store(room: Store, tmp_path: Path) -> None:
+def test_tum_is_the_trajectory_of_the_store(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    room = Store.open(make_memory(), writable=True)
+    with room.transaction():  # turned, so that no two numbers of a quaternion are alike
+        room.place_chunks({1: Sim3.exp([0.3, -0.2, 0.1, 0.4, -0.3, 0.8, 0.0])}, {1: 1})
     write_tum(room, tmp_path / "out.txt")
     rows = np.loadtxt(tmp_path / "out.txt")
     poses = room.camera_poses()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from list3r.memory.geometry import Array, Sim3, rotation_exp
-from list3r.memory.gravity import Gravity, estimate_gravity, gravity_from_planes, world_from_graph
+from list3r.memory.gravity import Gravity, estimate_gravity, floor_height, gravity_from_planes, world_from_graph
 from list3r.memory.planes import Planes, planar_area
 from list3r.memory.store import Store
 from tests.conftest import box_points, chunk_result, local_instance
@@ -131,3 +132,12 @@ def test_gravity_of_a_store_follows_its_planes_and_cameras(tmp_path: Path) -> No
         store.add_chunk(session, chunk_result(0, 0, 20, (table,)))
         gravity = estimate_gravity(store)
         assert gravity.status == "estimated" and error_deg(gravity, np.array([0, 0, 1.0])) < 1.0
+
+
+def test_a_level_surface_above_much_else_is_no_floor() -> None:
+    up, centers = np.array([0.0, 0.0, 1.0]), np.tile([0.0, 0.0, 1.6], (10, 1))
+    points = np.random.default_rng(0).uniform([-2, -2, 0], [2, 2, 2], (1000, 3))
+    plane = Planes(np.array([up]), np.zeros((1, 3)), np.array([6.0]), points, np.full(1000, -1))
+    assert floor_height(up, plane, centers) == pytest.approx(0.0)
+    sunk = replace(plane, points=points - [0.0, 0.0, 1.0])
+    assert floor_height(up, sunk, centers) is None

@@ -15,8 +15,10 @@ from list3r.memory.store import Store
 from list3r.memory.vectors import VectorIndex
 from list3r.queries.nearest import nearest
 from list3r.queries.relations import relations
+from list3r.queries.seen import seen
 from list3r.queries.similar import similar
 from list3r.queries.within import within
+from tests.conftest import instance
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
 
@@ -222,3 +224,28 @@ def test_queries_work_on_an_empty_memory(tmp_path: Path) -> None:
 def test_queries_read_while_another_process_could_write(make_memory: Callable[..., Path]) -> None:
     with Store.open(make_memory()) as reader:
         assert ids(nearest(reader, point=(1.8, 0.1, 1.0), k=1)) == [MUG]
+
+
+def test_a_box_ends_at_its_upper_corner(store: Store) -> None:
+    below = {m.instance.id for m in within(store, lower=(1.5, -0.5, -1.0), upper=(2.5, 0.5, 0.6))}
+    assert below == {TABLE}
+
+
+def test_the_beginning_of_a_word_names_half_as_well(store: Store) -> None:
+    whole, part = nearest(store, words="table")[0], nearest(store, words="tab")[0]
+    assert (whole.instance.id, part.instance.id) == (TABLE, TABLE)
+    assert part.score == pytest.approx(0.5 * whole.score)
+
+
+def test_a_stretch_goes_on_while_its_breaks_are_short(store: Store) -> None:
+    found = seen(store, MUG, gap_s=0.05)
+    assert len(found.frames) == 20 and len(found.spans_s) == 1
+    assert len(seen(store, MUG, gap_s=0.01).spans_s) == 20
+
+
+def test_what_lives_in_another_part_is_not_near_a_thing(make_memory: Callable[..., Path]) -> None:
+    with Store.open(make_memory(), writable=True) as apart:
+        with apart.transaction():
+            apart.put_instances([instance(20, (2.0, 0.0, 0.8), (0.1,) * 3, (1, 1, 1), description="mug", component=2)])
+        assert {m.instance.id for m in nearest(apart, instance_id=TABLE, words="mug")} == {MUG, TWIN}
+        assert {m.instance.id for m in nearest(apart, point=(2.0, 0.0, 0.8), words="mug")} == {MUG, TWIN, 20}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from list3r.memory.records import Relation
 from list3r.memory.store import Store
 from list3r.queries.path import path
 from list3r.queries.relations import Relations, relations
-from list3r.queries.viewpoint import Viewer, viewed
+from list3r.queries.viewpoint import Viewer, between, viewed
 from tests.conftest import instance, write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
@@ -148,3 +149,31 @@ def test_ways_need_not_lead_over_the_floor(store: Store) -> None:
         assert path(store, TABLE, CHAIR, structure=False) == []
     finally:
         store.replace_relations(None, held)
+
+
+def test_a_side_must_be_clear_of_half_of_the_larger_of_the_two() -> None:
+    viewer = Viewer(np.zeros(3), UP, "here")
+    wide, small = (
+        instance(1, (2, 0, 0), (0.4, 1.0, 0.4), (1, 1, 1)),
+        instance(2, (2, 0.8, 0), (0.1, 0.1, 0.1), (1,) * 3),
+    )
+    sides = [r for r in viewed(viewer, small, wide, 0.015) or [] if r.predicate == "left_of"]
+    assert 0.2 < sides[0].margin < 0.35
+    near = instance(2, (2, 0.4, 0), (0.1, 0.1, 0.1), (1, 1, 1))
+    assert not [r for r in viewed(viewer, near, wide, 0.015) or [] if r.predicate in ("left_of", "right_of")]
+
+
+def test_what_is_between_is_so_by_its_distance_from_all_bounds() -> None:
+    a, b = (instance(n, (x, 0, 0), (0.2, 0.6, 0.6), (1, 1, 1)) for n, x in ((1, 0.0), (2, 2.0)))
+    for x, margin in ((1.0, 0.4), (0.15, 0.05), (1.8, 0.1)):
+        found = between(instance(3, (x, 0, 0), (0.1, 0.2, 0.2), (1, 1, 1)), a, b, 0.01)
+        assert found is not None and found.margin == pytest.approx(margin)
+    assert between(instance(3, (0.05, 0, 0), (0.1, 0.2, 0.2), (1, 1, 1)), a, b, 0.01) is None
+
+
+def test_of_ways_equally_long_the_surest_is_taken(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "ways.l3r") as made, made.transaction():
+        made.put_instances(instance(n, (n, 0, 0), (0.1, 0.1, 0.1), (1, 1, 1)) for n in range(1, 5))
+        sure = {(1, 2): 0.6, (2, 4): 0.6, (1, 3): 0.9, (3, 4): 0.9}
+        made.replace_relations(None, [Relation(s, "near", o, c, 0.1) for (s, o), c in sure.items()])
+        assert [r.object for r in path(made, 1, 4)] == [3, 4]

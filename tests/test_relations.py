@@ -375,3 +375,13 @@ def test_what_is_measured_at_the_bound_is_not_said() -> None:
     ]
     assert len(said[0]) == 2 and all(r.confidence >= 0.6 for r in said[0]) and not said[2]
     assert not [r for r in said[1] if r.confidence < 0.6]
+
+
+def test_what_shares_no_height_is_near_and_not_next_to() -> None:
+    low = Piece("low", (0, 0, 0.15), (0.3, 0.3, 0.3), points=1200)
+    high = Piece("high", (0.34, 0, 0.55), (0.3, 0.3, 0.3), points=1200)
+    level = Piece("level", (0.34, 0, 0.15), (0.3, 0.3, 0.3), points=1200)
+    apart = {p for s, p, o in facts([body(1, low, view=None), body(2, high, view=None)]) if (s, o) == (1, 2)}
+    beside = {p for s, p, o in facts([body(1, low, view=None), body(2, level, view=None)]) if (s, o) == (1, 2)}
+    assert "near" in apart and "next_to" not in apart
+    assert {"near", "next_to"} <= beside

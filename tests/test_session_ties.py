@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,3 +70,9 @@ def test_the_order_of_edges_does_not_matter(order: tuple[int, ...]) -> None:
 def test_a_memory_of_one_session_is_left_as_it_is() -> None:
     edges = [_edge(1, 2), _edge(3, 4)]
     assert hold_back(edges, dict.fromkeys(CHUNKS, 1)) == edges
+
+
+def test_one_that_the_depth_contradicts_is_not_beyond_doubt() -> None:
+    edge = _edge(1, 3, features=150.0)
+    for name in ("overlap", "agreement"):
+        assert _accepted([*INSIDE, replace(edge, scores={**edge.scores, name: 0.3})]) == [True] * 3 + [False]
