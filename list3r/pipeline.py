@@ -156,7 +156,7 @@ def _notes(store: Store, session: int, lost: int, bad: int, components: int) -> 
     if cuts:
         notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
     if bad:
-        notes.append(f"{_count(bad, 'frame')} could not be decoded, skipped: {_listed(store)}")
+        notes.append(f"{_count(bad, 'frame')} could not be used, skipped: {_listed(store)}")
     if lost and store.get_value("poses") == "given":
         notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
     elif lost:

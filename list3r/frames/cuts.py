@@ -54,7 +54,7 @@ class CutSettings:
 
 
 class ThumbnailSource(FrameSource, Protocol):
-    """A source that can decode small grey pictures for less than whole frames: by `read_gray` or by `thumbnails`."""
+    """A source that can decode grey pictures for less than whole frames: by `read_gray`, or by the other two."""
 
     def read_gray(self, position: int, reduction: int) -> Gray | None:
         """The colour image in grey, each side reduced by about `reduction` (1, 2, 4 or 8); None where it is bad."""
@@ -64,9 +64,13 @@ class ThumbnailSource(FrameSource, Protocol):
         """Small grey pictures of all frames in order, in one pass; None where a frame is bad."""
         ...
 
+    def read_grays(self, start: int, stop: int) -> Iterator[Gray | None]:
+        """Grey pictures at positions [start, stop), large enough for local features; None where a frame is bad."""
+        ...
+
 
 Progress = Callable[[int, int], None]
-"""Called with (frames looked at, frames in all)."""
+"""Called with (looked at, in all): every frame, and then those once more that are suspected."""
 
 
 def find_cuts(
@@ -90,7 +94,13 @@ def find_cuts(
         return _thumbnail_likeness(one, two) >= chosen.thumbnail_likeness or looks.same_place(a, b)
 
     suspects = _suspects(likeness, chosen.thumbnail_likeness, chosen)
-    return _spaced([k for k in suspects if _jumps(k, count, alike, chosen)], alike, chosen)
+    cuts = []
+    for n, k in enumerate(suspects, start=1):
+        if _jumps(k, count, alike, chosen):
+            cuts.append(k)
+        if progress is not None:
+            progress(count + n, count + len(suspects))
+    return _spaced(cuts, alike, chosen)
 
 
 def _first_look(
@@ -286,6 +296,12 @@ class _Looks:
         if position not in self._grays:
             # A video decodes from a key frame on, so the neighbours that will be asked for next come with it.
             first, last = max(0, position - _AHEAD), min(self._count, position + _AHEAD)
-            read = enumerate(self._source.read(first, max(last, position + 1)), first)
-            self._grays = {k: _grey(f) if isinstance(f, Frame) else None for k, f in read}
+            self._grays = dict(enumerate(self._read_grays(first, max(last, position + 1)), first))
         return self._grays.get(position)
+
+    def _read_grays(self, first: int, stop: int) -> Iterator[Gray | None]:
+        """Grey pictures at positions [first, stop), None where a frame is bad."""
+        read_grays = getattr(self._source, "read_grays", None)
+        if read_grays is not None:
+            return iter(read_grays(first, stop))
+        return (_grey(f) if isinstance(f, Frame) else None for f in self._source.read(first, stop))

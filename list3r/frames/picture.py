@@ -27,11 +27,13 @@ class Upright:
     """Counter-clockwise quarter turns, after mirroring."""
     mirrored: bool
     """Left and right are exchanged first."""
+    interlaced: bool = False
+    """Every other line was taken a moment later."""
 
     @classmethod
     def of(cls, image: av.VideoFrame, aspect: Fraction) -> Upright:
         """As the first picture and its display matrix say; `aspect` is the width of its pixels by their height."""
-        return cls((image.height, image.width), aspect, *_orientation(image))
+        return cls((image.height, image.width), aspect, *_orientation(image), bool(image.interlaced_frame))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,6 +68,8 @@ class Upright:
             out.append("frames are mirrored, as the file says")
         if self.aspect != 1:
             out.append(f"pixels are {float(self.aspect):.3g} times as wide as high and are made square")
+        if self.interlaced:
+            out.append("frames are interlaced, which smears what moves; better deinterlace first (ffmpeg -vf bwdif)")
         return tuple(out)
 
 

@@ -23,6 +23,7 @@ FOLDERS: dict[str, Callable[[Path, SourceOptions], Layout | None]] = {
 }
 """Readers of folders, the most particular first: the layout of a folder, or None for one of another kind."""
 
+_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 _WANTED = (
     "give a video file, or a folder in 7-Scenes (frame-000000.color.png), TUM RGB-D (rgb.txt) or Replica "
     "(results/frame000000.jpg) layout, or of images"
@@ -69,6 +70,9 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
             layout = find(root, options)
             if layout is not None and layout.files:
                 return FolderSource(root, layout, options)
+    videos = sorted(p.name for p in root.iterdir() if p.suffix.lower() in _VIDEO_ENDINGS)
+    if videos:
+        raise SourceError(f"{root} is a folder with the video {videos[0]} in it; give the video: {root / videos[0]}")
     said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
     raise SourceError(f"{root} has {said}; {_WANTED}")
 

@@ -21,7 +21,7 @@ from list3r.frames.selection import select, sharpness
 from list3r.frames.stamps import list_stamps, packets, picture_stream
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
-_MEASURED_PX, _THUMBNAIL_PX = 320, 160
+_MEASURED_PX, _THUMBNAIL_PX, _LOOKED_AT_PX = 320, 160, 640
 _EARLIER = 4
 """Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
@@ -67,6 +67,11 @@ class VideoSource:
         """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""
         for _, image in self._pictures(0, len(self._chosen), threads=True):
             yield None if image is None else small_gray(image, _THUMBNAIL_PX)
+
+    def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
+        """Grey pictures at positions [start, stop), as stored, of at most 640 px; None for one that is damaged."""
+        for _, image in self._pictures(start, stop, threads=False):
+            yield None if image is None else small_gray(image, _LOOKED_AT_PX)
 
     def _pictures(self, start: int, stop: int, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """Number and picture of the frame handed out of each window at positions [start, stop); None where damaged."""
