@@ -261,7 +261,7 @@ def _between_boards(scene: Scene, a: int, b: int, *, walled: bool) -> float | No
     aside = np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2]
     half = subject.box.size[:2] / 2
     within = np.all(aside <= half + noise, axis=1)
-    inner = within if walled else np.all(aside <= 0.75 * half, axis=1)
+    inner = within if walled else np.all(aside <= 0.5 * half, axis=1)
     z = holder.points[:, 2]
     under = z[within & (z < low + noise) & (z > low - contact_of(scene, a) - noise)]
     over = z[inner & (z > high + noise)]
