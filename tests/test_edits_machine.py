@@ -1,24 +1,33 @@
-"""The store against a plain model: chunks, edits, undos and reopenings in any order."""
+"""The store against a plain model: chunks, edits, undos and reopenings in any order.
+
+`LIST3R_TEST_PROFILE=thorough` makes it go through forty times as many steps, other ones each time.
+"""
 
 from __future__ import annotations
 
+import os
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from list3r.memory import edits
+from list3r.memory import consolidation, edits
 from list3r.memory.constraints import Key
 from list3r.memory.errors import UnknownIdError
+from list3r.memory.library_rules import ConsolidationSettings
 from list3r.memory.store import Store
 from tests.memory_scenes import BOX, MUG, TWIN
 from tests.test_consolidation import add, chunk, create
 
 PIECES = [MUG, TWIN, BOX]
 MOST_CHUNKS = 4
+IN_MEMORY = "/dev/shm"
+"""Where there is such a folder no step waits for a disk."""
 View = dict[int, tuple[str | None, frozenset[Key]]]
 
 
@@ -46,9 +55,13 @@ class Said:
 class StoreAgainstModel(RuleBasedStateMachine):
     """The model knows what is what, and what was said and not taken back; it knows nothing of how groups are formed."""
 
-    @initialize()
-    def begin(self) -> None:
-        self.folder = tempfile.TemporaryDirectory()
+    @initialize(grows=st.booleans())
+    def begin(self, grows: bool) -> None:
+        """A memory whose library grows from the first chunk on, or is derived as a whole each time."""
+        self.patch = pytest.MonkeyPatch()
+        if grows:
+            self.patch.setattr(consolidation, "ConsolidationSettings", partial(ConsolidationSettings, whole_chunks=0))
+        self.folder = tempfile.TemporaryDirectory(dir=IN_MEMORY if os.access(IN_MEMORY, os.W_OK) else None)
         self.path = Path(self.folder.name) / "a.l3r"
         self.store = create(self.path)
         self.chunks = 0
@@ -57,11 +70,13 @@ class StoreAgainstModel(RuleBasedStateMachine):
         self.last: tuple[int, View] | None = None
         self.held: dict[int, frozenset[Key]] = {}
         self.add_chunk()
+        self.add_chunk()
 
     def teardown(self) -> None:
         if hasattr(self, "store"):
             self.store.close()
             self.folder.cleanup()
+            self.patch.undo()
 
     # ------------------------------------------------------------------ what happens
 
@@ -98,10 +113,10 @@ class StoreAgainstModel(RuleBasedStateMachine):
         out = data.draw(st.none() | st.lists(st.sampled_from(keys), min_size=1, max_size=len(keys) - 1, unique=True))
         report = edits.split(self.store, n, out)
         now = view(self.store)
-        assert len(report.new) == 1 and report.new[0] > max(self.held)
-        kept = self.store.resolve(n)  # what a split leaves free may go to an older thing that it had been kept from
-        left, right = now[kept][1] & before[n][1], now[report.new[0]][1] & before[n][1]
-        assert left | right == before[n][1] and left and right
+        assert len(report.new) <= 1 and all(m > max(self.held) for m in report.new)
+        # What a split leaves free may go to an older thing that it had been kept from; then there is no new one.
+        left, right = (held & before[n][1] for _, held in now.values() if held & before[n][1])
+        assert left | right == before[n][1]
         assert out is None or frozenset(out) in (left, right)
         self._said(report.entry, Said("split", (left, right)), before)
 
@@ -134,6 +149,24 @@ class StoreAgainstModel(RuleBasedStateMachine):
         del self.said[entry]
         self.last = None
         assert report.kind == "undo"
+
+    @rule(data=st.data(), kind=st.sampled_from(["merge", "split", "label", "delete"]), again=st.booleans())
+    def say_and_take_back(self, data: st.DataObject, kind: str, again: bool) -> None:
+        """What is taken back at once leaves nothing behind; taken back in turn, it holds again."""
+        before, known = view(self.store), set(self.said)
+        if kind == "label":
+            self.label(data, "c")
+        else:
+            {"merge": self.merge, "split": self.split, "delete": self.delete}[kind](data)
+        for entry in set(self.said) - known:
+            after, what = view(self.store), self.said.pop(entry)
+            undone = edits.undo(self.store, entry).entry
+            assert view(self.store) == before
+            if again:
+                edits.undo(self.store, undone)
+                assert view(self.store) == after
+                self.said[entry] = what
+        self.last = None
 
     @rule()
     def reopen(self) -> None:
@@ -203,7 +236,13 @@ class StoreAgainstModel(RuleBasedStateMachine):
                 assert not (n in now and keys & seen)
 
 
+THOROUGH = os.environ.get("LIST3R_TEST_PROFILE") == "thorough"
 StoreAgainstModel.TestCase.settings = settings(
-    max_examples=12, stateful_step_count=9, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=400 if THOROUGH else 30,
+    stateful_step_count=40 if THOROUGH else 9,
+    derandomize=not THOROUGH,
+    database=None,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
 )
 TestStoreAgainstModel = StoreAgainstModel.TestCase
