@@ -21,7 +21,7 @@ from list3r.frames.borrowing import BorrowSettings, borrow
 from list3r.frames.chunks import ChunkSpan
 from list3r.frames.picture import small_gray
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import TrackingError
+from list3r.memory.errors import SourceError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store import Store
 from list3r.pipeline import _runs, build
@@ -206,3 +206,28 @@ def test_more_windows_that_agree_make_the_focal_length_surer() -> None:
 def test_runs_of_numbers_in_words() -> None:
     assert _runs([4]) == "4" and _runs([1, 2, 3, 7, 9, 10]) == "1 to 3, 7, 9 to 10"
     assert _runs(list(range(0, 20, 2)), most=2) == "0, 2 and 8 more stretches"
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_pictures_of_fewer_bits_in_sixteen_are_as_bright_as_they_were(tmp_path: Path, bits: int) -> None:
+    for n in range(3):
+        grey = cv2.cvtColor(picture(n), cv2.COLOR_RGB2GRAY).astype(np.uint16)
+        grey[0, 0] = 255
+        cv2.imwrite(str(tmp_path / f"{n}.png"), grey << (bits - 8))
+    source = open_source(tmp_path)
+    (first,) = (f for f in source.read(0, 1) if isinstance(f, Frame))
+    expected = cv2.cvtColor(picture(0), cv2.COLOR_RGB2GRAY)
+    np.testing.assert_array_equal(first.color[1:, :, 0], expected[1:])
+    assert any(f"{bits} are in use" in note for note in source.info.notes) == (bits < 16)
+
+
+def test_a_folder_with_a_video_in_it_names_the_video(tmp_path: Path) -> None:
+    write_clip(tmp_path / "my walk.mp4", 0)
+    with pytest.raises(SourceError, match=r"folder with the video my walk\.mp4"):
+        open_source(tmp_path)
+
+
+def test_pictures_that_are_too_small_are_called_that() -> None:
+    frames = [Frame(k, k / 30, np.full((24, 32, 3), 9, np.uint8), None, None) for k in range(3)]
+    with pytest.raises(TrackingError, match="32x24 are too small"):
+        SfmReconstructor()(frames, Camera(32, 24, 40.0, 40.0, 15.5, 11.5))

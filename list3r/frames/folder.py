@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
-from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_depth
+from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_depth, used_bits
 from list3r.frames.exif import exif_focal
 from list3r.frames.layout import FrameFile, Layout, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
@@ -44,7 +44,7 @@ class FolderSource:
         optics = self.optics
         self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files)
         self._typical_raw = 0.0
-        self._floats = False
+        self._floats, self._bits = False, 16
         sizes = self._probe(root)
         if self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0):
             self.optics = optics = replace(optics, depth_scale=1.0)
@@ -88,7 +88,7 @@ class FolderSource:
         if file.depth is None:
             raise FrameError(f"{file.color.name} has no depth image")
         raw = read_raw_depth(file.depth)
-        return read_color(file.color), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
+        return read_color(file.color, self._bits), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
     def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
         """The colour image in grey as stored, each side reduced by 1, 2, 4 or 8; None where it cannot be decoded."""
@@ -113,7 +113,7 @@ class FolderSource:
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]
-        color = self._rig.color(read_color(file.color))
+        color = self._rig.color(read_color(file.color, self._bits))
         depth = None
         if self._has_depth:
             if file.depth is None:
@@ -145,6 +145,7 @@ class FolderSource:
             try:
                 color = read_color(file.color)
                 self._first_picture = file.color
+                self._bits = used_bits([self._layout.files[int(self._chosen.starts[k])].color for k in tried])
                 if not self._has_depth:
                     return color.shape[:2], None
                 if file.depth is not None:
@@ -172,6 +173,8 @@ class FolderSource:
             missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
         if rig.color_size != rig.stored_size:
             notes = (*notes, reduced_note(rig))
+        if self._bits < 16:
+            notes = (*notes, f"of the 16 bits of the pictures {self._bits} are in use, which count as full brightness")
         has_poses = any(f.pose is not None or f.T_source_camera is not None for f in layout.files)
         separate = rig.registration
         return SourceInfo(

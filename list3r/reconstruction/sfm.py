@@ -58,6 +58,8 @@ class SfmSettings:
     dense: MvsSettings = field(default_factory=MvsSettings)
     least_flow: float = 0.01
     """A camera whose picture moves less than this through a whole chunk, by the longer side, stands still."""
+    least_side_px: int = 128
+    """In pictures whose longer side is shorter than this nothing can be followed because of that."""
     least_segment: int = 8
     """Frames of a part of a chunk, besides the largest, that is worth keeping."""
 
@@ -175,7 +177,11 @@ def _check_motion(frames: Sequence[Frame], tracks: Tracks, settings: SfmSettings
     if len(frames) < 2:
         raise BaselineError(f"{_span(frames)}: depth from colour needs at least two frames from different places")
     if tracks.run.max(initial=-1) < 0:
-        raise TrackingError(f"{_span(frames)}: no texture to follow; the pictures are black, blank or out of focus")
+        height, width = frames[0].color.shape[:2]
+        why = "the pictures are black, blank or out of focus"
+        if max(height, width) < settings.least_side_px:
+            why = f"pictures of {width}x{height} are too small; give them as they were taken"
+        raise TrackingError(f"{_span(frames)}: no texture to follow; {why}")
     if np.nansum(tracks.flow) < settings.least_flow:
         raise BaselineError(f"{_span(frames)}: the camera stands still; depth from colour needs it to move")
 
