@@ -80,6 +80,24 @@ def test_what_is_not_as_it_was_written_is_not_answered_with(
         assert store.verify() != [], "what is damaged can be looked at"
 
 
+def test_large_memories_check_the_relations_and_surfaces_that_they_read(
+    make_memory: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make_memory()
+    monkeypatch.setattr("list3r.memory.connection.WHOLE_BYTES", 0)
+    with Store.open(path) as store:
+        assert len(store.relations(3)) == 1 and len(store.surface_points(5)) == len(store.support(5).points) == 400
+    spoil(path, "UPDATE relations SET margin = 0.5 WHERE subject = 3")
+    spoil(path, "UPDATE supports SET points = zeroblob(length(points)) WHERE local_id = 4")
+    with Store.open(path) as store, pytest.raises(MemoryFileError, match="relations 3: the row is not"):
+        store.relations(3)
+    for ask in (lambda store: store.surface_points(5), lambda store: store.support(5)):
+        with Store.open(path) as store, pytest.raises(MemoryFileError, match="supports 1:4: the checksum"):
+            ask(store)
+    with Store.open(path) as store:
+        assert len(store.relations(4)) == 1 and len(store.support(2).points) == 400
+
+
 @pytest.mark.parametrize(
     ("statement", "ask"),
     [

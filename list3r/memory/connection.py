@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from list3r.memory.codec import from_json, to_json
+from list3r.memory.codec import checksum, from_json, to_json
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.memory_file import (
     connected,
@@ -252,6 +252,17 @@ class Connection:
                 raise MemoryFileError(explained(self.path, error)) from error
             if bad:
                 raise MemoryFileError(_damaged(self.path, f"{table} {bad[0]}: the row is not as it was written"))
+        return rows
+
+    def _own_crc_believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """Rows that begin with two keys and a count and end with blobs and their checksum: that is compared where the
+        table is not checked as a whole.
+        """
+        if self._checks is None and not self._writing:
+            for row in rows:
+                if checksum(*(blob if isinstance(blob, bytes) else b"" for blob in row[3:-1])) != row[-1]:
+                    name = f"{table} {row[0]}:{row[1]}"
+                    raise MemoryFileError(_damaged(self.path, f"{name}: the checksum does not match"))
         return rows
 
 

@@ -99,25 +99,26 @@ class ObservationVerbs(InstanceVerbs):
     def surface_points(self, instance_id: int) -> NDArray[np.float32]:
         """Support points of one instance (no alias) in the world, without their colours. Shape (N, 3)."""
         query = (
-            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points FROM observations o"
+            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb, s.crc FROM observations o"
             " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
         )
-        rows = self._rows(query, (int(instance_id),))
+        rows = self._own_crc_believed("supports", self._rows(query, (int(instance_id),)))
         if not rows:
             return np.zeros((0, 3), np.float32)
         placed = self._poses({row[0] for row in rows})
         parts = [
             placed[k].apply(dequantise(grid, points, count, f"the support of local instance {k}:{n}"))
-            for k, n, count, grid, points in rows
+            for k, n, count, grid, points, *_ in rows
         ]
         return np.concatenate(parts).astype(np.float32)
 
     def _support_parts(self, instance_id: int) -> list[tuple[int, Support]]:
         query = (
-            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb FROM observations o"
+            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb, s.crc FROM observations o"
             " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
         )
-        return [_support_part(row) for row in self._rows(query, (instance_id,))]
+        rows = self._own_crc_believed("supports", self._rows(query, (instance_id,)))
+        return [_support_part(row[:-1]) for row in rows]
 
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a moving instance was: seconds of shape (V,) and places in the world of shape (V, 3), in order of time.

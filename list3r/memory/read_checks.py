@@ -2,8 +2,8 @@
 
 In files of up to `WHOLE_BYTES` a table is checked as a whole when it is first read: its pages and indices, the sums of
 its rows and blobs, and, for what is derived, what it was derived from. That takes about as long as reading it, once for
-each connection. In larger ones rows of instances are checked one by one as they are read (`unbelieved`); the rest is
-checked by `verify` alone.
+each connection. In larger ones rows of instances and relations (`unbelieved`) and the surfaces of things are checked
+one by one as they are read; the rest, and rows that are missing, by `verify` alone.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class RelationVerbs(ObservationVerbs):
             f"SELECT subject, predicate, object, confidence, margin FROM relations {where}"
             " ORDER BY subject, predicate, object"
         )
-        return [Relation(*r) for r in self._rows(query, tuple(arguments))]
+        return [Relation(*r) for r in self._believed("relations", self._rows(query, tuple(arguments)))]
 
     def log_decisions(self, chunk_id: int, decisions: Iterable[MergeDecision]) -> None:
         """Append to the merge log what was decided when a chunk arrived."""
