@@ -8,7 +8,8 @@ build: edge to the chunk before, revisits, pose graph, library. Three walks: `ro
 sees 12 things and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by
 turn. With `--sessions 2` the memory is that of a session that has ended, and the chunks that are added are the first of
 a later one, which walks the way again from its middle; what has changed is told when that session ends, which is timed
-too (`end_s`). `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user seconds of
+too (`end_s`; in a long first session it is also looked again at what holds for the whole memory, and all things are
+derived anew where that has changed). `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user seconds of
 processor time of placing (edges, revisits, graph) and of the library, things written anew; what the process had grown
 by when the memory was made, and its peak then.
 """
@@ -106,8 +107,7 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
             row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instance_count())}
             for key in ("placing_s", "library_s", "all_s"):
                 row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
-            if words.sessions > 1:
-                row["end_s"] = end(stores[n], 2)
+            row["end_s"] = end(stores[n], words.sessions)
             row["edit_s"], row["undo_s"] = edited(stores[n])
             row["written"] = int(np.median([r["written"] for r in rows[n]]))
             out.append({**row, "memory_mb": resident[n], "peak_mb": peak[n], "file_mb": size_mb[n]})

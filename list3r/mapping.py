@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from list3r.association.camera_edge import better_edge, camera_edge
 from list3r.association.chunk_nodes import NodeSettings
-from list3r.association.edges import EdgeSettings, measure_edge
+from list3r.association.edges import EdgeEnd, EdgeSettings, measure_edge
 from list3r.association.graph_growth import extend
 from list3r.association.joint_window import JointReconstructor
 from list3r.association.node_graph import bend_chunks
@@ -114,17 +114,11 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
     if not metric and _from_motion(store, session_id):
         by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id)
     try:
-        found = measure_edge(
-            samples_u,
-            samples_v,
-            u.chunk_id,
-            v.chunk_id,
-            _camera(v),
-            metric,
-            settings,
-            dynamic_u=store.dynamic_locals(u.chunk_id),
-            dynamic_v=store.dynamic_locals(v.chunk_id),
+        ends = (
+            EdgeEnd(u.chunk_id, samples_u, store.dynamic_locals(u.chunk_id)),
+            EdgeEnd(v.chunk_id, samples_v, store.dynamic_locals(v.chunk_id)),
         )
+        found = measure_edge(*ends, _camera(v), metric, settings)
     except DegenerateError:
         return [] if by_cameras is None else [by_cameras]
     for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from list3r.association.edges import EdgeSettings, measure_edge
+from list3r.association.edges import EdgeEnd, EdgeSettings, MeasuredEdge, measure_edge
 from list3r.instances.overlays import draw_support, write_support
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
@@ -25,6 +27,20 @@ def off(S_v_u: Sim3, truth: Sim3 = S_V_U) -> float:
     return float(np.abs((S_v_u.inverse() @ truth).log()).max())
 
 
+def edge_between(
+    u: FrameSamples,
+    v: FrameSamples,
+    u_id: int,
+    v_id: int,
+    *chosen: Any,
+    dynamic_u: Sequence[int] = (),
+    dynamic_v: Sequence[int] = (),
+    **named: Any,
+) -> MeasuredEdge:
+    """The edge of two chunks by their samples and ids."""
+    return measure_edge(EdgeEnd(u_id, u, dynamic_u), EdgeEnd(v_id, v, dynamic_v), *chosen, **named)
+
+
 def pair(things: tuple[Thing, ...] = BOXES, noise: float = 0.005, **kwargs: float) -> tuple[FrameSamples, FrameSamples]:
     u = film(things, S_U, noise=noise, seed=1, mover_depth=kwargs.get("depth_u", 1.0))
     return u, film(things, S_V, noise=noise, seed=2, mover_depth=kwargs.get("depth_v", 1.0))
@@ -32,7 +48,7 @@ def pair(things: tuple[Thing, ...] = BOXES, noise: float = 0.005, **kwargs: floa
 
 @pytest.mark.parametrize("aware", [True, False])
 def test_a_similarity_is_recovered(aware: bool) -> None:
-    measured = measure_edge(*pair(noise=0.0), 3, 4, CAMERA, False, EdgeSettings(instance_aware=aware))
+    measured = edge_between(*pair(noise=0.0), 3, 4, CAMERA, False, EdgeSettings(instance_aware=aware))
     edge = measured.edge
     assert (edge.u, edge.v, edge.kind, edge.accepted, edge.frames) == (3, 4, "adjacent", True, None)
     assert off(edge.S_v_u) < 1e-4
@@ -45,14 +61,14 @@ def test_a_similarity_is_recovered(aware: bool) -> None:
 def test_a_rigid_edge_between_metric_chunks() -> None:
     T_u, T_v = (replace(S, scale=np.ones(())) for S in (S_U, S_V))
     u, v = film(S_chunk_world=T_u), film(S_chunk_world=T_v)
-    edge = measure_edge(u, v, 0, 1, CAMERA, True, kind="loop", frames=(3, 90)).edge
+    edge = edge_between(u, v, 0, 1, CAMERA, True, kind="loop", frames=(3, 90)).edge
     assert float(edge.S_v_u.scale) == 1.0
     assert (edge.kind, edge.frames) == ("loop", (3, 90))
     assert off(edge.S_v_u, T_v @ T_u.inverse()) < 1e-4
 
 
 def test_a_calm_scene_keeps_all_its_things() -> None:
-    measured = measure_edge(*pair(noise=0.01), 0, 1, CAMERA, False)
+    measured = edge_between(*pair(noise=0.01), 0, 1, CAMERA, False)
     assert measured.moving_u == measured.moving_v == frozenset()
     assert not measured.support.removed.any()
     assert off(measured.edge.S_v_u) < 0.01
@@ -62,19 +78,19 @@ def test_a_calm_scene_keeps_all_its_things() -> None:
 def test_a_mover_over_half_of_the_picture_is_left_out(depth_u: float, depth_v: float) -> None:
     u, v = pair((*BOXES, LARGE), depth_u=depth_u, depth_v=depth_v)
     assert (u.instance == MOVER).mean() > 0.4
-    measured = measure_edge(u, v, 0, 1, CAMERA, False)
+    measured = edge_between(u, v, 0, 1, CAMERA, False)
     assert measured.moving_u == measured.moving_v == {MOVER}
     assert measured.support.removed.mean() > 0.4
     assert "moves" in measured.edge.reason
     assert off(measured.edge.S_v_u) < 0.015
-    plain = measure_edge(u, v, 0, 1, CAMERA, False, EdgeSettings(instance_aware=False))
+    plain = edge_between(u, v, 0, 1, CAMERA, False, EdgeSettings(instance_aware=False))
     assert off(measured.edge.S_v_u) <= off(plain.edge.S_v_u) + 0.005
 
 
 def test_a_mover_displaced_across_the_ray_is_left_out() -> None:
     u, v = pair((*BOXES, LARGE))
     aside = (v.instance == MOVER)[:, None] * (float(S_V.scale) * S_V.rotation @ [0.25, 0.0, 0.0])
-    measured = measure_edge(u, replace(v, points=(v.points + aside).astype(np.float32)), 0, 1, CAMERA, False)
+    measured = edge_between(u, replace(v, points=(v.points + aside).astype(np.float32)), 0, 1, CAMERA, False)
     assert measured.moving_u == {MOVER}
     assert off(measured.edge.S_v_u) < 0.015
 
@@ -82,11 +98,11 @@ def test_a_mover_displaced_across_the_ray_is_left_out() -> None:
 def test_a_mover_without_a_mask_is_left_out_block_by_block() -> None:
     u, v = pair((*BOXES, replace(LARGE, half=(0.4, 1.2))), depth_v=1.3)
     u, v = (replace(s, instance=np.full_like(s.instance, -1)) for s in (u, v))
-    assert off(measure_edge(u, v, 0, 1, CAMERA, False).edge.S_v_u) < 0.02
+    assert off(edge_between(u, v, 0, 1, CAMERA, False).edge.S_v_u) < 0.02
 
 
 def test_instances_known_to_move_are_left_out() -> None:
-    measured = measure_edge(*pair((*BOXES, LARGE)), 0, 1, CAMERA, False, dynamic_u=[MOVER], dynamic_v=[MOVER])
+    measured = edge_between(*pair((*BOXES, LARGE)), 0, 1, CAMERA, False, dynamic_u=[MOVER], dynamic_v=[MOVER])
     u, _ = pair((*BOXES, LARGE))
     assert not measured.support.kept[u.instance == MOVER].any()
     assert off(measured.edge.S_v_u) < 0.015
@@ -98,7 +114,7 @@ def test_a_third_of_the_frames_misplaced_together_does_not_bend_it() -> None:
     moved = v.points + late[:, None] * np.array([0.3, 0.1, -0.2])
     T = v.T_chunk_cam.copy()
     T[16:, :3, 3] += [0.3, 0.1, -0.2]
-    measured = measure_edge(u, replace(v, points=moved.astype(np.float32), T_chunk_cam=T), 0, 1, CAMERA, False)
+    measured = edge_between(u, replace(v, points=moved.astype(np.float32), T_chunk_cam=T), 0, 1, CAMERA, False)
     assert measured.edge.accepted
     assert off(measured.edge.S_v_u) < 0.02
     assert measured.moving_u == frozenset()
@@ -107,20 +123,20 @@ def test_a_third_of_the_frames_misplaced_together_does_not_bend_it() -> None:
 @pytest.mark.parametrize("labels", ["none", "one"])
 def test_chunks_with_no_instance_and_with_one(labels: str) -> None:
     u, v = (replace(s, instance=np.full_like(s.instance, -1 if labels == "none" else 0)) for s in pair())
-    assert off(measure_edge(u, v, 0, 1, CAMERA, False).edge.S_v_u) < 0.01
+    assert off(edge_between(u, v, 0, 1, CAMERA, False).edge.S_v_u) < 0.01
 
 
 def test_all_points_on_one_plane_are_enough() -> None:
     u, v = pair(())
     wall_u, wall_v = (only(s, s.instance == 0) for s in (u, v))
-    assert off(measure_edge(wall_u, wall_v, 0, 1, CAMERA, False).edge.S_v_u) < 0.02
+    assert off(edge_between(wall_u, wall_v, 0, 1, CAMERA, False).edge.S_v_u) < 0.02
 
 
 def test_points_that_are_not_finite_are_left_out() -> None:
     u, v = pair()
     points = v.points.copy()
     points[::3] = np.nan
-    assert off(measure_edge(u, replace(v, points=points), 0, 1, CAMERA, False).edge.S_v_u) < 0.01
+    assert off(edge_between(u, replace(v, points=points), 0, 1, CAMERA, False).edge.S_v_u) < 0.01
 
 
 def test_movers_everywhere_are_no_accepted_edge() -> None:
@@ -128,7 +144,7 @@ def test_movers_everywhere_are_no_accepted_edge() -> None:
     rng = np.random.default_rng(0)
     wild = (v.points + rng.normal(size=v.points.shape)).astype(np.float32)
     try:
-        edge = measure_edge(u, replace(v, points=wild), 0, 1, CAMERA, False).edge
+        edge = edge_between(u, replace(v, points=wild), 0, 1, CAMERA, False).edge
     except DegenerateError:
         return
     assert not edge.accepted
@@ -152,15 +168,15 @@ def test_degenerate_overlap_has_a_name() -> None:
     for reason, (a, b) in cases.items():
         for aware in (True, False):
             with pytest.raises(DegenerateError, match=f"chunks 7 and 8 cannot be aligned.*{reason}"):
-                measure_edge(a, b, 7, 8, CAMERA, False, EdgeSettings(instance_aware=aware))
+                edge_between(a, b, 7, 8, CAMERA, False, EdgeSettings(instance_aware=aware))
     with pytest.raises(DegenerateError):
-        measure_edge(FrameSamples.empty(), FrameSamples.empty(), 7, 8, CAMERA, False)
+        edge_between(FrameSamples.empty(), FrameSamples.empty(), 7, 8, CAMERA, False)
     with pytest.raises(DegenerateError, match="stands still"):
-        measure_edge(u, v, 7, 8, CAMERA, False, dynamic_u=range(10))
+        edge_between(u, v, 7, 8, CAMERA, False, dynamic_u=range(10))
 
 
 def test_the_picture_shows_what_was_removed_and_kept(tmp_path: object) -> None:
-    measured = measure_edge(*pair((*BOXES, LARGE), depth_v=1.25), 5, 6, CAMERA, False)
+    measured = edge_between(*pair((*BOXES, LARGE), depth_v=1.25), 5, 6, CAMERA, False)
     picture = draw_support(np.full((120, 160, 3), 96, np.uint8), measured, 12)
     assert (np.abs(picture.astype(int) - [255, 30, 30]).max(axis=-1) < 40).sum() > 100
     assert (np.abs(picture.astype(int) - [0, 230, 255]).max(axis=-1) < 40).sum() > 100

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from list3r.association.chunk_nodes import ChunkNodes, NodeSettings, measured_walk, relate_frames
-from list3r.association.edges import measure_edge
+from list3r.association.edges import EdgeEnd, measure_edge
 from list3r.association.node_graph import bend_chunks
 from list3r.association.pose_graph import GraphResult, optimize
 from list3r.memory.bends import Bend
@@ -45,7 +45,7 @@ def chunks(deviation: float, seed: int = 3) -> dict[int, FrameSamples]:
 def graph_of(samples: dict[int, FrameSamples], loop: bool = True) -> GraphResult:
     """Chunks by adjacent edges, and a true loop between the first frame of all and the last."""
     ids = sorted(samples)
-    edges = [measure_edge(samples[a], samples[a + 1], a, a + 1, CAMERA, False).edge for a in ids[:-1]]
+    edges = [measure_edge(EdgeEnd(a, samples[a]), EdgeEnd(a + 1, samples[a + 1]), CAMERA, False).edge for a in ids[:-1]]
     if loop:
         last = STEP * (COUNT - 1) + LENGTH - 1
         ends = [Sim3.from_matrix(samples[c].T_chunk_cam[n]) for c, n in ((1, 0), (COUNT, -1))]
@@ -110,7 +110,7 @@ def test_given_poses_and_a_switched_off_graph_do_not_bend() -> None:
 
 def test_metric_chunks_keep_their_scale() -> None:
     samples = {k: bent(film(first=STEP * (k - 1), frames=LENGTH), np.array([0.02] * 6 + [0.0])) for k in range(1, 4)}
-    edges = [measure_edge(samples[a], samples[a + 1], a, a + 1, CAMERA, True).edge for a in (1, 2)]
+    edges = [measure_edge(EdgeEnd(a, samples[a]), EdgeEnd(a + 1, samples[a + 1]), CAMERA, True).edge for a in (1, 2)]
     graph = optimize([1, 2, 3], edges, {}, metric=True)
     straight, bends = bend_chunks(samples.__getitem__, graph, (), True)
     assert all(float(S.scale) == pytest.approx(1.0, abs=1e-12) for S in straight.S_graph_chunk.values())
@@ -147,7 +147,7 @@ def test_how_much_chunks_bend_is_measured_on_their_overlaps() -> None:
         samples = chunks(deviation)
         found = []
         for a in (1, 2, 3):
-            edge = measure_edge(samples[a], samples[a + 1], a, a + 1, CAMERA, False).edge
+            edge = measure_edge(EdgeEnd(a, samples[a]), EdgeEnd(a + 1, samples[a + 1]), CAMERA, False).edge
             nodes = ChunkNodes.of(samples[a], 10)
             assert nodes.count.sum() == LENGTH
             found.append(relate_frames(samples[a], samples[a + 1], edge, nodes))

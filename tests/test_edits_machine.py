@@ -226,6 +226,7 @@ class StoreAgainstModel(RuleBasedStateMachine):
         now = view(self.store)
         for n, (_, keys) in now.items():
             self.held[n] = keys
+        assert not self.store.aliases().keys() & now.keys(), "what names an instance is no alias"
         seen = {k for _, keys in now.values() for k in keys}
         for n, keys in self.held.items():
             try:

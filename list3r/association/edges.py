@@ -76,48 +76,52 @@ class MeasuredEdge:
     support: EdgeSupport
 
 
+@dataclass(frozen=True)
+class EdgeEnd:
+    """One of two chunks that share frames."""
+
+    chunk_id: int
+    samples: FrameSamples
+    dynamic: Collection[int] = ()
+    """Local ids of instances that are known to move (`motion.flag_moving`), which are left out."""
+
+
 def measure_edge(
-    u: FrameSamples,
-    v: FrameSamples,
-    u_id: int,
-    v_id: int,
+    u: EdgeEnd,
+    v: EdgeEnd,
     camera: Camera,
     metric: bool,
     settings: EdgeSettings | None = None,
     *,
     kind: str = "adjacent",
     frames: tuple[int, int] | None = None,
-    dynamic_u: Collection[int] = (),
-    dynamic_v: Collection[int] = (),
 ) -> MeasuredEdge:
     """The edge between two chunks that share frames; a rigid one when `metric`.
 
-    `camera` is that of the colour images; `dynamic_u` and `dynamic_v` are local ids of instances that are known to move
-    (`motion.flag_moving`), which are left out. Raises `DegenerateError` where the shared points determine no transform;
-    an edge that they determine but do not agree on is returned with `accepted` false and the reason.
+    `camera` is that of the colour images. Raises `DegenerateError` where the shared points determine no transform; an
+    edge that they determine but do not agree on is returned with `accepted` false and the reason.
     """
     chosen = settings or EdgeSettings()
     try:
-        pairs = shared_pairs(u, v)
+        pairs = shared_pairs(u.samples, v.samples)
         if len(pairs) < chosen.least_pairs:
             raise DegenerateError(f"only {len(pairs)} points are shared; at least {chosen.least_pairs} are needed")
-        known = np.isin(pairs.instance_u, list(dynamic_u)) | np.isin(pairs.instance_v, list(dynamic_v))
-        return _measure(pairs, known, u_id, v_id, camera, metric, chosen, kind, frames)
+        known = np.isin(pairs.instance_u, list(u.dynamic)) | np.isin(pairs.instance_v, list(v.dynamic))
+        static, support, found = _aligned(pairs, known, camera, metric, chosen)
     except DegenerateError as error:
-        raise DegenerateError(f"chunks {u_id} and {v_id} cannot be aligned: {error}") from error
+        raise DegenerateError(f"chunks {u.chunk_id} and {v.chunk_id} cannot be aligned: {error}") from error
+    return MeasuredEdge(
+        edge=_edge(static, support, found, u.chunk_id, v.chunk_id, chosen, kind, frames),
+        moving_u=static.moving_u,
+        moving_v=static.moving_v,
+        support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, support.used),
+    )
 
 
-def _measure(
-    pairs: Pairs,
-    known: Mask,
-    u_id: int,
-    v_id: int,
-    camera: Camera,
-    metric: bool,
-    settings: EdgeSettings,
-    kind: str,
-    frames: tuple[int, int] | None,
-) -> MeasuredEdge:
+def _aligned(
+    pairs: Pairs, known: Mask, camera: Camera, metric: bool, settings: EdgeSettings
+) -> tuple[StaticSupport, BalancedSupport, Alignment]:
+    """What an edge stands on, and the alignment; without instances where they leave too little."""
     if settings.instance_aware:
         static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
         support = balanced_support(pairs, static, camera, settings.support)
@@ -130,12 +134,7 @@ def _measure(
             raise
         static, support = _confident_support(pairs, settings.support)
         found = _align(support, metric, settings)
-    return MeasuredEdge(
-        edge=_edge(static, support, found, u_id, v_id, settings, kind, frames),
-        moving_u=static.moving_u,
-        moving_v=static.moving_v,
-        support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, support.used),
-    )
+    return static, support, found
 
 
 def _align(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:

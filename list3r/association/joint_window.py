@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from list3r.association.alignment import align
 from list3r.association.chain import adjoint
 from list3r.association.cross_check import CrossSettings, Side, cross_check, shared_view
-from list3r.association.edges import EdgeSettings, measure_edge
+from list3r.association.edges import EdgeEnd, EdgeSettings, measure_edge
 from list3r.association.shared_points import shared_samples
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
@@ -182,8 +182,8 @@ def _rough(a: FrameSamples, b: FrameSamples, settings: WindowSettings) -> Sim3:
 def _half(a: FrameSamples, b: FrameSamples, place: Place, window: JointWindow, settings: EdgeSettings) -> Edge:
     """The edge between a chunk and its side of the window."""
     metric = place.metric and window.scale_kind == "metric"
-    measured = measure_edge(a, b, place.chunk_id, place.chunk_id, place.side.camera, metric, settings, kind="loop")
-    return measured.edge
+    ends = EdgeEnd(place.chunk_id, a), EdgeEnd(place.chunk_id, b)
+    return measure_edge(*ends, place.side.camera, metric, settings, kind="loop").edge
 
 
 def _composed(u: Place, v: Place, to_window: Edge, to_v: Edge) -> Edge:
