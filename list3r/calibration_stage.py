@@ -44,8 +44,10 @@ def with_camera(
         with threadpool_limits(1):
             progress = None if look is None else (lambda done, total: look("camera", done, total))
             calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
-            found = calibrate(open_source(source, options), progress=progress)
-        known = {"notes": list(found.notes), **_as_stored(found.camera, source, options)}
+            opened, size = open_source(source, options), _stored_size(source, options)
+            height, width = opened.info.image_size or size
+            found = calibrate(opened, progress=progress, stored_px=max(size) / max(height, width))
+        known = {"notes": list(found.notes), **_as_stored(found.camera, size)}
         with store.transaction():
             store.set_value(_name(session), known)
     return replace(options, intrinsics=tuple(known["intrinsics"]), distortion=tuple(known["distortion"]))
@@ -57,12 +59,15 @@ def camera_notes(store: Store, session: int) -> tuple[str, ...]:
     return tuple(known.get("notes", ()))
 
 
-def _as_stored(camera: Camera, source: str | Path, options: SourceOptions) -> dict[str, list[float]]:
-    """Intrinsics and distortion for pictures as stored, which may be larger than the frames handed out."""
+def _stored_size(source: str | Path, options: SourceOptions) -> tuple[int, int]:
+    """(height, width) of pictures as stored, which may be larger than the frames handed out."""
     whole = open_source(source, replace(options, max_side=0)).info
-    size = whole.image_size or (camera.height, camera.width)
-    if whole.camera is not None:
-        size = (whole.camera.height, whole.camera.width)
+    assert whole.image_size is not None
+    return whole.image_size
+
+
+def _as_stored(camera: Camera, size: tuple[int, int]) -> dict[str, list[float]]:
+    """Intrinsics and distortion for pictures of that (height, width)."""
     full = resized(camera, size)
     assert full is not None
     return {"intrinsics": [full.fx, full.fy, full.cx, full.cy], "distortion": list(camera.distortion)}

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from list3r.calibration_stage import camera_notes
 from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.borrowing import BorrowSettings, borrow
@@ -28,6 +29,7 @@ from list3r.pipeline import _runs, build
 from list3r.reconstruction.sfm import SfmReconstructor
 from list3r.reconstruction.sfm_calibration import CalibrationSettings, _focal_sigma
 from list3r.reconstruction.sfm_mapping import MapProblem, SparseMap
+from list3r.session_stage import Job, plan_session
 from tests.conftest import write_small_room
 from tests.rgbd_scenes import CAMERA, render
 
@@ -201,6 +203,18 @@ def test_more_windows_that_agree_make_the_focal_length_surer() -> None:
     agreeing = _focal_sigma(windows(500.0, 505.0, 495.0, 500.0, 502.0), s)
     parted = _focal_sigma(windows(500.0, 600.0, 420.0, 560.0, 450.0), s)
     assert agreeing < 0.035 < parted < s.window_sigma
+
+
+def test_what_is_said_of_the_camera_is_in_pixels_of_the_pictures_as_stored(tmp_path: Path) -> None:
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((120, 160, 3), np.uint8))
+    job = Job(tmp_path, SourceOptions(max_side=80), BuildSettings("sfm"), open_source(tmp_path).info, 1)
+    with Store.create(tmp_path / "m.l3r") as store:
+        with store.transaction():
+            session = store.add_session("here", "", {}, 4)
+        plan = plan_session(store, session, job)
+        assert "focal length of 192 px is a guess" in camera_notes(store, session)[0]
+    assert plan.tasks[0].options.intrinsics == pytest.approx((192.0, 192.0, 79.5, 59.5))
 
 
 def test_runs_of_numbers_in_words() -> None:

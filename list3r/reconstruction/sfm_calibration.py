@@ -68,9 +68,15 @@ class Calibration:
 
 
 def calibrate(
-    source: FrameSource, settings: CalibrationSettings | None = None, progress: Progress | None = None
+    source: FrameSource,
+    settings: CalibrationSettings | None = None,
+    progress: Progress | None = None,
+    stored_px: float = 1.0,
 ) -> Calibration:
-    """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given."""
+    """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given.
+
+    `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes speak of those.
+    """
     chosen = settings or CalibrationSettings()
     info = source.info
     known = info.camera is not None
@@ -79,16 +85,16 @@ def calibrate(
     if found is None and known:
         found = _estimated(source, guessed_camera(info), chosen, progress)
     if found is None:
-        return _nothing(start, known)
+        return _nothing(start, known, stored_px)
     windows, free, k1 = found
     sigma = _focal_sigma(windows, chosen)
-    told = f"{free.fx:.0f} px, give or take {100 * sigma:.0f} %"
+    told = f"{free.fx * stored_px:.0f} px, give or take {100 * sigma:.0f} %"
     if not known:
         said = f"the camera was estimated from the pictures: focal length {told}; distortion k1 {k1:.3f}"
         return Calibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, (said,))
     if abs(np.log(free.fx / start.fx)) > chosen.doubted_sigmas * sigma:
         said = (
-            f"the given focal length {start.fx:.0f} px does not fit the pictures, which say about {told}; "
+            f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which say about {told}; "
             "check --intrinsics, or leave it out"
         )
         return Calibration(start, len(windows), free.fx, sigma, (said,))
@@ -126,10 +132,11 @@ def _estimated(
     return (windows, free, k1) if low < free.fx < high and abs(k1) <= settings.distortion_range else None
 
 
-def _nothing(start: Camera, known: bool) -> Calibration:
+def _nothing(start: Camera, known: bool, stored_px: float) -> Calibration:
     if known:
         return Calibration(start, 0, None)
-    said = f"the camera could not be estimated; a focal length of {start.fx:.0f} px is a guess: give --intrinsics"
+    guess = f"a focal length of {start.fx * stored_px:.0f} px is a guess: give --intrinsics"
+    said = f"the camera could not be estimated; {guess}"
     return Calibration(start, 0, None, notes=(said,))
 
 
