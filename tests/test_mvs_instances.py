@@ -74,3 +74,29 @@ def test_frames_that_share_their_errors_do_not_confirm_an_edge() -> None:
         forget_views()
     assert seen[True].mean() > seen[False].mean() > 0.8
     assert (seen[False] & ~seen[True]).mean() < 0.01
+
+
+def test_confidence_of_stereo_tells_the_deviation_of_its_depth() -> None:
+    noise = DepthNoise(0.0, 0.002, 0.02)
+    sigma, depth = np.array([0.005, 0.02, 0.06], np.float32), np.array([0.5, 1.0, 4.0], np.float32)
+    confidence = (1.0 / (1.0 + (sigma / 0.02) ** 2)).astype(np.float16)
+    assert np.allclose(noise.doubt(depth, confidence), sigma * depth, rtol=0.02)
+    assert not DepthNoise(0.0, 0.002).doubt(depth, confidence).any()
+
+
+def test_a_thing_narrower_than_the_deviation_of_its_depth_is_none() -> None:
+    T = walk(COUNT)
+    frames = frames_along(T, seed=101, noise=False)
+    depth = np.stack([f.depth for f in frames if f.depth is not None])
+    found = {}
+    for sure in (0.9, 0.02):
+        confidence = np.where(depth > 0, sure, 0.0).astype(np.float16)
+        reconstruction = Reconstruction(
+            np.arange(COUNT), np.ones(COUNT, bool), T, CAMERA, depth, confidence, "metric",
+            np.arange(0, COUNT, 8), depth_noise=DepthNoise(0.0, 0.002, 0.02),
+        )  # fmt: skip
+        found[sure] = build_library(frames, reconstruction).instances
+    things = {sure: [i for i in library if not i.structure and i.plane is None] for sure, library in found.items()}
+    assert len(things[0.9]) >= 3
+    assert len(things[0.02]) < len(things[0.9])
+    assert sum(i.structure for i in found[0.02]) == sum(i.structure for i in found[0.9])

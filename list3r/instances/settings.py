@@ -52,6 +52,9 @@ class SegmentSettings:
     """Smallest diameter of a thing that stands out of a surface."""
     flat_area_m2: float = 0.008
     """Smallest sheet that is told from the surface under it by colour alone (a postcard is 0.015)."""
+    least_spread: float = 0.75
+    """Of computed depth: deviation of a thing's points along the second of its axes, over that of its depth; a bar as
+    wide as what its depth may be off by to either side has 0.58."""
 
 
 @dataclass(frozen=True)

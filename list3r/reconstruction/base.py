@@ -21,10 +21,20 @@ class DepthNoise:
 
     base: float
     quadratic: float
+    half_share: float = 0.0
+    """Deviation, as a share of depth, at which confidence is one half; 0 where confidence does not tell."""
 
     def sigma(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Standard deviation of depths, chunk units. Shape (...)."""
         return np.asarray(self.base + self.quadratic * depth * depth, np.float32)
+
+    def doubt(self, depth: NDArray[np.float32], confidence: NDArray[np.float16]) -> NDArray[np.float32]:
+        """Standard deviation that confidence tells, chunk units: what bends a whole surface is in it. Shape (...).
+
+        Confidence is 1 / (1 + (sigma / half)^2).
+        """
+        c = np.clip(confidence.astype(np.float32), 0.01, 1.0)
+        return np.asarray(self.half_share * np.sqrt(1.0 / c - 1.0) * depth, np.float32)
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,8 @@ def stereo_noise(
         rates.append(plane_residual(inverse, radius=8)[4:-4:4, 4:-4:4].ravel())
     found = np.concatenate(rates) if rates else np.zeros(0)
     found = found[np.isfinite(found)]
-    return DepthNoise(0.0, float(np.quantile(found, 0.4))) if len(found) >= 200 else None
+    rough = float(np.quantile(found, 0.4)) if len(found) >= 200 else 0.0
+    return DepthNoise(0.0, rough, TrustSettings().half_sigma) if rough > 0 else None
 
 
 def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
