@@ -13,7 +13,7 @@ from list3r.memory.errors import UnknownIdError
 from list3r.memory.geometry import Sim3
 from list3r.memory.graphs import merge_graph, relation_graph
 from list3r.memory.identities import assign_ids
-from list3r.memory.records import ChunkResult, LocalInstance, LocalLibrary
+from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary
 from list3r.memory.store import Store
 from tests.conftest import chunk_result, local_instance
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, Piece, surface
@@ -215,6 +215,62 @@ def test_what_others_see_as_part_of_a_thing_is_not_shown_and_its_id_resolves_to_
         assert len(store.instances()) == 1
         table = store.instances()[0].id
         assert store.resolve(3 - table) == table
+
+
+def computed(result: ChunkResult, things: int) -> ChunkResult:
+    """The chunk as if its depth had been computed, with depth wherever it or others see one of some things."""
+    frames = np.repeat(result.frame_indices, things)
+    slot = np.tile(np.arange(things), len(result.frame_indices))
+    # what is seen at a place in the picture is told by the box, see `local`
+    boxes = {int(i.track.boxes_xyxy[0, 0]): i.local_id for i in result.library.instances}
+    places = sorted({int(4 + 6.0 * n) for n in range(len(THINGS))} | {54})
+    owner = np.array([boxes.get(places[k], -1) for k in slot], np.int32)
+    samples = FrameSamples(
+        frame=frames,
+        pixel=slot.astype(np.int32),
+        points=np.zeros((len(frames), 3), np.float32),
+        confidence=np.ones(len(frames), np.float32),
+        instance=owner,
+        camera_frames=result.frame_indices,
+        T_chunk_cam=result.T_chunk_cam,
+    )
+    return dataclasses.replace(result, scale_kind="relative", samples=samples)
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+def test_what_the_next_chunk_misses_in_the_same_frames_was_never_there(tmp_path: Path, kind: str) -> None:
+    phantom = Piece("phantom", (-0.6, 0.4, 0.9), (0.2, 0.1, 0.1), (90, 40, 40), points=300)
+    with create(tmp_path / "a.l3r") as store:
+        made = computed if kind == "relative" else (lambda result, _: result)
+        add(store, made(chunk(0, [TABLE, MUG, phantom]), 8))
+        before = {i.id for i in store.instances()}
+        assert len(before) == 3
+        report = add(store, made(chunk(1, [TABLE, MUG], step=6), 8))
+        after = {i.id for i in store.instances()}
+        if kind == "metric":
+            assert after == before
+            return
+        assert after < before and report.hidden == 1
+        (gone,) = before - after
+        with pytest.raises(UnknownIdError):
+            store.instance(gone)
+        again = add(store, made(chunk(2, [TABLE, MUG, phantom], step=6), 8))
+        assert len(again.new) == 1 and gone not in again.new
+
+
+def test_where_the_next_chunk_has_no_depth_it_misses_nothing(tmp_path: Path) -> None:
+    phantom = Piece("phantom", (-0.6, 0.4, 0.9), (0.2, 0.1, 0.1), (90, 40, 40), points=300)
+    with create(tmp_path / "a.l3r") as store:
+        add(store, computed(chunk(0, [TABLE, MUG, phantom]), 8))
+        add(store, computed(chunk(1, [TABLE, MUG], step=6), 7))
+        assert len(store.instances()) == 3
+
+
+def test_what_bounds_the_room_is_not_missed(tmp_path: Path) -> None:
+    with create(tmp_path / "a.l3r") as store:
+        add(store, computed(chunk(0, [TABLE, FLOOR]), 8))
+        add(store, computed(chunk(1, [TABLE], step=6), 8))
+        assert len(store.instances()) == 2
 
 
 def test_too_few_frames_are_not_shown(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from list3r.memory.changes import Changes, across_sessions, as_events, find_changes
 from list3r.memory.constraints import Constraints
 from list3r.memory.derive import Thing, with_agreement
-from list3r.memory.evidence import Evidence, contested, weigh
+from list3r.memory.evidence import Evidence, contested, weigh, without_missed
 from list3r.memory.geometry import Sim3
 from list3r.memory.growth import grow
 from list3r.memory.identities import Identities, assign_ids
@@ -117,6 +117,7 @@ def _derive_whole(
     counts = [e.shown(s.evidence, world.posed) or tale.shows(g) for e, g in zip(evidence, groups, strict=True)]
     shown = word.shown(groups, counts)
     within = [next((w for w in e.within if shown[w]), None) for e in evidence]
+    before = without_missed(before, groups, evidence, shown)
     ids = assign_ids(groups, before, weights, shown, within, store.next_id())
     things = _things(store, groups, ids, evidence, chunks, held, s, movers, tale, world)
     things = _with_structure(store, things, chunks, groups, ids, s, world)

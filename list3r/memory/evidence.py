@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.meetings import Key, Meetings, Numbering, PairScores
+from list3r.memory.missed import frames_beside, looks_at
 from list3r.memory.shapes import ChunkShapes, Ints
 
 
@@ -30,6 +31,11 @@ class EvidenceSettings:
     """Edge of the cells in which the claims of things to a place are counted."""
     claims: int = 4
     """A bit that one chunk alone gives to a thing, and this many to another, is not part of it."""
+    missed_frames: int = 8
+    """Frames that two chunks of computed depth share in which one must see a thing and the other look at its place,
+    for the other to have missed it: as many as a track of a chunk of 100 frames needs."""
+    missed_share: float = 0.25
+    """Share of a thing in a frame where the other has depth, to look at its place: a part of it would do."""
 
 
 @dataclass(frozen=True)
@@ -44,15 +50,17 @@ class Evidence:
     """Chunks that saw its place, but as part of another thing."""
     within: tuple[int, ...]
     """Those other things (numbers of groups), the one named most first."""
+    missed: int = 0
+    """Chunks of computed depth that looked at it in frames they share with one that found it, and found nothing."""
 
     @property
     def agreement(self) -> float:
         """Share of the chunks that saw its place and found it as a thing of its own."""
-        return self.found / max(self.found + self.swallowed, 1)
+        return self.found / max(self.found + self.swallowed + self.missed, 1)
 
     def shown(self, s: EvidenceSettings, all_frames: int) -> bool:
         """Seen in enough of all posed frames, and more chunks for it than against (or nearly, if several found it)."""
-        agreed = self.found > self.swallowed or (self.found >= 3 and self.agreement >= s.min_agreement)
+        agreed = self.found > self.swallowed + self.missed or (self.found >= 3 and self.agreement >= s.min_agreement)
         enough = min(s.min_frames, max(3, math.ceil(s.min_share * all_frames)))
         return self.frames >= enough and agreed
 
@@ -85,6 +93,7 @@ def weigh(
         for n, other, share, chunk in rows:
             claim = (share, -other)
             against[n][chunk] = max(claim, against[n].get(chunk, claim))
+    beside = frames_beside(chunks, pairs)
     out = []
     for n, group in enumerate(groups):
         own = {k for k, _ in group}
@@ -93,8 +102,33 @@ def weigh(
             if chunk not in own:
                 votes[-other] = votes.get(-other, 0) + 1
         ranked = tuple(sorted(votes, key=lambda g: (-votes[g], g)))
-        out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked))
+        asked = weighed[n] and not all(_bounds(chunks, key) for key in group)
+        silent = {v for u in own for v in beside.get(u, {})} - own - against[n].keys() if asked else set()
+        least, share = settings.missed_frames, settings.missed_share
+        missed = sum(looks_at(v, group, chunks, beside, least_frames=least, least_share=share) for v in silent)
+        out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked, missed))
     return out
+
+
+def without_missed(
+    before: Mapping[Key, int], groups: Sequence[Sequence[Key]], evidence: Sequence[Evidence], shown: Sequence[bool]
+) -> dict[Key, int]:
+    """The ids of before without those of things that others looked at and missed, and that lie within no other: they
+    were never there, so that no thing goes on with their id.
+    """
+    gone = {
+        key
+        for group, e, show in zip(groups, evidence, shown, strict=True)
+        if e.missed and not show and not e.within
+        for key in group
+    }
+    return {key: n for key, n in before.items() if key not in gone}
+
+
+def _bounds(chunks: Mapping[int, ChunkShapes], key: Key) -> bool:
+    """Whether a local instance is a surface that bounds the room, of which each chunk sees what it sees."""
+    chunk = chunks.get(key[0])
+    return chunk is not None and bool(chunk.structure[int(np.searchsorted(chunk.local_id, key[1]))])
 
 
 def _frames_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes]) -> set[tuple[int, int]]:

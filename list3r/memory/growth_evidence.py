@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.evidence import Evidence, claim_cells, contested, weigh
+from list3r.memory.evidence import Evidence, claim_cells, contested, weigh, without_missed
 from list3r.memory.growth_region import Group, Occasion, Region
 from list3r.memory.identities import Identities, assign_ids
 from list3r.memory.meetings import Key, Meetings
+from list3r.memory.missed import frames_beside
 from list3r.memory.settling import neighbours
 from list3r.memory.shapes import Ints
 
 _LARGE = 3
 """Chunks from which a group is large, see `evidence.contested`."""
+_UNWEIGHED = Evidence(0, 0, 0, ())
 
 
 @dataclass
@@ -42,7 +44,7 @@ class Weighing(Region):
         against them; as long as one of them comes to be shown or not, also for those that lie within it.
         """
         out = Weighed()
-        wanted = {*changed, *self._against(changed), *(self._home[k] for k in self._left)}
+        wanted = {*changed, *self._against(changed), *(self._home[k] for k in self._left), *self._looked_at()}
         while True:
             fresh = sorted(wanted - out.evidence.keys())
             if not fresh:
@@ -77,6 +79,19 @@ class Weighing(Region):
             out.evidence[g] = e
             out.shown[g] = show
 
+    def _looked_at(self) -> set[Group]:
+        """Groups in frames that chunks of computed depth share with one that is new or moved, which may miss them."""
+        pairs = self._pairs_of(self._dirty)
+        shapes = {k: self._shapes(k) for k in sorted({k for pair in pairs for k in pair})}
+        beside = frames_beside(shapes, pairs)
+        self._look_up(beside)
+        out: set[Group] = set()
+        for k, others in beside.items():
+            shared = np.unique(np.concatenate(list(others.values())))
+            seen = [len(np.intersect1d(frames, shared)) > 0 for frames in shapes[k].frames]
+            out |= {self._home[k, int(n)] for n in shapes[k].local_id[seen]}
+        return out
+
     def _against(self, groups: Collection[Group]) -> set[Group]:
         """Groups of which a member lies on a member of one of these."""
         keys = {k for g in groups for k in g}
@@ -97,6 +112,8 @@ class Weighing(Region):
         keys = [k for g in listed for k in g]
         before = self._word.remembered(listed, self._store.observed_as(keys))
         weights = {(k, n): len(self._frames_of((k, n))) for k, n in keys}
+        known = [weighed.evidence.get(g, _UNWEIGHED) for g in listed]
+        before = without_missed(before, listed, known, [shown.get(g, False) for g in listed])
         within = [at.get(inner[g]) if inner.get(g) is not None else None for g in listed]  # type: ignore[arg-type]
         ids = assign_ids(listed, before, weights, [shown.get(g, False) for g in listed], within, self._store.next_id())
         return ids, listed, before

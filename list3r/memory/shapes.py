@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from list3r.memory.colors import lab_from_rgb
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.local_verbs import LocalNode
+from list3r.memory.records import FrameSamples
 
 Ints = NDArray[np.int64]
 
@@ -108,6 +109,10 @@ class ChunkShapes:
     """Shape (V,) each."""
     visible_fraction: tuple[NDArray[np.float32], ...]
     """Shape (V,) each."""
+    samples: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Where depth was computed in every third frame: ascending keys of frame and pixel; none of a sensor. (S,)."""
+    sample_owner: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
 
     def spans(self, S_world_chunk: Sim3) -> tuple[Array, Array]:
         """Corners of the boxes of the instances' points, world; the origin of the chunk for those without any.
@@ -131,10 +136,11 @@ def chunk_shapes(
     *,
     chunk_id: int,
     session_id: int = 1,
+    samples: FrameSamples | None = None,
 ) -> ChunkShapes:
     """Enter the local instances of one chunk in their grids.
 
-    `image_size` is (height, width); `unit` is what a metre is in chunk units.
+    `image_size` is (height, width); `unit` is what a metre is in chunk units; `samples` are given for computed depth.
     """
     s = settings or ShapeSettings()
     nodes = sorted(nodes, key=lambda n: n.local_id)
@@ -157,6 +163,7 @@ def chunk_shapes(
         points.append(p[chosen])
         rgb.append(node.support.rgb[chosen])
         owner.append(np.full(len(chosen), n))
+    sampled, sample_owner = _sampled(samples or FrameSamples.empty(), [n.local_id for n in nodes])
     return ChunkShapes(
         chunk_id=chunk_id,
         session_id=session_id,
@@ -185,7 +192,24 @@ def chunk_shapes(
         boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
         areas_px=tuple(n.areas_px for n in nodes),
         visible_fraction=tuple(n.visible_fraction for n in nodes),
+        samples=sampled,
+        sample_owner=sample_owner,
     )
+
+
+SAMPLED_FRAMES = 3
+"""Every how many frames samples are kept."""
+PIXEL_BITS = 24
+
+
+def _sampled(samples: FrameSamples, local_id: Sequence[int]) -> tuple[Ints, NDArray[np.int32]]:
+    """Keys of the samples of every third frame, ascending, and the instance of each."""
+    kept = np.flatnonzero((samples.frame % SAMPLED_FRAMES == 0) & (samples.confidence > 0))
+    keys = samples.frame[kept] << PIXEL_BITS | samples.pixel[kept].astype(np.int64)
+    place = {n: k for k, n in enumerate(local_id)}
+    owner = np.array([place.get(n, -1) for n in samples.instance[kept].tolist()], np.int32)
+    order = np.argsort(keys, kind="stable")
+    return np.asarray(keys[order], np.int64), owner[order]
 
 
 def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) -> Array:

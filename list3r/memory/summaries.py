@@ -120,7 +120,15 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     nodes = store.local_nodes([chunk.chunk_id])
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
-    shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
+    shapes = chunk_shapes(
+        nodes,
+        chunk.image_size,
+        unit,
+        settings,
+        chunk_id=chunk.chunk_id,
+        session_id=chunk.session_id,
+        samples=None if chunk.scale_kind == "metric" else store.frame_samples(chunk.chunk_id),
+    )
     lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
     motions = {n: store.motion_track(chunk.chunk_id, n) for n in moves}
