@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     parser.add_argument("--workers", default="1")
-    parser.add_argument("--jobs", type=int, default=1, help="homes that are measured side by side")
+    parser.add_argument("--jobs", type=int, default=1, help="how many are measured side by side")
     parser.add_argument("--redkitchen", type=Path, help="the sequence's folder; its two halves become two sessions")
     words = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -62,12 +62,12 @@ def main() -> None:
         root = words.keep or Path(scratch)
         seeds = [int(word) for word in words.seeds.split(",") if word]
         with ThreadPoolExecutor(words.jobs) as pool:
-            for seed, row in zip(
-                seeds, pool.map(lambda n: one_home(root / str(n), n, words.workers), seeds), strict=True
-            ):
+            table = pool.submit(redkitchen, root, words.redkitchen, words.workers) if words.redkitchen else None
+            homes = pool.map(lambda seed: one_home(root / str(seed), seed, words.workers), seeds)
+            for seed, row in zip(seeds, homes, strict=True):
                 rows.append({"seed": seed, **row})
                 print(json.dumps(rows[-1]), flush=True)
-        halves = redkitchen(root, words.redkitchen, words.workers) if words.redkitchen else None
+            halves = table.result() if table else None
     result: dict[str, Any] = {"seeds": rows, "total": total(rows)} | ({"redkitchen": halves} if halves else {})
     print(machine())
     print(json.dumps({k: v for k, v in result.items() if k != "seeds"}, indent=1))
