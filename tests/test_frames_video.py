@@ -333,8 +333,7 @@ def test_thumbnails_tell_a_cut_in_one_pass(tmp_path: Path) -> None:
     source = open_source(encode(tmp_path / "cut.mp4", "libx264", pictures, {"g": "12"}))
     heard: list[tuple[int, int]] = []
     assert find_cuts(source, progress=lambda done, total: heard.append((done, total))) == (20,)
-    assert heard[:40] == [(k + 1, 40) for k in range(40)]
-    assert heard[40:] == [(40 + n, len(heard)) for n in range(1, len(heard) - 39)]
+    assert heard == [(k + 1, 40) for k in range(40)]
 
 
 def test_a_clip_as_phones_write_it(tmp_path: Path) -> None:

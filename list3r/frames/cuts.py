@@ -8,7 +8,6 @@ One spoilt frame (black, flash, blur) is looked past.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -70,7 +69,7 @@ class ThumbnailSource(FrameSource, Protocol):
 
 
 Progress = Callable[[int, int], None]
-"""Called with (looked at, in all): every frame, and then those once more that are suspected."""
+"""Called with (frames looked at, frames in all)."""
 
 
 def find_cuts(
@@ -80,12 +79,14 @@ def find_cuts(
 
     Reads every frame once, small where the source can (a `ThumbnailSource`: 0.6 ms a JPEG of 640 x 480), and the few
     around a suspect again; what it keeps does not grow with the video but by some bytes a frame. The same source gives
-    the same cuts.
+    the same cuts. A bad frame is passed over: the next is compared with the last good one.
     """
     chosen = settings or CutSettings()
     count = source.info.frame_count
-    likeness, around = _first_look(source, count, chosen, progress)
+    likeness = np.ones(count)  # of every frame to the one before it
+    around: dict[int, Gray] = {}
     looks = _Looks(source, chosen)
+    cuts: list[int] = []
 
     def alike(a: int, b: int) -> bool:
         one, two = around.get(a), around.get(b)
@@ -93,42 +94,26 @@ def find_cuts(
             return False
         return _thumbnail_likeness(one, two) >= chosen.thumbnail_likeness or looks.same_place(a, b)
 
-    suspects = _suspects(likeness, chosen.thumbnail_likeness, chosen)
-    cuts = []
-    for n, k in enumerate(suspects, start=1):
-        if _jumps(k, count, alike, chosen):
+    def judge(k: int) -> None:
+        if k >= 0 and _suspected(likeness, k, chosen.thumbnail_likeness, chosen) and _jumps(k, count, alike, chosen):
             cuts.append(k)
-        if progress is not None:
-            progress(count + n, count + len(suspects))
-    return _spaced(cuts, alike, chosen)
 
-
-def _first_look(
-    source: FrameSource, count: int, settings: CutSettings, progress: Progress | None
-) -> tuple[NDArray[np.float64], dict[int, Gray]]:
-    """Likeness of every frame to the one before it, shape (F,), and the thumbnails about frames that are unlike it.
-
-    A frame that is bad is passed over: the next is compared with the last good one.
-    """
-    likeness = np.ones(count)
-    reach = max(settings.look_past, settings.least_shot) + 1
-    recent: deque[tuple[int, Gray]] = deque(maxlen=reach + 1)
-    around: dict[int, Gray] = {}
-    keep_to = -1
+    reach = max(chosen.look_past, chosen.least_shot) + 1
+    delay = max(chosen.window, reach)
+    last: Gray | None = None
     for k, thumbnail in enumerate(_thumbnails(source, count)):
+        if thumbnail is not None:
+            likeness[k] = 1.0 if last is None else _thumbnail_likeness(last, thumbnail)
+            around[k] = last = thumbnail
+        judge(k - delay)
+        old = k - delay - reach - 1
+        if not cuts or old - cuts[-1] > reach:
+            around.pop(old, None)
         if progress is not None:
             progress(k + 1, count)
-        if thumbnail is None:
-            continue
-        if recent:
-            likeness[k] = _thumbnail_likeness(recent[-1][1], thumbnail)
-        recent.append((k, thumbnail))
-        if likeness[k] < settings.thumbnail_likeness:
-            around.update(recent)
-            keep_to = k + reach
-        elif k <= keep_to:
-            around[k] = thumbnail
-    return likeness, around
+    for k in range(count - delay, count):
+        judge(k)
+    return _spaced(cuts, alike, chosen)
 
 
 def cuts_by_descriptor(descriptors: Floats, settings: CutSettings | None = None) -> tuple[int, ...]:
@@ -141,22 +126,19 @@ def cuts_by_descriptor(descriptors: Floats, settings: CutSettings | None = None)
     def alike(a: int, b: int) -> bool:
         return bool(descriptors[a] @ descriptors[b] >= chosen.descriptor_likeness)
 
-    suspects = _suspects(likeness, chosen.descriptor_likeness, chosen)
+    suspects = [k for k in range(len(likeness)) if _suspected(likeness, k, chosen.descriptor_likeness, chosen)]
     return _spaced([k for k in suspects if _jumps(k, len(descriptors), alike, chosen)], alike, chosen)
 
 
 Alike = Callable[[int, int], bool]
 
 
-def _suspects(likeness: NDArray[np.float64], enough: float, settings: CutSettings) -> list[int]:
-    """Frames far less like the one before than is usual around them; 1 is alike, of F frames the first is."""
-    unlike = 1.0 - likeness
-    out = []
-    for k in np.flatnonzero(likeness < enough):
-        around = unlike[max(1, k - settings.window) : k + settings.window + 1]
-        if unlike[k] > settings.factor * float(np.median(around)):
-            out.append(int(k))
-    return out
+def _suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: CutSettings) -> bool:
+    """Whether a frame is far less like the one before than is usual around it; 1 is alike, of F frames the first is."""
+    if likeness[k] >= enough:
+        return False
+    around = 1.0 - likeness[max(1, k - settings.window) : k + settings.window + 1]
+    return bool(1.0 - likeness[k] > settings.factor * float(np.median(around)))
 
 
 def _jumps(cut: int, count: int, alike: Alike, settings: CutSettings) -> bool:
