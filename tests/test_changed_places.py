@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.instances.changed_places import add_changed_places
+from list3r.instances.changed_places import _Change, add_changed_places
+from list3r.instances.changed_surfaces import ChangedPlaceSettings
 from list3r.instances.features import object_feature
 from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.consolidation import consolidate
@@ -88,3 +89,34 @@ def test_and_one_overlooked_where_it_came_to(tmp_path: Path) -> None:
 def test_what_stays_is_never_found_by_this(tmp_path: Path, overlooked: str) -> None:
     """Only change shows what discovery overlooked."""
     assert _two(tmp_path / "a.l3r", dict(ROOM), overlooked, None) == 0
+
+
+def _plate(x: float, length: float, z: float = 0.0) -> np.ndarray:
+    side = np.arange(0.0, length, 0.02)
+    return np.array([[x + a, b, z] for a in side for b in np.arange(0.0, 0.12, 0.02)])
+
+
+def test_an_instance_stands_for_a_change_if_nothing_of_it_stayed() -> None:
+    gone, board = _plate(0.0, 0.2), _plate(0.2, 0.4)
+    place = _Change(gone, [], np.concatenate([gone, board]), 1.0, ChangedPlaceSettings())
+    assert place.explains(gone)
+    assert place.explains(gone + 0.01)
+    assert not place.explains(np.concatenate([gone, board]))
+    assert not place.explains(board + np.array([0.1, 0.0, 0.0]))
+    assert not place.explains(np.zeros((0, 3)))
+
+
+def test_what_another_thing_took_the_place_of_need_not_be_seen_through() -> None:
+    """The lower half of what stood there is hidden by what stands there now, whose rim is new."""
+    top, bottom, new = _plate(0.0, 0.12), _plate(0.0, 0.3, -0.09), _plate(-0.05, 0.4, -0.1)
+    told = np.concatenate([top, bottom])
+    alone, replaced = (_Change(top, c, told, 1.0, ChangedPlaceSettings()) for c in ([], [new]))
+    assert not alone.explains(told)
+    assert replaced.explains(told)
+
+
+def test_what_no_frame_tells_about_does_not_speak_against_an_instance() -> None:
+    gone, hidden = _plate(0.0, 0.1), _plate(0.16, 0.3)
+    support = np.concatenate([gone, hidden])
+    assert _Change(gone, [], gone, 1.0, ChangedPlaceSettings()).explains(support)
+    assert not _Change(gone, [], support, 1.0, ChangedPlaceSettings()).explains(support)
