@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import write_json
+from machine import machine, write_json
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from list3r.association.edges import EdgeSettings, measure_edge
+from list3r.association.edges import EdgeEnd, EdgeSettings, measure_edge
 from list3r.frames.base import Camera
 from list3r.frames.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import DegenerateError
@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="101,102,103")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
+    print(machine())
     rows = []
     for preset in words.presets.split(","):
         for seed in words.seeds.split(","):
@@ -116,7 +117,7 @@ def _plain(u: ChunkResult, v: ChunkResult) -> Sim3:
     camera = Camera(width, height, *v.intrinsics)
     settings = EdgeSettings(instance_aware=False)
     try:
-        return measure_edge(u.samples, v.samples, 1, 2, camera, False, settings).edge.S_v_u
+        return measure_edge(EdgeEnd(1, u.samples), EdgeEnd(2, v.samples), camera, False, settings).edge.S_v_u
     except DegenerateError:
         return Sim3.identity()
 

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from machine import write_json
+from machine import machine, write_json
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
@@ -132,6 +132,7 @@ def main() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     options = SourceOptions(intrinsics=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
+    print(machine())
     figures = run(given.source, options, given.start, given.frames, given.poses, given.device)
     print(json.dumps(figures["mean"]))
     write_json(given.json, figures)

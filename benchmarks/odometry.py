@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import platform
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -20,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from machine import machine, write_json
 from numpy.typing import NDArray
 
 from list3r.association.alignment import align_overlap
@@ -30,6 +31,7 @@ from list3r.frames.chunks import ChunkSettings, ChunkSpan, plan_chunks
 from list3r.frames.options import SourceOptions, parse_intrinsics
 from list3r.frames.source import open_source
 from list3r.memory.geometry import Sim3, umeyama
+from list3r.memory.local_verbs import LocalNode
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.rgbd import RgbdReconstructor
@@ -56,6 +58,11 @@ class Chunks:
 
     def __init__(self) -> None:
         self.done: list[Chunk] = []
+        self.known: list[Edge] = []
+
+    def chunk_checksums(self) -> dict[int, int]:
+        """Finished chunks do not change."""
+        return dict.fromkeys(range(len(self.done)), 1)
 
     def chunks(self, session_id: int | None = None) -> list[ChunkRow]:
         """One row for each chunk so far."""
@@ -70,9 +77,28 @@ class Chunks:
         """One keyframe."""
         return next(k for k in self.done[chunk_id].keyframes if k.frame_index == frame_index)
 
-    def keyframe_descriptors(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Keys and descriptors of all keyframes so far."""
-        all_keyframes = [(c, k) for c, chunk in enumerate(self.done) for k in chunk.keyframes]
+    def frame_samples(self, chunk_id: int) -> FrameSamples:
+        """Points of all frames of a chunk."""
+        return self.done[chunk_id].samples
+
+    def local_nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]:
+        """Nothing: no instances are looked for here."""
+        return []
+
+    def feature_space(self, chunk_id: int) -> str:
+        """That of no features."""
+        return "none@1/0"
+
+    def edges(self) -> list[Edge]:
+        """Those known so far, between neighbours and loops."""
+        return self.known
+
+    def keyframe_descriptors(
+        self, chunk_ids: Sequence[int] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Keys and descriptors of the keyframes of some chunks, of all so far by default."""
+        wanted = range(len(self.done)) if chunk_ids is None else chunk_ids
+        all_keyframes = [(c, k) for c in wanted for k in self.done[c].keyframes]
         keys = np.array([(c, k.frame_index) for c, k in all_keyframes], np.int64).reshape(-1, 2)
         return keys, np.array([k.descriptor for _, k in all_keyframes], np.float32)
 
@@ -104,6 +130,7 @@ def associate(chunks: list[Chunk]) -> tuple[list[Edge], list[Edge]]:
     store, loops = Chunks(), list[Edge]()
     for k, chunk in enumerate(chunks):
         store.done.append(chunk)
+        store.known = [*adjacent[:k], *loops]
         loops += find_loops(store, k)
     return adjacent, loops
 
@@ -182,7 +209,7 @@ def run(path: str, options: SourceOptions, workers: int, beside_open3d: bool) ->
     stages = {stage: sum(c.seconds[stage] for c in chunks) for stage in chunks[0].seconds}
     figures: dict[str, object] = {
         "source": path,
-        "machine": f"{platform.machine()} {platform.processor()}, {workers} workers",
+        "workers": workers,
         "frames": count,
         "chunks": len(chunks),
         "posed": len(poses),
@@ -221,11 +248,10 @@ def main() -> None:
     given = parser.parse_args()
     intrinsics = parse_intrinsics(given.intrinsics) if given.intrinsics else None
     options = SourceOptions(intrinsics=intrinsics, every=given.every)
+    print(machine())
     figures = run(given.source, options, given.workers, given.beside_open3d)
-    text = json.dumps(figures, indent=2)
-    print(text)
-    if given.json:
-        given.json.write_text(text + "\n", encoding="utf-8")
+    print(json.dumps(figures, indent=2))
+    write_json(given.json, figures)
 
 
 if __name__ == "__main__":

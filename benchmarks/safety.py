@@ -280,7 +280,7 @@ def repair_flips(memory: Path, folder: Path, count: int, seed: int = 1) -> Resul
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=200, help="in all: builds and updates 30 % each, edits the rest")
+    parser.add_argument("--kills", type=int, default=200, help="in all: builds and updates 30 %% each, edits the rest")
     parser.add_argument("--minutes", type=float, default=5.0, help="how long eight readers and a writer run")
     parser.add_argument("--flips", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
