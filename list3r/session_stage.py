@@ -128,8 +128,9 @@ def add_chunks(
     try:
         with threadpool_limits(1):
             for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):
-                bad.update(index for part in results for index, _ in part.bad_frames)
-                check_bad_share(len(bad), count)
+                found = [row for part in results for row in part.bad_frames]
+                bad.update(index for index, _ in found)
+                check_bad_share(len(bad), count, found[0][1] if found else "")
                 for part in (p for p in results if p.index not in known):
                     add_chunk(store, session, part, joint, library=library, debug_dir=debug_dir)
                     _note_lost(store, session, part)

@@ -52,10 +52,11 @@ def require_camera(info: SourceInfo) -> Camera:
     return info.camera
 
 
-def check_bad_share(bad: int, total: int) -> None:
-    """Raises `SourceError` when more than half of the frames could not be decoded."""
+def check_bad_share(bad: int, total: int, reason: str = "") -> None:
+    """Raises `SourceError` when more than half of the frames could not be used, with the `reason` of one of them."""
     if bad * 2 > total:
-        raise SourceError(f"{bad} of {total} frames cannot be decoded; is the copy of the source complete?")
+        said = f" ({reason})" if reason else ""
+        raise SourceError(f"{bad} of {total} frames cannot be used{said}; is the copy of the source complete?")
 
 
 def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
