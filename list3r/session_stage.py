@@ -210,6 +210,10 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
     if settings.poses == "given" and not info.has_poses:
         raise OptionError(f"{info.path} has no poses; use --poses estimate")
     check_choice(settings.discovery, settings.tracking, settings.features)
+    if settings.device not in ("auto", "cpu"):  # looking for a GPU takes seconds
+        from list3r.models.pretrained import pick_device
+
+        pick_device(settings.device)
 
 
 def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Frame
 from list3r.instances.base import Discoverer, Proposals
-from list3r.memory.errors import OptionError
 from list3r.models.images import InputShape, network_input
-from list3r.models.pretrained import load_pretrained, pick_device, space_name
+from list3r.models.pretrained import load_named, space_name
 from list3r.reconstruction.base import Reconstruction
 
 CLASSES = {"dinov2": "Dinov2Model", "dinov3": "DINOv3ViTModel"}
@@ -26,10 +25,7 @@ class Appearance:
 
     def __init__(self, model: str, folder: Path, device: str = "auto", long_side: int = LONG_SIDE) -> None:
         """`model` is dinov2 or dinov3, `folder` holds its configuration and weights. Raises `OptionError`."""
-        if model not in CLASSES:
-            raise OptionError(f"features {model} are not known; choose one of geometric, {', '.join(CLASSES)}")
-        self._device = pick_device(device)
-        self._network = load_pretrained(CLASSES[model], folder, self._device)
+        self._network, self._device = load_named(CLASSES, "features", model, folder, device)
         config = self._network.config
         self._patch, self._long_side = int(config.patch_size), long_side
         self._skipped = 1 + int(getattr(config, "num_register_tokens", 0) or 0)

@@ -18,9 +18,8 @@ from list3r.instances.base import Proposals
 from list3r.instances.candidates import CandidateSettings, SoftMasks, choose_candidates
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.views import chunk_views
-from list3r.memory.errors import OptionError
 from list3r.models.images import InputShape, network_input, to_picture
-from list3r.models.pretrained import load_pretrained, pick_device, space_name
+from list3r.models.pretrained import load_named, space_name
 from list3r.reconstruction.base import Reconstruction
 
 if TYPE_CHECKING:
@@ -43,10 +42,7 @@ class QuerySegmenter:
         candidates: CandidateSettings | None = None,
     ) -> None:
         """`model` is eomt or mask2former, `folder` holds its configuration and weights. Raises `OptionError`."""
-        if model not in CLASSES:
-            raise OptionError(f"segmenter {model} is not known; choose one of {', '.join(CLASSES)}")
-        self._device = pick_device(device)
-        self._network = load_pretrained(CLASSES[model], folder, self._device)
+        self._network, self._device = load_named(CLASSES, "discovery", model, folder, device)
         self._settings = settings or InstanceSettings()
         self._candidates = candidates or CandidateSettings()
         config = self._network.config

@@ -20,8 +20,8 @@ from list3r.instances.candidates import CandidateSettings, SoftMasks, choose_can
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.views import chunk_views
 from list3r.memory.errors import OptionError
-from list3r.models.images import HALF, IMAGENET_MEAN, IMAGENET_STD, InputShape, network_input, to_picture
-from list3r.models.pretrained import load_pretrained, pick_device, space_name
+from list3r.models.images import network_input, sam_input, to_picture
+from list3r.models.pretrained import load_named, space_name
 from list3r.reconstruction.base import Reconstruction
 
 if TYPE_CHECKING:
@@ -63,15 +63,10 @@ class SamMasks:
         sam: SamMaskSettings | None = None,
     ) -> None:
         """`model` is sam2 or sam3, `folder` holds its configuration and weights. Raises `OptionError`."""
-        if model not in CLASSES:
-            raise OptionError(f"mask model {model} is not known; choose one of {', '.join(CLASSES)}")
-        self._device = pick_device(device)
-        self._network = load_pretrained(CLASSES[model], folder, self._device)
+        self._network, self._device = load_named(CLASSES, "discovery", model, folder, device)
         self._settings = settings or InstanceSettings()
         self._sam = sam or SamMaskSettings()
-        size = int(self._network.prompt_encoder.input_image_size)
-        mean, std = (HALF, HALF) if model == "sam3" else (IMAGENET_MEAN, IMAGENET_STD)
-        self._shape = InputShape(size, size, mean=mean, std=std)
+        self._shape = sam_input(model, int(self._network.prompt_encoder.input_image_size))
         self._space = space_name(model, folder, int(self._network.config.mask_decoder_config.hidden_size))
 
     @property

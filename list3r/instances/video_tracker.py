@@ -23,8 +23,8 @@ from list3r.instances.tracking import LabelledChunk
 from list3r.instances.views import ChunkViews, chunk_views
 from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
-from list3r.models.images import HALF, IMAGENET_MEAN, IMAGENET_STD, InputShape, network_input
-from list3r.models.pretrained import load_pretrained, pick_device
+from list3r.models.images import InputShape, network_input, sam_input
+from list3r.models.pretrained import load_named
 from list3r.reconstruction.base import Reconstruction
 
 if TYPE_CHECKING:
@@ -33,9 +33,14 @@ if TYPE_CHECKING:
     Sessions = Callable[[], Any]
 
 CLASSES = {
-    "sam2": ("Sam2VideoModel", "Sam2VideoInferenceSession"),
-    "sam3": ("Sam3TrackerVideoModel", "Sam3TrackerVideoInferenceSession"),
-    "edgetam": ("EdgeTamVideoModel", "EdgeTamVideoInferenceSession"),
+    "sam2": "Sam2VideoModel",
+    "sam3": "Sam3TrackerVideoModel",
+    "edgetam": "EdgeTamVideoModel",
+}
+SESSIONS = {
+    "sam2": "Sam2VideoInferenceSession",
+    "sam3": "Sam3TrackerVideoInferenceSession",
+    "edgetam": "EdgeTamVideoInferenceSession",
 }
 
 
@@ -67,18 +72,13 @@ class VideoTracker:
         tracker: VideoTrackerSettings | None = None,
     ) -> None:
         """`model` is sam2, sam3 or edgetam, `folder` holds its configuration and weights. Raises `OptionError`."""
-        if model not in CLASSES:
-            raise OptionError(f"tracker {model} is not known; choose one of reprojection, {', '.join(CLASSES)}")
-        self._device = pick_device(device)
-        self._network = load_pretrained(CLASSES[model][0], folder, self._device)
+        self._network, self._device = load_named(CLASSES, "tracking", model, folder, device)
         if model == "edgetam":
             _even_scores(self._network)
-        self._session_class = CLASSES[model][1]
+        self._session_class = SESSIONS[model]
         self._settings = settings or InstanceSettings()
         self._tracker = tracker or VideoTrackerSettings()
-        mean, std = (HALF, HALF) if model == "sam3" else (IMAGENET_MEAN, IMAGENET_STD)
-        size = int(self._network.config.image_size)
-        self._shape = InputShape(size, size, mean=mean, std=std)
+        self._shape = sam_input(model, int(self._network.config.image_size))
 
     def __call__(
         self,

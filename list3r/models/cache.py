@@ -10,9 +10,12 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlparse
+from urllib.request import getproxies
 
 from list3r.memory.errors import OptionError
 from list3r.models.cards import UNPINNED, Weights
@@ -112,11 +115,13 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
     Raises `OptionError` when the hub cannot be reached, does not know them, or wants the user to be granted access.
     """
     try:
-        from huggingface_hub import snapshot_download
+        from huggingface_hub import constants, snapshot_download
         from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
     except ImportError:
         raise OptionError("fetching weights needs a package: pip install 'list3r[models]'") from None
     name, wanted = weights.repository, revision or weights.revision
+    if not _is_known(constants.ENDPOINT):  # told at once; the package would try for half a minute
+        raise OptionError(f"{name}@{wanted} cannot be fetched: {NO_NETWORK.format(name=name)}")
     why = ""
     try:
         folder = Path(snapshot_download(name, revision=wanted, allow_patterns=list(weights.files)))
@@ -183,6 +188,17 @@ def _unknown() -> Any:
     from list3r.models.cards import OTHER
 
     return OTHER
+
+
+def _is_known(endpoint: str) -> bool:
+    """Whether the name of the hub's host can be looked up here; a proxy looks it up itself."""
+    if getproxies():
+        return True
+    try:
+        socket.getaddrinfo(urlparse(endpoint).hostname, None)
+    except OSError:
+        return False
+    return True
 
 
 def _is_transport(error: Exception) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,19 @@ class InputShape:
         return max(1, round(height * scale)), max(1, round(width * scale))
 
 
+def sam_input(model: str, size: int) -> InputShape:
+    """What the networks of the SAM family take: a square, normalised otherwise since SAM 3."""
+    mean, std = (HALF, HALF) if model == "sam3" else (IMAGENET_MEAN, IMAGENET_STD)
+    return InputShape(size, size, mean=mean, std=std)
+
+
+def normalised(
+    pictures: torch.Tensor, mean: Sequence[float] = IMAGENET_MEAN, std: Sequence[float] = IMAGENET_STD
+) -> torch.Tensor:
+    """Pictures (..., 3, h, w) in [0, 1], each channel shifted and scaled; as for DINOv2 unless told otherwise."""
+    return (pictures - pictures.new_tensor(mean).view(3, 1, 1)) / pictures.new_tensor(std).view(3, 1, 1)
+
+
 def network_input(
     color: NDArray[np.uint8], shape: InputShape, device: torch.device, dtype: torch.dtype
 ) -> torch.Tensor:
@@ -47,9 +61,7 @@ def network_input(
     inner = shape.inner(*color.shape[:2])
     if inner != tuple(color.shape[:2]):
         picture = functional.interpolate(picture, size=inner, mode="bilinear", align_corners=False, antialias=True)
-    mean = torch.tensor(shape.mean, device=device).view(1, 3, 1, 1)
-    std = torch.tensor(shape.std, device=device).view(1, 3, 1, 1)
-    picture = (picture - mean) / std
+    picture = normalised(picture, shape.mean, shape.std)
     pad = (0, shape.width - inner[1], 0, shape.height - inner[0])
     return functional.pad(picture, pad).to(dtype) if any(pad) else picture.to(dtype)
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from list3r.memory.errors import OptionError
+from list3r.models.cache import CONFIG, check_weights
+from list3r.models.upstream import first_line
 
 if TYPE_CHECKING:
     import torch
-
-WEIGHTS = ("model.safetensors", "model.safetensors.index.json", "pytorch_model.bin")
 
 
 def pick_device(name: str) -> torch.device:
@@ -27,6 +28,17 @@ def pick_device(name: str) -> torch.device:
     except RuntimeError:
         raise OptionError(f"--device {name} is not known; give cpu, cuda or cuda:1") from None
     return device
+
+
+def load_named(kinds: Mapping[str, str], option: str, name: str, folder: Path, device: str) -> tuple[Any, torch.device]:
+    """The network that a model's name stands for, by its class, and the device that it lies on.
+
+    Raises `OptionError` as `pick_device` and `load_pretrained` do, and for a name that is none of the kinds.
+    """
+    if name not in kinds:
+        raise OptionError(f"--{option} {name} is not known; choose one of {', '.join(kinds)}")
+    chosen = pick_device(device)
+    return load_pretrained(kinds[name], folder, chosen), chosen
 
 
 def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
@@ -46,11 +58,7 @@ def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
     try:
         model, report = cls.from_pretrained(folder, dtype=dtype, local_files_only=True, output_loading_info=True)
     except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError) as error:
-        raise OptionError(f"{folder} cannot be loaded as {class_name}: {_first_line(error)}") from None
-    except Exception as error:
-        if type(error).__name__ != "SafetensorError":
-            raise
-        raise OptionError(f"the weights in {folder} are damaged ({_first_line(error)}); fetch them again") from None
+        raise OptionError(f"{folder} cannot be loaded as {class_name}: {first_line(error)}") from None
     finally:
         logging.set_verbosity(level)
     wrong = sorted(str(k) for k in (*report["missing_keys"], *report["mismatched_keys"]))
@@ -63,13 +71,12 @@ def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
 
 
 def check_folder(folder: Path) -> None:
-    """Raises `OptionError` unless the folder has a configuration and weights."""
+    """Raises `OptionError` unless the folder has a configuration and whole weights."""
     if not folder.is_dir():
         raise OptionError(f"the folder of weights {folder} does not exist; see `list3r models list`")
-    if not (folder / "config.json").is_file():
-        raise OptionError(f"{folder} has no config.json; give the folder that the weights' repository was saved to")
-    if not any((folder / name).is_file() for name in WEIGHTS):
-        raise OptionError(f"{folder} has no weights ({', '.join(WEIGHTS)}); fetch them again")
+    if not (folder / CONFIG).is_file():
+        raise OptionError(f"{folder} has no {CONFIG}; give the folder that the weights' repository was saved to")
+    check_weights(folder)
 
 
 def space_name(model: str, folder: Path, dimensions: int) -> str:
@@ -79,7 +86,7 @@ def space_name(model: str, folder: Path, dimensions: int) -> str:
     """
     if folder.parent.name == "snapshots":
         return f"{model}@{folder.name[:12]}/{dimensions}"
-    digest = hashlib.sha256((folder / "config.json").read_bytes())
+    digest = hashlib.sha256((folder / CONFIG).read_bytes())
     for path in sorted(folder.glob("*.safetensors")):
         with path.open("rb") as file:
             digest.update(file.read(1 << 20))
@@ -97,8 +104,3 @@ def _transformers_class(name: str) -> Any:
     if found is None:
         raise OptionError(f"this version of transformers ({transformers.__version__}) has no {name}; upgrade it")
     return found
-
-
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__

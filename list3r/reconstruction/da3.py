@@ -7,20 +7,16 @@ nested weights are about metric; taken as relative like the others. Weights with
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from list3r.memory.errors import OptionError
-from list3r.models.cards import ModelCard
-from list3r.models.images import IMAGENET_MEAN, IMAGENET_STD
-from list3r.models.upstream import load_upstream, upstream_class
+from list3r.models.images import normalised
 from list3r.reconstruction.feedforward import (
     FeedforwardReconstructor,
+    Network,
     PictureSize,
-    card_of,
     inverted,
     numpy,
     sigmoid_of_expp1,
@@ -34,39 +30,22 @@ if TYPE_CHECKING:
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
     """The model with the weights that the options name."""
-    return FeedforwardReconstructor(DepthAnything3(), options)
+    return FeedforwardReconstructor(NETWORK, options)
 
 
-@dataclass(frozen=True)
-class DepthAnything3:
-    """The network da3."""
+def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
+    """See `feedforward.Answer`; without poses the network cannot be told the intrinsics."""
+    # The inner network: the outer one chooses half precision by asking CUDA, which a CPU has not got.
+    output = model.model(normalised(pictures)[None], export_feat_layers=[])
+    if "extrinsics" not in output or "depth_conf" not in output:
+        raise OptionError("these weights of da3 say nothing of cameras; give any-view weights, such as DA3-BASE")
+    shape = (len(pictures), *pictures.shape[-2:])
+    return WindowOutput(
+        T_window_cam=inverted(numpy(output["extrinsics"][0])),
+        depth=numpy(output["depth"]).reshape(shape).astype(np.float32),
+        confidence=sigmoid_of_expp1(numpy(output["depth_conf"]).reshape(shape)),
+        focal=numpy(output["intrinsics"][0]).astype(np.float64)[:, [0, 1], [0, 1]],
+    )
 
-    @property
-    def card(self) -> ModelCard:
-        """What it is."""
-        return card_of("da3")
 
-    @property
-    def size(self) -> PictureSize:
-        """How large its pictures are."""
-        return PictureSize(longest=504)
-
-    def load(self, path: Path, device: torch.device) -> Any:
-        """The network of the package `depth_anything_3`."""
-        return load_upstream(upstream_class(self.card, "depth_anything_3.api", "DepthAnything3"), path, device)
-
-    def answer(self, model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-        """See `feedforward.Network`; without poses the network cannot be told the intrinsics."""
-        mean = pictures.new_tensor(IMAGENET_MEAN).view(3, 1, 1)
-        std = pictures.new_tensor(IMAGENET_STD).view(3, 1, 1)
-        # The inner network: the outer one chooses half precision by asking CUDA, which a CPU has not got.
-        output = model.model(((pictures - mean) / std)[None], export_feat_layers=[])
-        if "extrinsics" not in output or "depth_conf" not in output:
-            raise OptionError("these weights of da3 say nothing of cameras; give any-view weights, such as DA3-BASE")
-        shape = (len(pictures), *pictures.shape[-2:])
-        return WindowOutput(
-            T_window_cam=inverted(numpy(output["extrinsics"][0])),
-            depth=numpy(output["depth"]).reshape(shape).astype(np.float32),
-            confidence=sigmoid_of_expp1(numpy(output["depth_conf"]).reshape(shape)),
-            focal=numpy(output["intrinsics"][0]).astype(np.float64)[:, [0, 1], [0, 1]],
-        )
+NETWORK = Network("da3", "depth_anything_3.api", "DepthAnything3", PictureSize(longest=504), answer)

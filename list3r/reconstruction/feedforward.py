@@ -1,16 +1,17 @@
 """Reconstruction by a feed-forward network: many frames in, poses, depth and confidence of all of them out.
 
 What the adapters (`pi3`, `vggt`, `mapanything`, `da3`) share: pictures at the network's size, the device, as many
-frames at once as the memory holds, and one form of the answer. An adapter is a `Network`: its card, how its class is
-loaded, and how its outputs read in the terms of `WindowOutput`.
+frames at once as the memory holds, and one form of the answer. An adapter is a `Network`: its card, where its class is,
+and how its outputs read in the terms of `WindowOutput`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from list3r.models.cards import ModelCard, find_card
 from list3r.models.device import MemoryBudget, find_gpu
 from list3r.models.licences import choose_weights
 from list3r.models.pretrained import pick_device
+from list3r.models.upstream import load_upstream, upstream_class
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.feedforward_output import WindowOutput, to_reconstruction, with_given_poses
 from list3r.reconstruction.feedforward_windows import run_windows
@@ -58,29 +60,34 @@ class PictureSize:
         return max(1, rows) * PATCH, max(1, columns) * PATCH
 
 
-class Network(Protocol):
+Answer = Callable[[Any, "torch.Tensor", "torch.Tensor | None"], WindowOutput]
+"""Poses, depth, confidence and focal lengths that a model tells of pictures (n, 3, h, w) in [0, 1]. The last argument
+are known intrinsics of the pictures, px, (3, 3), for models that can be told."""
+
+
+@dataclass(frozen=True)
+class Network:
     """What an adapter is."""
+
+    name: str
+    """Of its card."""
+    module: str
+    class_name: str
+    """Where the upstream package has its class."""
+    size: PictureSize
+    """How large its pictures are."""
+    answer: Answer
 
     @property
     def card(self) -> ModelCard:
         """What the network is."""
-        ...
+        card = find_card(self.name, "geometry")
+        assert card is not None
+        return card
 
-    @property
-    def size(self) -> PictureSize:
-        """How large its pictures are."""
-        ...
-
-    def load(self, path: Any, device: torch.device) -> Any:
+    def load(self, path: Path, device: torch.device) -> Any:
         """The network with the weights at a path. Raises `OptionError` in one line."""
-        ...
-
-    def answer(self, model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-        """Poses, depth, confidence and focal lengths of pictures (n, 3, h, w) in [0, 1].
-
-        `K` are known intrinsics of the pictures, px, (3, 3), for networks that can be told.
-        """
-        ...
+        return load_upstream(upstream_class(self.card, self.module, self.class_name), path, device)
 
 
 class FeedforwardReconstructor:
@@ -139,13 +146,6 @@ def half_precision(device: torch.device) -> torch.dtype:
 
     old = device.type == "cuda" and torch.cuda.get_device_capability(device)[0] < 8
     return torch.float16 if old else torch.bfloat16
-
-
-def card_of(name: str) -> ModelCard:
-    """The card of a geometry model."""
-    card = find_card(name, "geometry")
-    assert card is not None
-    return card
 
 
 def shrink(pictures: Sequence[NDArray[np.uint8]], height: int, width: int) -> NDArray[np.uint8]:

@@ -8,19 +8,15 @@ Depth is about metric; its users find factors of up to three, so it is taken as 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from list3r.models.cards import ModelCard
-from list3r.models.images import IMAGENET_MEAN, IMAGENET_STD
-from list3r.models.upstream import load_upstream, upstream_class
+from list3r.models.images import normalised
 from list3r.reconstruction.feedforward import (
     FeedforwardReconstructor,
+    Network,
     PictureSize,
-    card_of,
     numpy,
     sigmoid_of_expp1,
 )
@@ -33,44 +29,26 @@ if TYPE_CHECKING:
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
     """The model with the weights that the options name."""
-    return FeedforwardReconstructor(MapAnything(), options)
+    return FeedforwardReconstructor(NETWORK, options)
 
 
-@dataclass(frozen=True)
-class MapAnything:
-    """The network mapanything."""
+def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
+    """See `feedforward.Answer`."""
+    views: list[dict[str, Any]] = [
+        {"img": p[None], "data_norm_type": ["dinov2"]} | ({} if K is None else {"intrinsics": K[None]})
+        for p in normalised(pictures)
+    ]
+    cuda = pictures.is_cuda
+    said = model.infer(views, memory_efficient_inference=True, use_amp=cuda, apply_mask=False, mask_edges=False)
+    confidence = np.stack([sigmoid_of_expp1(numpy(view["conf"][0])) for view in said])
+    solid = np.stack([numpy(view["non_ambiguous_mask"][0]) > 0.5 for view in said])
+    K_found = np.stack([numpy(view["intrinsics"][0]) for view in said]).astype(np.float64)
+    return WindowOutput(
+        T_window_cam=np.stack([numpy(view["camera_poses"][0]) for view in said]).astype(np.float64),
+        depth=np.stack([numpy(view["depth_z"][0, ..., 0]) for view in said]).astype(np.float32),
+        confidence=np.where(solid, confidence, np.float32(0)),
+        focal=K_found[:, [0, 1], [0, 1]],
+    )
 
-    @property
-    def card(self) -> ModelCard:
-        """What it is."""
-        return card_of("mapanything")
 
-    @property
-    def size(self) -> PictureSize:
-        """How large its pictures are."""
-        return PictureSize(longest=518)
-
-    def load(self, path: Path, device: torch.device) -> Any:
-        """The network of the package `mapanything`."""
-        return load_upstream(upstream_class(self.card, "mapanything.models", "MapAnything"), path, device)
-
-    def answer(self, model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-        """See `feedforward.Network`."""
-        mean = pictures.new_tensor(IMAGENET_MEAN).view(3, 1, 1)
-        std = pictures.new_tensor(IMAGENET_STD).view(3, 1, 1)
-        views: list[dict[str, Any]] = [
-            {"img": ((p - mean) / std)[None], "data_norm_type": ["dinov2"]}
-            | ({} if K is None else {"intrinsics": K[None]})
-            for p in pictures
-        ]
-        cuda = pictures.is_cuda
-        said = model.infer(views, memory_efficient_inference=True, use_amp=cuda, apply_mask=False, mask_edges=False)
-        confidence = np.stack([sigmoid_of_expp1(numpy(view["conf"][0])) for view in said])
-        solid = np.stack([numpy(view["non_ambiguous_mask"][0]) > 0.5 for view in said])
-        K_found = np.stack([numpy(view["intrinsics"][0]) for view in said]).astype(np.float64)
-        return WindowOutput(
-            T_window_cam=np.stack([numpy(view["camera_poses"][0]) for view in said]).astype(np.float64),
-            depth=np.stack([numpy(view["depth_z"][0, ..., 0]) for view in said]).astype(np.float32),
-            confidence=np.where(solid, confidence, np.float32(0)),
-            focal=K_found[:, [0, 1], [0, 1]],
-        )
+NETWORK = Network("mapanything", "mapanything.models", "MapAnything", PictureSize(longest=518), answer)

@@ -8,15 +8,11 @@ no scale (pi3x: about metres, which is not relied on), and no intrinsics: the fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from list3r.models.cards import ModelCard
-from list3r.models.upstream import load_upstream, upstream_class
-from list3r.reconstruction.feedforward import FeedforwardReconstructor, PictureSize, card_of, numpy
+from list3r.reconstruction.feedforward import FeedforwardReconstructor, Network, PictureSize, numpy
 from list3r.reconstruction.feedforward_output import WindowOutput, focal_from_points
 from list3r.reconstruction.registry import ModelOptions
 
@@ -29,39 +25,12 @@ PIXEL_LIMIT = 255_000
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
     """The model with the weights that the options name."""
-    return FeedforwardReconstructor(Pi3(), options)
+    return FeedforwardReconstructor(NETWORK, options)
 
 
-@dataclass(frozen=True)
-class Pi3:
-    """The network pi3, or its successor pi3x, which can be told the intrinsics."""
-
-    conditional: bool = False
-
-    @property
-    def card(self) -> ModelCard:
-        """What it is."""
-        return card_of("pi3x" if self.conditional else "pi3")
-
-    @property
-    def size(self) -> PictureSize:
-        """How large its pictures are."""
-        return PictureSize(max_pixels=PIXEL_LIMIT)
-
-    def load(self, path: Path, device: torch.device) -> Any:
-        """The network of the package `pi3`."""
-        module, name = ("pi3.models.pi3x", "Pi3X") if self.conditional else ("pi3.models.pi3", "Pi3")
-        return load_upstream(upstream_class(self.card, module, name), path, device)
-
-    def answer(self, model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-        """See `feedforward.Network`."""
-        if not self.conditional:
-            return read(model(pictures[None]))
-        if K is None:
-            return read(model(imgs=pictures[None], with_prior=False))
-        told = K.expand(1, len(pictures), 3, 3)
-        everywhere = pictures.new_ones((1, len(pictures))).bool()
-        return read(model(imgs=pictures[None], intrinsics=told, mask_add_ray=everywhere))
+def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
+    """See `feedforward.Answer`; the network cannot be told the intrinsics."""
+    return read(model(pictures[None]))
 
 
 def read(output: dict[str, torch.Tensor]) -> WindowOutput:
@@ -76,3 +45,6 @@ def read(output: dict[str, torch.Tensor]) -> WindowOutput:
         confidence=confidence.astype(np.float32),
         focal=np.stack([focal_from_points(p, c) for p, c in zip(points, confidence, strict=True)]),
     )
+
+
+NETWORK = Network("pi3", "pi3.models.pi3", "Pi3", PictureSize(max_pixels=PIXEL_LIMIT), answer)

@@ -7,19 +7,15 @@ vertical and the horizontal field of view in radians. The first camera is the fr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from list3r.models.cards import ModelCard
-from list3r.models.upstream import load_upstream, upstream_class
 from list3r.reconstruction.feedforward import (
     FeedforwardReconstructor,
+    Network,
     PictureSize,
-    card_of,
     inverted,
     numpy,
     sigmoid_of_expp1,
@@ -33,37 +29,22 @@ if TYPE_CHECKING:
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
     """The model with the weights that the options name."""
-    return FeedforwardReconstructor(Vggt(), options)
+    return FeedforwardReconstructor(NETWORK, options)
 
 
-@dataclass(frozen=True)
-class Vggt:
-    """The network vggt."""
+def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
+    """See `feedforward.Answer`; the network cannot be told the intrinsics."""
+    output = model(pictures[None])
+    T_cam_world, focal = decode_poses(numpy(output["pose_enc"][0]), *pictures.shape[-2:])
+    return WindowOutput(
+        T_window_cam=inverted(T_cam_world),
+        depth=numpy(output["depth"][0, ..., 0]).astype(np.float32),
+        confidence=sigmoid_of_expp1(numpy(output["depth_conf"][0])),
+        focal=focal,
+    )
 
-    @property
-    def card(self) -> ModelCard:
-        """What it is."""
-        return card_of("vggt")
 
-    @property
-    def size(self) -> PictureSize:
-        """How large its pictures are."""
-        return PictureSize(longest=518)
-
-    def load(self, path: Path, device: torch.device) -> Any:
-        """The network of the package `vggt`."""
-        return load_upstream(upstream_class(self.card, "vggt.models.vggt", "VGGT"), path, device)
-
-    def answer(self, model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-        """See `feedforward.Network`; the network cannot be told the intrinsics."""
-        output = model(pictures[None])
-        T_cam_world, focal = decode_poses(numpy(output["pose_enc"][0]), *pictures.shape[-2:])
-        return WindowOutput(
-            T_window_cam=inverted(T_cam_world),
-            depth=numpy(output["depth"][0, ..., 0]).astype(np.float32),
-            confidence=sigmoid_of_expp1(numpy(output["depth_conf"][0])),
-            focal=focal,
-        )
+NETWORK = Network("vggt", "vggt.models.vggt", "VGGT", PictureSize(longest=518), answer)
 
 
 def decode_poses(encoding: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
