@@ -29,7 +29,7 @@ from list3r.models.cards import find_card
 from list3r.models.device import MemoryBudget, find_gpu, pictures_that_fit
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.feedforward import half_precision
-from list3r.reconstruction.pi3 import Pi3
+from list3r.reconstruction.pi3 import NETWORK as PI3
 
 SIZE = (364, 504)
 PUBLISHED = {"pictures": 1024, "peak_mb": 43667, "frames_per_s": 2.4, "on": "A800-80GB, its authors"}
@@ -154,7 +154,7 @@ def _pass(network: nn.Module, pictures: torch.Tensor, device: torch.device) -> d
             if cuda:
                 torch.cuda.synchronize(device)
             inside.append(time.perf_counter() - started)
-            Pi3().answer(network, pictures, None)
+            PI3.answer(network, pictures, None)
         seconds.append(time.perf_counter() - started - inside[-1])
     peak = torch.cuda.max_memory_allocated(device) / 2**20 if cuda else 0.0
     count = len(pictures)
