@@ -65,15 +65,15 @@ class Places:
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
-    def members(self, n: int, session: int, *, before: bool) -> list[Key]:
-        """Members of the last session before, or of this one."""
+    def members(self, n: int, session: int, *, before: bool, stayed: bool = False) -> list[Key]:
+        """Members of the last session before, or of this one; those that tell of the change, if it has not `stayed`."""
         owner = [self.rows[k].session_id for k, _ in self.groups[n]]
         wanted = session
         if before:
             earlier = [s for s in owner if s < session]
             wanted = max(earlier) if earlier else session
         inside = [k for k, s in zip(self.groups[n], owner, strict=True) if s == wanted]
-        return self._pure(n, inside, session, before=before)
+        return inside if stayed else self._pure(n, inside, session, before=before)
 
     def _pure(self, n: int, members: list[Key], session: int, *, before: bool) -> list[Key]:
         """Those that hold least of what stayed, where what they show has changed: not what is mixed with a table."""
@@ -92,15 +92,15 @@ class Places:
             self._share[name] = self._changed(self._points_of(key), n, session, before=before)
         return self._share[name]
 
-    def points(self, n: int, session: int, *, before: bool) -> Array:
+    def points(self, n: int, session: int, *, before: bool, stayed: bool = False) -> Array:
         """Some surface points, world coordinates. Shape (N, 3)."""
-        parts = [self._points_of(key) for key in self.members(n, session, before=before)]
+        parts = [self._points_of(key) for key in self.members(n, session, before=before, stayed=stayed)]
         points = np.concatenate(parts) if parts else np.zeros((0, 3))
         return points[:: max(1, len(points) // self._s.points)]
 
-    def box(self, n: int, session: int, *, before: bool) -> OrientedBox:
+    def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
         """The box of what was seen of it."""
-        points = self.points(n, session, before=before)
+        points = self.points(n, session, before=before, stayed=stayed)
         upright = self._upright and self.component[n] == self._first
         return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
 

@@ -138,7 +138,8 @@ class Story:
         p = self._p
         place = thing.now if thing.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
         kind = "seen_again" if place == thing.now else "moved"
-        before, after = p.box(thing.now, session, before=True), p.box(place, session, before=False)
+        before = p.box(thing.now, session, before=True, stayed=True)
+        after = p.box(place, session, before=False, stayed=True)
         thing.now, thing.state = place, "present" if kind == "seen_again" else "moved"
         if self._counts[place]:
             frames = p.frames_in(place, session)
@@ -148,7 +149,7 @@ class Story:
 
     def _still_there(self, thing: _Thing, session: int, found: Look) -> None:
         thing.state = "present"
-        box = self._p.box(thing.now, session, before=True)
+        box = self._p.box(thing.now, session, before=True, stayed=True)
         reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
         self._tell(thing, session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason)
 
