@@ -70,8 +70,3 @@ def fit_box(points: Array, *, upright: bool, trim: float = 0.01) -> OrientedBox:
     local = points @ axes
     low, high = np.quantile(local, [trim, 1.0 - trim], axis=0)
     return OrientedBox(axes @ ((low + high) / 2), high - low, axes)
-
-
-def aabb_gap(a: Array, b: Array) -> float:
-    """Distance between two axis-aligned boxes, 0 where they meet. Shape (2, 3) each."""
-    return float(np.linalg.norm(np.maximum(0.0, np.maximum(a[0] - b[1], b[0] - a[1]))))

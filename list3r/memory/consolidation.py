@@ -101,15 +101,8 @@ def _derive_whole(
     groups, movers = word.joined(groups, {c.chunk_id: c.component for c in chunks}, movers)
     evidence = weigh(groups, shapes, pairs, s.evidence)
     shown = word.shown(groups, [e.shown(s.evidence, world.posed) for e in evidence])
-    story = None
-    if tale is None:
-        some = SomeSummaries(held, held, world.unit)
-        story = find_changes(store, groups, shown, frozenset(movers), chunks, some, s.changes)
-        tale, groups = Tale.of(story, groups, max(c.session_id for c in chunks)), story.groups
-        decisions += joined + story.decisions
-    else:
-        groups, tale = tale.joined(groups, {c.chunk_id: c.component for c in chunks})
-        decisions += joined
+    story, groups, tale = _story(store, groups, shown, frozenset(movers), chunks, held, s, world, tale)
+    decisions += joined + (story.decisions if story is not None else [])
     if tale.moved:
         evidence = weigh(groups, shapes, pairs, s.evidence)
     before = word.remembered(groups, {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()})
@@ -139,6 +132,24 @@ def _derive_whole(
         merged=ids.aliases,
         hidden=sum(n is None for n in ids.of_group),
     )
+
+
+def _story(
+    store: Store,
+    groups: list[list[Key]],
+    shown: Sequence[bool],
+    movers: frozenset[Key],
+    chunks: Sequence[ChunkRow],
+    held: Mapping[int, ChunkSummary],
+    s: ConsolidationSettings,
+    world: World,
+    tale: Tale | None,
+) -> tuple[Changes | None, list[list[Key]], Tale]:
+    """What has changed between sessions, unless that stands as it was told; the groups, those that moved joined."""
+    if tale is not None:
+        return None, *tale.joined(groups, {c.chunk_id: c.component for c in chunks})
+    found = find_changes(store, groups, shown, movers, chunks, SomeSummaries(held, held, world.unit), s.changes)
+    return found, found.groups, Tale.of(found, groups, max(c.session_id for c in chunks))
 
 
 # ---------------------------------------------------------------------------------------------- merging

@@ -192,7 +192,3 @@ class LibraryVerbs(Connection):
             for k, S in self._rows("SELECT chunk_id, S_exact_settled FROM anchors WHERE instance = ?", (int(n),)):
                 out[int(n)] = Anchor(k, unpack_sim3(S))
         return out
-
-    def drop_anchors(self, ids: Iterable[int]) -> None:
-        """Forget the anchors of instances that are gone."""
-        self._database.executemany("DELETE FROM anchors WHERE instance = ?", [(int(n),) for n in ids])

@@ -56,18 +56,6 @@ class ObservationVerbs(InstanceVerbs):
         """Whether any local instance was seen moving."""
         return bool(self._rows("SELECT 1 FROM local_instances WHERE dynamic LIMIT 1"))
 
-    def node_checksums(self) -> dict[int, int]:
-        """A checksum, by chunk id, of what each chunk measured, of how many local instances it has and which move."""
-        out = self.chunk_checksums()
-        for chunk_id, count in self._rows("SELECT chunk_id, count(*) FROM local_instances GROUP BY chunk_id"):
-            out[chunk_id] = (out[chunk_id] * 31 + 104729 * count) & 0xFFFFFFFF
-        query = (
-            "SELECT chunk_id, local_id, length(motion) FROM local_instances WHERE dynamic ORDER BY chunk_id, local_id"
-        )
-        for chunk_id, local_id, length in self._rows(query):
-            out[chunk_id] = (out[chunk_id] * 31 + 7919 * (local_id + 1) + (length or 0)) & 0xFFFFFFFF
-        return out
-
     def node_checksum(self, chunk_id: int) -> int:
         """The same of one chunk; another one after a rollback, when its id may stand for another chunk."""
         moving = self._rows(
