@@ -13,7 +13,9 @@ from list3r.memory.errors import UnknownIdError
 from list3r.memory.geometry import Sim3
 from list3r.memory.graphs import merge_graph, relation_graph
 from list3r.memory.identities import assign_ids
+from list3r.memory.library_rules import ConsolidationSettings, settings_of
 from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary
+from list3r.memory.relation_scene import RelationSettings
 from list3r.memory.store import Store
 from tests.conftest import chunk_result, local_instance
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, Piece, surface
@@ -264,6 +266,17 @@ def test_where_the_next_chunk_has_no_depth_it_misses_nothing(tmp_path: Path) -> 
         add(store, computed(chunk(0, [TABLE, MUG, phantom]), 8))
         add(store, computed(chunk(1, [TABLE, MUG], step=6), 7))
         assert len(store.instances()) == 3
+
+
+def test_relations_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None:
+    given = ConsolidationSettings(relations=RelationSettings(contact_m=0.05))
+    with create(tmp_path / "a.l3r") as store:
+        assert settings_of(store, given) == given
+        with store.transaction():
+            store.set_value("scale_kind", "relative")
+        found = settings_of(store, given)
+        assert found.relations == RelationSettings(contact_m=0.05, noise_m=RelationSettings().computed_noise_m)
+        assert settings_of(store, found) == found
 
 
 def test_what_bounds_the_room_is_not_missed(tmp_path: Path) -> None:

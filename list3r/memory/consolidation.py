@@ -25,6 +25,7 @@ from list3r.memory.library_rules import (
     World,
     known_world,
     look_at_world,
+    settings_of,
 )
 from list3r.memory.library_things import eye_level, measured_before, thing_of
 from list3r.memory.library_verbs import Anchor
@@ -55,7 +56,7 @@ def consolidate(
     one. The result depends on what the store holds alone, so a build that goes on after a crash comes to the same
     library: the partition on the local instances and on where the chunks lie, the ids on the observations before.
     """
-    s = settings or ConsolidationSettings()
+    s = settings_of(store, settings)
     chunks = store.chunks()
     if not chunks:
         return ConsolidationReport(0, 0, (), (), 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,14 @@ class ConsolidationSettings:
     """Up to so many chunks the library is derived as a whole; then only what a chunk touches."""
     whole_share: float = 0.3
     """Nor is it when more than this share of the chunks has moved."""
+
+
+def settings_of(store: Store, settings: ConsolidationSettings | None) -> ConsolidationSettings:
+    """The settings for a memory: what no sensor measured is less exact."""
+    s = settings or ConsolidationSettings()
+    if store.get_value("scale_kind", "metric") == "metric":
+        return s
+    return replace(s, relations=replace(s.relations, noise_m=max(s.relations.noise_m, s.relations.computed_noise_m)))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from list3r.memory.bodies import Body
 from list3r.memory.geometry import Array
 from list3r.memory.history import world_at
+from list3r.memory.library_rules import settings_of
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations import relations
 from list3r.memory.store import Store
@@ -100,7 +101,8 @@ def _told_anew(past: Store, then: Sequence[Instance], changed: set[int], vertica
         near = [i for i in here if any(_gap(i.aabb, m.aabb) <= _REACH_M for m in moved)]
         middle = np.mean([i.center for i in here], axis=0) if here else np.zeros(3)
         bodies = [b for i in near if (b := _body(past, i, middle)) is not None]
-        found = relations(bodies, gravity_known=vertical and component == first) if moved else []
+        told = settings_of(past, None).relations
+        found = relations(bodies, gravity_known=vertical and component == first, settings=told) if moved else []
         out += [r for r in found if r.subject in changed or r.object in changed]
     return out
 
