@@ -1,6 +1,6 @@
 """The store against a plain model: chunks, edits, undos and reopenings in any order.
 
-`LIST3R_TEST_PROFILE=thorough` makes it go through forty times as many steps, other ones each time.
+`LIST3R_TEST_PROFILE=thorough` makes it go through many more steps, other ones each time.
 """
 
 from __future__ import annotations

@@ -223,7 +223,8 @@ class Connection:
 
         Keys in use: `scale_kind`, `scale_source`, `gravity` (known, estimated, unknown), `T_world_graph` (4x4),
         `gravity_estimate` (up and floor in the graph's frame, see `memory.gravity`), `library` (what all things are
-        derived with, see `memory.library_rules`), `feature_space`, `last_id`, `created_by`.
+        derived with, see `memory.library_rules`), `tale` (what stands of changes between sessions, see `memory.tale`),
+        `feature_space`, `last_id`, `created_by`.
         """
         rows = self._rows("SELECT value FROM memory WHERE key = ?", (key,))
         return from_json(rows[0][0], f"the value {key} of {self.path}") if rows else default
