@@ -222,11 +222,11 @@ def test_the_word_of_operators_holds_while_the_library_grows(walks: ModuleType, 
 def test_little_is_kept_between_chunks_and_what_is_not_is_read_again(
     walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(summaries, "_KEPT", 3)
+    monkeypatch.setattr(summaries, "_KEPT_BYTES", 1)
     monkeypatch.setattr(library_things, "_KEPT", 20)
     for index, place in enumerate((0, 1, 2, 3, 1)):
         add(store, visit(walks, index, place))
-        assert len(summaries._cache[store]) <= 3 and len(library_things._derived[store]) <= 20
+        assert len(summaries._cache[store]) == 1 and len(library_things._derived[store]) <= 20
     check(store)
 
 
