@@ -44,17 +44,18 @@ def instances_of(store: Store) -> dict[str, int | None]:
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     found: dict[str, int | None] = {}
     for name, (_, frame, box) in TRUTH.items():
-        boxes: dict[int, np.ndarray] = {}
+        boxes: dict[tuple[int, int], np.ndarray] = {}
         for (chunk_id, local_id), instance in home.items():
             track = store.mask_track(chunk_id, local_id)
             at = np.flatnonzero((track.frames == frame) & (track.areas_px > 0))
             if len(at):
                 one = track.boxes_xyxy[at[0]]
-                other = boxes.get(instance, one)
-                boxes[instance] = np.concatenate([np.minimum(one[:2], other[:2]), np.maximum(one[2:], other[2:])])
-        fits = {i: float(overlaps(np.array(box, np.float32), b[None])[0]) for i, b in boxes.items()}
-        best = max(fits, key=lambda i: fits[i], default=None)
-        found[name] = best if best is not None and fits[best] >= LEAST_OVERLAP else None
+                other = boxes.get((chunk_id, instance), one)
+                whole = np.concatenate([np.minimum(one[:2], other[:2]), np.maximum(one[2:], other[2:])])
+                boxes[chunk_id, instance] = whole
+        fits = {key: float(overlaps(np.array(box, np.float32), b[None])[0]) for key, b in boxes.items()}
+        best = max(fits, key=lambda key: fits[key], default=None)
+        found[name] = best[1] if best is not None and fits[best] >= LEAST_OVERLAP else None
     return found
 
 
@@ -104,9 +105,9 @@ def main() -> None:
                 for looks in ("video", "pictures"):
                     shutil.copy(built, work)
                     where = ["--source", chosen.source] if looks == "video" else []
-                    said, cost = run_list3r("detect", str(work), "--detector", str(detector), *where)
+                    said, _ = run_list3r("detect", str(work), "--detector", str(detector), *where)
                     row = {"reconstruction": kind, "detector": detector.stem, "looks": looks, "frames": said["frames"]}
-                    rows.append({**row, "wall_s": cost["wall_s"], **judged(work)})
+                    rows.append({**row, **judged(work)})
                     print({k: v for k, v in rows[-1].items() if k != "called"}, flush=True)
     if chosen.json:
         write_json(chosen.json, {"rows": rows})
