@@ -88,9 +88,12 @@ def _listed(path: Path, words: dict[str, str]) -> tuple[Stamps, float]:
         stream = picture_stream(container)
         if stream is None or any(sign in container.format.name for sign in _NOT_VIDEO):
             raise SourceError(_no_video(path, container))
-        found = [p for p in packets(container, stream) if p.size]
-        rows = [(p.pts, p.dts, bool(p.is_keyframe)) for p in found if not p.is_discard]
-        hidden = [p.pts for p in found if p.is_discard and p.pts is not None]
+        rows, hidden = [], []
+        for packet in packets(container, stream):  # none is kept: together they are the file
+            if packet.size and not packet.is_discard:
+                rows.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
+            elif packet.size and packet.pts is not None:
+                hidden.append(packet.pts)
         stamps = _stamps(path, rows, container, stream)
         earlier = stamps.clock and bool(hidden) and max(hidden) < stamps.stamps[0]
         hidden_s = float((stamps.stamps[0] - min(hidden)) * stamps.unit) if earlier else 0.0
