@@ -32,24 +32,44 @@ def with_camera(
 ) -> SourceOptions:
     """The options with the camera that was estimated for a session, for models that leave that to a stage of its own.
 
-    It is estimated where intrinsics or distortion are unknown, once: an interrupted session goes on with the same.
+    It is estimated once: an interrupted session goes on with the same.
+    """
+    known = store.get_value(_name(session))
+    if known is None:
+        known = estimated_camera(source, options, model, info, look)
+        if known is None:
+            return options
+        with store.transaction():
+            store.set_value(_name(session), known)
+    return told_camera(options, known)
+
+
+def estimated_camera(
+    source: str | Path,
+    options: SourceOptions,
+    model: str,
+    info: SourceInfo,
+    look: Callable[[str, int, int], None] | None = None,
+) -> dict[str, Any] | None:
+    """`intrinsics` and `distortion` of pictures as stored, with `notes`; None where the source or the model says them.
+
     `look` hears ("camera", windows of the video done, in all).
     """
     module = entry(model).calibration
     told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
     if not module or (info.camera is not None and told):
-        return options
-    known = store.get_value(_name(session))
-    if known is None:
-        with threadpool_limits(1):
-            progress = None if look is None else (lambda done, total: look("camera", done, total))
-            calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
-            opened, size = open_source(source, options), _stored_size(source, options)
-            height, width = opened.info.image_size or size
-            found = calibrate(opened, progress=progress, stored_px=max(size) / max(height, width))
-        known = {"notes": list(found.notes), **_as_stored(found.camera, size)}
-        with store.transaction():
-            store.set_value(_name(session), known)
+        return None
+    with threadpool_limits(1):
+        progress = None if look is None else (lambda done, total: look("camera", done, total))
+        calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
+        opened, size = open_source(source, options), _stored_size(source, options)
+        height, width = opened.info.image_size or size
+        found = calibrate(opened, progress=progress, stored_px=max(size) / max(height, width))
+    return {"notes": list(found.notes), **_as_stored(found.camera, size)}
+
+
+def told_camera(options: SourceOptions, known: dict[str, Any]) -> SourceOptions:
+    """The options with a camera that was estimated."""
     return replace(options, intrinsics=tuple(known["intrinsics"]), distortion=tuple(known["distortion"]))
 
 

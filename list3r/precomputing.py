@@ -6,9 +6,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from list3r.calibration_stage import estimated_camera, told_camera
 from list3r.chunk_stage import BuildSettings
 from list3r.frames.base import Camera, Frame, FrameSource, SourceInfo, guessed_camera
 from list3r.frames.chunks import ChunkSpan, plan_chunks
@@ -28,7 +30,7 @@ from list3r.reconstruction.precomputed_files import (
     write_piece,
 )
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
-from list3r.session_stage import check_buildable, resolve_settings, with_weights
+from list3r.session_stage import Look, check_buildable, resolve_settings, with_weights
 
 
 @dataclass(frozen=True)
@@ -56,26 +58,33 @@ def precompute(
     force: bool = False,
     licence: str = DEFAULT_PROFILE,
     progress: Callable[[int, int], None] | None = None,
+    look: Look | None = None,
 ) -> PrecomputeReport:
     """Reconstruct every chunk of a source and write one file for each into `out`; finished files are kept.
 
+    `look` hears of what is done before the chunks: as in a build, jumps are looked for and an unknown camera estimated.
     Raises `SourceError`, and `OptionError` when the folder holds files of other settings.
     """
     settings = resolve_settings(settings, info)
     check_buildable(info, settings)
     settings = with_weights(settings, licence)
-    opened = open_source(source, options)
-    cuts = () if settings.poses == "given" else tuple(find_cuts(opened))
+    _begin(out, settings, info, force)
+    scan = None if look is None else (lambda done, total: look("cuts", done, total))
+    cuts = () if settings.poses == "given" else tuple(find_cuts(open_source(source, options), progress=scan))
     spans = plan_chunks(info.frame_count, settings.chunks, cuts)
-    known = info.camera is not None
+    notes: list[str] = []
+    if force or not all(_file(out, span).exists() for span in spans):
+        camera = estimated_camera(source, options, settings.reconstruction, info, look)
+        if camera is not None:
+            options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
+    opened = open_source(source, options)
+    known = opened.info.camera is not None
     model = make_reconstructor(
         settings.reconstruction, ModelOptions(settings.poses, known, settings.device, settings.weights)
     )
-    _begin(out, settings, info, force)
     posed: set[int] = set()
-    notes: list[str] = []
     for span in spans:
-        path = out / f"chunk-{span.index:04d}.npz"
+        path = _file(out, span)
         if force or not path.exists():
             try:
                 made = model(*_chunk(opened, span))
@@ -107,6 +116,16 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
     if (out / MANIFEST).exists() and not force and read_manifest(out) != manifest:
         raise OptionError(f"{out} holds files of another model or other chunks; give another --out, or --force")
     write_manifest(out, manifest)
+
+
+def _said(camera: dict[str, Any]) -> str:
+    """What the build that reads the files has to be told, so that its pictures are those that were looked at."""
+    words = [f"--{name} {','.join(f'{v:.5g}' for v in camera[name])}" for name in ("intrinsics", "distortion")]
+    return f"the camera was estimated; give the build the same: {' '.join(words)}"
+
+
+def _file(out: Path, span: ChunkSpan) -> Path:
+    return out / f"chunk-{span.index:04d}.npz"
 
 
 def _chunk(source: FrameSource, span: ChunkSpan) -> tuple[list[Frame], Camera]:

@@ -11,6 +11,7 @@ import typer
 
 from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
+from list3r.cli.building import looking
 from list3r.cli.common import JsonOption, note, print_json, print_table, spread
 
 if TYPE_CHECKING:
@@ -151,7 +152,8 @@ def _write_all(
             bar.update(done - bar.n)
             bar.refresh()
 
-        return write(source, out, options, settings, info, force=force, licence=licence, progress=progress).as_dict()
+        run: dict[str, Any] = {"progress": progress, "look": looking(bar, "reconstructing")}
+        return write(source, out, options, settings, info, force=force, licence=licence, **run).as_dict()
 
 
 def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
