@@ -1,8 +1,9 @@
 """What has changed between sessions: things seen again, moved, removed, added (design 3.9).
 
-Things of two sessions are one where their surfaces meet and they look alike. A thing of an earlier session that the
-new one did not find is asked about in the new session's frames: only where they see through its place is it gone,
-and what no frame could see stays unseen. What is new is asked about in the frames of the sessions before in the same
+Things of two sessions are one where their surfaces meet, they look alike, and neither session sees through the surface
+of the other. A thing of an earlier session that the new one did not find is asked about in the new session's frames:
+only where they see through its place, or measure there the surface of something new, is it gone, and what no frame
+could see stays unseen. What is new is asked about in the frames of the sessions before in the same
 way. What is gone from one place and new at another is one thing that moved if it looks and measures the same, one to
 one, the best pairs first decided together. A thing that moved keeps what earlier sessions saw of it, but its body is
 that of the place where it is now.
