@@ -46,13 +46,37 @@ WORDS = st.one_of(
     ),
     st.text(max_size=8),
 )
-TEXTS = st.one_of(st.lists(WORDS, max_size=9).map(" ".join), st.text(max_size=30))
+SENTENCES = st.sampled_from(
+    [
+        "mug",
+        "mug on table",
+        "mug on the table near 4",
+        "table next to chair",
+        "thing on 2",
+        "#3",
+        "wall",
+        "biggest thing",
+    ]
+)
+TEXTS = st.one_of(SENTENCES, st.lists(WORDS, max_size=9).map(" ".join), st.text(max_size=30))
 NUMBERS = st.one_of(st.floats(), st.floats(-5, 5), st.sampled_from([0.0, 1e308, -1e308, 5e-324, math.inf, math.nan]))
-POINTS = st.one_of(st.lists(NUMBERS, min_size=3, max_size=3), st.lists(NUMBERS, max_size=4))
+INSIDE = st.tuples(st.floats(0, 4), st.floats(-2, 2), st.floats(0, 2)).map(list)
+POINTS = st.one_of(INSIDE, st.lists(NUMBERS, min_size=3, max_size=3), st.lists(NUMBERS, max_size=4))
 IDS = st.one_of(st.integers(-2, 9), st.integers())
 THINGS = st.one_of(IDS, TEXTS)
 VIEWPOINTS = st.one_of(st.none(), IDS, POINTS, st.sampled_from(["camera", "camera:3", "camera:99", "#4"]), TEXTS)
-FILTERS = st.fixed_dictionaries(
+PLAIN_FILTERS = st.fixed_dictionaries(
+    {},
+    optional={
+        "structure": st.booleans(),
+        "min_confidence": st.floats(0, 1),
+        "state": st.sampled_from([None, "present", "any"]),
+        "label": st.sampled_from(["mug", "table"]),
+        "color": st.just("white"),
+        "max_size": st.floats(0.05, 5),
+    },
+)
+WILD_FILTERS = st.fixed_dictionaries(
     {},
     optional={
         "structure": st.booleans(),
@@ -66,6 +90,7 @@ FILTERS = st.fixed_dictionaries(
         "dynamic": st.booleans(),
     },
 )
+FILTERS = st.one_of(st.just({}), PLAIN_FILTERS, WILD_FILTERS)
 often = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 
 
@@ -83,6 +108,38 @@ def answers(ask: Callable[[], Any]) -> Any:
             assert all(math.isfinite(n) for n in numbers)
             assert match.reason
     return found
+
+
+@settings(often, max_examples=100)
+@given(place=INSIDE, radius=st.floats(0.01, 3), filters=PLAIN_FILTERS)
+def test_what_makes_sense_is_answered_and_answers_agree(
+    memory: SceneMemory, place: list[float], radius: float, filters: Any
+) -> None:
+    """What lies in a sphere is what is no further than its radius, the same with and without a box around it."""
+    near = answers(lambda: memory.nearest(place, 9, max_distance=radius, **filters))
+    inside = answers(lambda: memory.within(center=place, radius=radius, **filters))
+    low, high = [x - radius for x in place], [x + radius for x in place]
+    boxed = answers(lambda: memory.within(lower=low, upper=high, **filters))
+    assert near is not None and inside is not None and boxed is not None
+    assert {m.instance.id for m in near} == {m.instance.id for m in inside} <= {m.instance.id for m in boxed}
+
+
+SOMETHING = st.sampled_from([None, "mug", "table", 2, 3, "#4"])
+
+
+@settings(often, max_examples=100)
+@given(subject=SOMETHING, predicate=st.sampled_from([None, "on", "supports", "next_to"]), object=SOMETHING)
+def test_relations_that_make_sense_are_the_stored_ones(memory: SceneMemory, **asked: Any) -> None:
+    named = {"mug": {3, 4}, "table": {2}, "#4": {4}}
+    ends = [None if x is None else named.get(x, {x}) for x in (asked["subject"], asked["object"])]
+    expected = {
+        (r.subject, r.predicate, r.object)
+        for r in memory.store.relations()
+        if (ends[0] is None or r.subject in ends[0]) and (ends[1] is None or r.object in ends[1])
+    }
+    found = answers(lambda: memory.relations(**asked))
+    wanted = {r for r in expected if asked["predicate"] in (None, r[1])}
+    assert found is not None and {(r.subject, r.predicate, r.object) for r in found} == wanted
 
 
 @settings(often, max_examples=1000)
