@@ -164,9 +164,10 @@ def test_what_is_in_the_cache_needs_no_network(monkeypatch: pytest.MonkeyPatch) 
     assert resolve(str(folder), None, "x") == str(folder.resolve())
 
 
-def test_without_network_and_copy_one_line_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
-    _reload_hub(monkeypatch, "http://127.0.0.1:9")
+@pytest.mark.parametrize("endpoint", ["http://127.0.0.1:9", "http://no-such-host.invalid"])
+def test_without_network_and_copy_one_line_says_what_to_do(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_ENDPOINT", endpoint)
+    _reload_hub(monkeypatch, endpoint)
     with pytest.raises(OptionError, match=r"list3r models fetch a/b") as caught:
         fetch(Weights("a/b", APACHE))
     assert "\n" not in str(caught.value)

@@ -12,11 +12,13 @@ import pytest
 import list3r
 from list3r.chunk_stage import PART_STEP, BuildSettings, ChunkTask, process_parts
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
-from list3r.frames.source import SourceOptions
+from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store import Store
 from list3r.pipeline import build
+from list3r.precomputing import precompute
+from list3r.reconstruction.precomputed_files import read_piece
 from tests.rgbd_scenes import CAMERA, render
 
 COUNT = 26
@@ -76,3 +78,20 @@ def test_parts_of_a_chunk_are_numbered_so_that_the_last_closes_the_span(tmp_path
     first, last = process_parts(task)
     assert (first.index, last.index) == (3 + PART_STEP, 3)
     assert first.frame_indices[-1] < last.frame_indices[0] and first.posed.all() and last.posed.all()
+
+
+def test_files_for_another_machine_have_one_estimated_camera_and_say_it(pictures: Path, tmp_path: Path) -> None:
+    settings = BuildSettings(reconstruction="sfm", chunks=ChunkSettings(18, 8))
+    told: list[str] = []
+    report = precompute(
+        pictures,
+        tmp_path / "files",
+        SourceOptions(),
+        settings,
+        open_source(pictures).info,
+        look=lambda what, done, total: told.append(what),
+    )
+    assert report.posed == COUNT and {"cuts", "camera"} <= set(told)
+    cameras = np.concatenate([read_piece(p).intrinsics for p in sorted((tmp_path / "files").glob("*.npz"))])
+    assert report.files == 2 and (cameras == cameras[0]).all() and abs(cameras[0, 0] / CAMERA.fx - 1) < 0.1
+    assert any("give the build the same: --intrinsics" in line for line in report.notes)
