@@ -15,7 +15,7 @@ from list3r.detection.voting import Seen, VotingSettings, summed, vote
 from list3r.frames.base import Frame, FrameSource
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
-from list3r.memory.labels import LabelSettings, apply_labels, put_votes
+from list3r.memory.labels import LabelSettings, Votes, apply_labels, put_votes
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import ChunkRow, MaskTrack
 from list3r.memory.store import Store
@@ -60,39 +60,53 @@ def detect(
     there is no picture.
     """
     rows = [c for c in store.chunks() if chunks is None or c.chunk_id in chunks]
-    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
-    in_session, in_chunk = _posed(store)
-    metric = store.get_value("scale_kind", "relative") != "relative"
-    sizes = {i.id: i.box.size for i in store.instances()} if metric else {}
-    looked: set[tuple[int, int]] = set()
-    pictures = boxes = 0
+    watch = _Watch(store, detector, sources or {}, voting)
     with store.transaction():
         for done, chunk in enumerate(rows):
             if progress is not None:
                 progress(done, len(rows))
-            tracks = {n: store.mask_track(chunk.chunk_id, n) for k, n in sorted(home) if k == chunk.chunk_id}
-            votes, last_s, region = [], -np.inf, _region(tracks)
-            source = (sources or {}).get(chunk.session_id)
-            own = in_session.get(chunk.session_id, {}) if source is None else in_chunk.get(chunk.chunk_id, {})
-            for index, color in _pictures(store, chunk, own, source):
-                if (chunk.session_id, index) in looked:
-                    continue
-                looked.add((chunk.session_id, index))
-                found = detector(color)
-                things = _seen(index, tracks, {n: home[chunk.chunk_id, n] for n in tracks}, sizes)
-                gap_s = own[index] - last_s
-                votes.append(vote(found, detector.class_names, things, gap_s, voting, region))
-                last_s = own[index]
-                pictures, boxes = pictures + 1, boxes + len(found.scores)
-            put_votes(store, chunk.chunk_id, detector.name, summed(votes), detector.class_names)
-        if rows and not pictures:
+            put_votes(store, chunk.chunk_id, detector.name, watch.votes(chunk), detector.class_names)
+        if rows and not watch.pictures:
             raise OptionError(
                 f"{store.path} keeps no pictures; name the video: list3r detect {store.path} --source {_source(store)}"
             )
         named = apply_labels(store, labels)
     if progress is not None:
         progress(len(rows), len(rows))
-    return DetectReport(detector.name, pictures, boxes, {n: d.label for n, d in sorted(named.items())})
+    return DetectReport(detector.name, watch.pictures, watch.boxes, {n: d.label for n, d in sorted(named.items())})
+
+
+class _Watch:
+    """A detector that looks at chunks one by one, at no frame twice."""
+
+    def __init__(
+        self, store: Store, detector: Detector, sources: Mapping[int, FrameSource], voting: VotingSettings | None
+    ) -> None:
+        self._store, self._detector, self._sources, self._voting = store, detector, sources, voting
+        self._home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+        self._in_session, self._in_chunk = _posed(store)
+        metric = store.get_value("scale_kind", "relative") != "relative"
+        self._sizes = {i.id: i.box.size for i in store.instances()} if metric else {}
+        self._looked: set[tuple[int, int]] = set()
+        self.pictures = self.boxes = 0
+
+    def votes(self, chunk: ChunkRow) -> dict[int, Votes]:
+        """What the detector says of the local instances of a chunk."""
+        home = {n: i for (k, n), i in sorted(self._home.items()) if k == chunk.chunk_id}
+        tracks = {n: self._store.mask_track(chunk.chunk_id, n) for n in home}
+        source, session = self._sources.get(chunk.session_id), chunk.session_id
+        own = self._in_session.get(session, {}) if source is None else self._in_chunk.get(chunk.chunk_id, {})
+        votes, last_s, region = [], -np.inf, _region(tracks)
+        for index, color in _pictures(self._store, chunk, own, source):
+            if (session, index) in self._looked:
+                continue
+            self._looked.add((session, index))
+            found = self._detector(color)
+            things = _seen(index, tracks, home, self._sizes)
+            votes.append(vote(found, self._detector.class_names, things, own[index] - last_s, self._voting, region))
+            last_s = own[index]
+            self.pictures, self.boxes = self.pictures + 1, self.boxes + len(found.scores)
+        return summed(votes)
 
 
 def open_sources(store: Store, source: str | Path, options: SourceOptions | None = None) -> dict[int, FrameSource]:
