@@ -62,10 +62,10 @@ class RelationSettings:
     """Gap between surfaces: half the mean size of the two, within these."""
     near_m: tuple[float, float] = (0.15, 0.4)
     """The same for near."""
-    sure: float = 0.6
+    sure: float = 0.65
     """Least confidence of near and next_to: a gap that is measured at the bound is as likely beyond it, and is one of
     the many that lie there."""
-    grain: float = 0.2
+    grain: float = 0.3
     """The nearest points of two surfaces lie further apart than the surfaces, as surfaces are sampled, less what the
     noise of the points makes up for: by this share of the spacing of the coarser one's points."""
     attached_m: float = 0.05

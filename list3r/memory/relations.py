@@ -9,7 +9,7 @@ stand side by side (they share heights). Size is the longest edge; bounds in met
 said of structure, nor of two things of which one holds the other, nor where it is hardly likelier than not.
 
 The gap is that of the nearest points, without readings amidst an edge, and with the backs of round things
-(`roundness`). What was tried on the simulated homes 101 to 115, wrong and missed pairs of 269 (now 2 and 13): making it
+(`roundness`). What was tried on the simulated homes 101 to 119, wrong and missed pairs of 345 (now 4 and 16): making it
 smaller by the sides that may be hidden is 3 cm too near where nothing is hidden; convex hulls of level slices, the
 third nearest points and averages over neighbours are no better and fail where things are sparsely seen.
 """
