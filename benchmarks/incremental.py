@@ -9,8 +9,9 @@ sees 12 things and a floor. Memories of several sizes are made, then the same nu
 turn. With `--sessions 2` the memory is that of a session that has ended, and the chunks that are added are the first of
 a later one, which walks the way again from its middle; what has changed is told when that session ends, which is timed
 too (`end_s`; in a long first session it is also looked again at what holds for the whole memory, and all things are
-derived anew where that has changed). `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user seconds of
-processor time of placing (edges, revisits, graph) and of the library, things written anew; what the process had grown
+derived anew where that has changed). `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians:
+user seconds of processor time of placing (edges, revisits, graph) and of the library, things written anew; what the
+process had grown
 by when the memory was made, and its peak then.
 """
 
