@@ -86,9 +86,7 @@ def add_chunk(
         if debug_dir is not None:
             _draw_loops(store, chunk_id, debug_dir)
         if library:
-            consolidate(store, chunk_id)
-            if store.get_value("detected labels") is not None or named:
-                apply_labels(store)
+            apply_labels(store, written=consolidate(store, chunk_id).written)
     return chunk_id
 
 

@@ -14,6 +14,7 @@ import pytest
 from list3r.memory import edits, library_things, summaries
 from list3r.memory.consolidation import consolidate
 from list3r.memory.geometry import Sim3
+from list3r.memory.labels import Votes, apply_labels, detected_labels, put_votes
 from list3r.memory.library_rules import ConsolidationSettings
 from list3r.memory.records import ChunkResult, FrameSamples
 from list3r.memory.store import Store
@@ -76,6 +77,30 @@ def add(store: Store, result: ChunkResult, pose: Sim3 | None = None, component: 
         store.place_chunks({chunk_id: pose or Sim3.identity()}, {chunk_id: component})
         consolidate(store, chunk_id, GROW)
     return chunk_id
+
+
+@pytest.mark.parametrize("order", [[*range(10)], [0, 1, 2, 3, 2, 1, 0, 1, 2, 3]], ids=["rooms", "there and back"])
+def test_labels_that_grow_are_those_of_all_votes(store: Store, walks: ModuleType, order: list[int]) -> None:
+    names, local = ("cup", "chair", "book"), 0
+    for index, place in enumerate(order):
+        made = visit(walks, index, place)
+        with store.transaction():
+            chunk_id = store.add_chunk(1, made)
+            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            told = {
+                n.local_id: Votes(1.0, {names[(place + n.local_id) % 3]: (8.0, 40.0)}, 8.0)
+                for n in made.library.instances
+                if (index + n.local_id) % 3
+            }
+            put_votes(store, chunk_id, "net", told)
+            report = consolidate(store, chunk_id, GROW)
+            local += report.written is not None
+            apply_labels(store, written=report.written)
+        grown = {i.id: i.label for i in store.instances()}, detected_labels(store)
+        with store.transaction():
+            assert apply_labels(store).keys() == grown[1].keys()
+        assert ({i.id: i.label for i in store.instances()}, detected_labels(store)) == grown
+    assert local >= 3 and set(grown[0].values()) >= {None, "cup"}
 
 
 def tables(store: Store) -> dict[str, list[tuple[object, ...]]]:

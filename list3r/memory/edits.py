@@ -247,8 +247,8 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
     retired = _retired(store, edit.before + bring_back, home, now, dict(report.merged))
     store.add_aliases(retired)
     store.drop_revived_aliases()
-    apply_labels(store)
     touched = sorted({home[k] for _, _, keys in edit.before + bring_back for k in keys if k in home})
+    apply_labels(store, written=None if report.written is None else report.written | {*touched})
     first = [n for n, _, _ in bring_back + edit.before if n in touched]
     return EditReport(
         entry=edit.entry,

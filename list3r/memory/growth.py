@@ -18,7 +18,7 @@ away need not be looked at:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -108,7 +108,7 @@ class _Growth(Writing):
         has changed between sessions.
         """
         if not (self._dirty or self._spoken or telling):
-            return self._report(Identities((), (), (), (), 0))
+            return self._report(Identities((), (), (), (), 0), ())
         self._compare()
         before = self._tale
         groups, decisions = self._told() if telling else self._joined()
@@ -126,11 +126,12 @@ class _Growth(Writing):
             write_tale(self._store, self._tale)
         self._relate(touched)
         log_decisions(self._store, chunk_id, decisions, owned, ids)
-        return self._report(ids)
+        return self._report(ids, touched)
 
-    def _report(self, ids: Identities) -> ConsolidationReport:
+    def _report(self, ids: Identities, touched: Iterable[int]) -> ConsolidationReport:
         things, structure = self._store.instance_count()
-        return ConsolidationReport(things, structure, ids.new, ids.aliases, self._store.hidden_groups())
+        hidden = self._store.hidden_groups()
+        return ConsolidationReport(things, structure, ids.new, ids.aliases, hidden, frozenset(touched))
 
     def _joined(self) -> tuple[list[Group], list[MergeDecision]]:
         """The groups of what was touched, what has moved joined as it was told last."""

@@ -169,37 +169,49 @@ def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str
     return {"label_source": detected.detector, "label_confidence": round(detected.confidence, 4)}
 
 
-def apply_labels(store: Store, settings: LabelSettings | None = None) -> dict[int, DetectedLabel]:
+def apply_labels(
+    store: Store, settings: LabelSettings | None = None, written: Collection[int] | None = None
+) -> dict[int, DetectedLabel]:
     """Name the instances by what detectors saw of them; what was named so before and is not any more loses its name.
 
-    Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was derived.
+    `written` are the ids that were written anew or are gone since, where only those need it; the labels of those are
+    returned. Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was
+    derived.
     """
     known = store.get_value(_CLASSES)
     if known is None:
         return {}
-    before = store.get_value("detected labels")
-    votes = {c.chunk_id: votes_of(store, c.chunk_id) for c in store.chunks()}
-    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    before: dict[str, list[Any]] = store.get_value("detected labels", {})
+    instances = store.instances() if written is None else store.instances_of(sorted(written))
+    home = _home(store, None if written is None else [i.id for i in instances])
+    votes = {chunk_id: votes_of(store, chunk_id) for chunk_id in sorted({k for k, _ in home})}
     spoken = _named_by_operators(store, home)
     members: dict[int, list[Key]] = {}
     for key, n in home.items():
         members.setdefault(n, []).append(key)
     out: dict[int, DetectedLabel] = {}
     changed: dict[int, str | None] = {}
-    for i in store.instances():
+    for i in instances:
         if i.id in spoken:
             continue
         label = None if i.structure is not None else _label(members.get(i.id, ()), votes, known, settings)
         if label is not None:
             out[i.id] = label
         text = None if label is None else label.label
-        if i.label != text and (text is not None or str(i.id) in (before or {})):
+        if i.label != text and (text is not None or str(i.id) in before):
             changed[i.id] = text
     store.set_labels(changed)
-    rows = {str(n): [d.label, round(d.confidence, 4), round(d.found, 2), d.detector] for n, d in sorted(out.items())}
+    rows = {} if written is None else {n: row for n, row in before.items() if int(n) not in written}
+    rows |= {str(n): [d.label, round(d.confidence, 4), round(d.found, 2), d.detector] for n, d in out.items()}
     if rows != before:
-        store.set_value("detected labels", rows)
+        store.set_value("detected labels", dict(sorted(rows.items(), key=lambda row: int(row[0]))))
     return out
+
+
+def _home(store: Store, ids: Iterable[int] | None) -> dict[Key, int]:
+    """Which instance each local instance belongs to, of all instances or of some."""
+    rows = store.observations() if ids is None else [o for n in ids for o in store.observations(n)]
+    return {(o.chunk_id, o.local_id): o.instance_id for o in rows}
 
 
 def _label(

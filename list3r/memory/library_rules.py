@@ -67,6 +67,8 @@ class ConsolidationReport:
     """(id that retired, id that it is an alias of)."""
     hidden: int
     """Groups of local instances that are not shown: seen too little, or fragments of a thing that is."""
+    written: frozenset[int] | None = None
+    """Ids that were written anew or are gone; None where all were."""
 
 
 @dataclass(frozen=True)
