@@ -34,13 +34,13 @@ def with_camera(
 
     It is estimated once: an interrupted session goes on with the same.
     """
-    known = store.get_value(_name(session))
+    known = store.get_value(camera_key(session))
     if known is None:
         known = estimated_camera(source, options, model, info, look)
         if known is None:
             return options
         with store.transaction():
-            store.set_value(_name(session), known)
+            store.set_value(camera_key(session), known)
     return told_camera(options, known)
 
 
@@ -75,7 +75,7 @@ def told_camera(options: SourceOptions, known: dict[str, Any]) -> SourceOptions:
 
 def camera_notes(store: Store, session: int) -> tuple[str, ...]:
     """What the user should know of the camera that was estimated."""
-    known: dict[str, Any] = store.get_value(_name(session), {})
+    known: dict[str, Any] = store.get_value(camera_key(session), {})
     return tuple(known.get("notes", ()))
 
 
@@ -93,5 +93,6 @@ def _as_stored(camera: Camera, size: tuple[int, int]) -> dict[str, list[float]]:
     return {"intrinsics": [full.fx, full.fy, full.cx, full.cy], "distortion": list(camera.distortion)}
 
 
-def _name(session: int) -> str:
+def camera_key(session: int) -> str:
+    """Where the camera of a session is kept in the key-value table."""
     return f"camera {session}"

@@ -105,17 +105,19 @@ def update(
     settings: BuildSettings | None = None,
     workers: int | None = None,
     resume: bool = False,
+    force: bool = False,
     licence: str = "research",
 ) -> SceneMemory:
     """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
 
-    The arguments are those of `build`. A video in which no stored place is recognised is kept apart, in a component of
-    its own. Raises `SourceError`, `OptionError` or `MemoryFileError`, each with the way to mend it.
+    The arguments are those of `build`; `force` gives up an update that was interrupted. A video in which no stored
+    place is recognised is kept apart, in a component of its own. Raises `SourceError`, `OptionError`,
+    `TrackingError` or `MemoryFileError`, each with the way to mend it.
     """
     from list3r import updating
 
     run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
-    updating.update(memory, source, licence=licence, **run)
+    updating.update(memory, source, force=force, licence=licence, **run)
     return open(memory)
 
 

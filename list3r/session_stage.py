@@ -11,14 +11,14 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.calibration_stage import with_camera
+from list3r.calibration_stage import camera_key, with_camera
 from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_parts
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.cuts import find_cuts
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
-from list3r.mapping import add_chunk
+from list3r.mapping import AssociationSettings, add_chunk, place_chunks
 from list3r.memory.errors import OptionError
 from list3r.memory.records import ChunkResult
 from list3r.memory.store import Store
@@ -144,6 +144,17 @@ def add_chunks(
 
 _MOST_REASONS = 5
 """Chunks that were lost of which is said why."""
+
+
+def take_back(store: Store, session: int) -> None:
+    """Leave the memory as it was before a session that is not in the library yet."""
+    placed = any(f.state == "posed" for f in store.frames(session))
+    with store.transaction():
+        for name in (_name(store, session, "lost"), _name(store, session, "cuts"), camera_key(session)):
+            store.drop_value(name)
+        store.drop_session(session)
+        if placed:
+            place_chunks(store, nodes=AssociationSettings().nodes)
 
 
 def lost_reasons(store: Store, session: int) -> list[str]:

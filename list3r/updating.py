@@ -7,6 +7,7 @@ Then all chunks are placed once more and the library is derived from both sessio
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -18,11 +19,11 @@ from list3r.chunk_stage import BuildSettings
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.mapping import finish_session
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
 from list3r.memory.records import Edge
 from list3r.memory.store import Store
 from list3r.models.licences import DEFAULT_PROFILE
-from list3r.session_stage import Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare
+from list3r.session_stage import Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare, take_back
 
 
 @dataclass(frozen=True)
@@ -62,28 +63,53 @@ def update(
     settings: BuildSettings | None = None,
     workers: int | None = None,
     resume: bool = False,
+    force: bool = False,
     licence: str = DEFAULT_PROFILE,
     progress: Progress | None = None,
     look: Look | None = None,
 ) -> UpdateReport:
     """Add one more video to an existing memory.
 
-    Raises `SourceError`, `MemoryFileError`, `OptionError`. When it is interrupted, the memory keeps the library as it
-    was and the chunks that were finished, which `resume` goes on with.
+    Raises `SourceError`, `MemoryFileError`, `OptionError`, `TrackingError`. When it fails or is interrupted, the memory
+    keeps the library as it was and the chunks that were finished, if a camera was placed in any; `resume` goes on with
+    them, `force` gives up what an interrupted update left, of this video or another.
     """
     started = time.monotonic()
     job = prepare(source, options, settings, workers, licence)
     with Store.open(memory, writable=True) as store:
-        session = _session(store, job.info, job.settings, resume=resume)
-        plan = plan_session(store, session, job, look)
-        add_chunks(store, job, plan, progress, library=False)
+        session = _session(store, job.info, job.settings, resume=resume, force=force)
+        try:
+            plan = plan_session(store, session, job, look)
+            add_chunks(store, job, plan, progress, library=False)
+            _check_posed(store, session, job.info)
+        except BaseException:
+            with suppress(MemoryFileError):  # what was wrong first is told; the next update takes it back
+                if not _begun(store, session):
+                    take_back(store, session)
+            raise
         with threadpool_limits(1):
             finish_session(store, session)
         return _report(store, job.info, plan, started)
 
 
-def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume: bool) -> int:
+def _begun(store: Store, session: int) -> bool:
+    """Whether the camera of any frame of a session is placed."""
+    return any(f.state == "posed" for f in store.frames(session))
+
+
+def _check_posed(store: Store, session: int, info: SourceInfo) -> None:
+    if not _begun(store, session):
+        why = lost_reasons(store, session)
+        reasons = "; ".join(("the memory is as it was", *why[:1]))
+        raise TrackingError(f"the camera could not be followed in any frame of {info.path}; {reasons}")
+
+
+def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume: bool, force: bool) -> int:
     """The session to write to. Raises `OptionError` where this video cannot come next."""
+    sessions = store.sessions()
+    for s in sessions[1:]:
+        if s.state != "complete" and ((force and not resume) or not _begun(store, s.session_id)):
+            take_back(store, s.session_id)
     sessions = store.sessions()
     path = str(Path(info.path).resolve())
     if not sessions or not store.chunks(sessions[0].session_id):
@@ -100,7 +126,7 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume:
     if begun and (begun[0].fingerprint != info.fingerprint or not resume):
         raise OptionError(
             f"an update of {store.path} was interrupted; finish it first: "
-            f"list3r update {store.path} {begun[0].source} --resume"
+            f"list3r update {store.path} {begun[0].source} --resume, or give it up with --force"
         )
     if begun:
         return begun[0].session_id
@@ -156,9 +182,7 @@ def _report(store: Store, info: SourceInfo, plan: Plan, started: float) -> Updat
 
 def _notes(info: SourceInfo, chunks: int, placed: int, held: int, lost: int, frames: int) -> tuple[str, ...]:
     notes = []
-    if lost == frames:
-        notes.append(f"the camera could not be followed in any frame of {info.path}; the library is as it was")
-    elif placed == 0:
+    if placed == 0:
         notes.append(
             "no place in this video was recognised: it is kept apart, in a frame of its own, and is joined "
             "when a later session connects the two"
@@ -168,6 +192,6 @@ def _notes(info: SourceInfo, chunks: int, placed: int, held: int, lost: int, fra
         )
     elif placed < chunks:
         notes.append(f"{chunks - placed} of {chunks} chunks could not be placed; they are kept apart")
-    if 0 < lost < frames:
+    if lost:
         notes.append(f"the camera could not be followed in {lost} of {frames} frames; they have no pose")
     return tuple(notes)

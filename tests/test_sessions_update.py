@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,8 +13,8 @@ import list3r
 from list3r.chunk_stage import BuildSettings
 from list3r.cli.app import run
 from list3r.frames.chunks import ChunkSettings
-from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError
+from list3r.frames.source import SourceOptions, open_source
+from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.updating import ties, update
@@ -118,6 +119,43 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
         assert [(e.instance_id, e.kind) for e in store.events()] == [(e.instance_id, e.kind) for e in whole.events()]
         assert [i.id for i in store.instances()] == [i.id for i in whole.instances()]
         assert store.verify() == []
+
+
+def test_an_interrupted_update_can_be_given_up(one: Path, walks: tuple[Path, Path], tmp_path: Path) -> None:
+    path = tmp_path / "given-up.l3r"
+    shutil.copy(one, path)
+
+    def stop(done: int, _: int) -> None:
+        if done > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        update(path, walks[1], settings=SETTINGS, workers=1, progress=stop)
+    with Store.open(path) as store:
+        assert len(store.sessions()) == 2 and store.chunks(2)
+    with pytest.raises(OptionError, match="give it up with --force"):
+        update(path, walks[1], settings=SETTINGS, workers=1)
+    report = update(path, walks[1], settings=SETTINGS, workers=1, force=True)
+    assert report.resumed_chunks == 0 and report.session == 2
+    with Store.open(path) as store:
+        assert len(store.sessions()) == 2 and store.verify() == []
+
+
+def test_a_video_in_which_no_camera_is_placed_leaves_the_memory_as_it_was(one: Path, tmp_path: Path) -> None:
+    path, black = tmp_path / "as-it-was.l3r", tmp_path / "black"
+    shutil.copy(one, path)
+    black.mkdir()
+    for n in range(12):
+        cv2.imwrite(str(black / f"{n:06d}.png"), np.zeros((120, 160, 3), np.uint8))
+    with pytest.raises(TrackingError, match=r"in any frame of .*; the memory is as it was"):
+        update(path, black, settings=SETTINGS, workers=1, options=SourceOptions(intrinsics=(130.0, 130.0, 80.0, 60.0)))
+    assert run(["update", str(path), str(black), "--intrinsics", "130,130,80,60"]) == 2
+    with Store.open(path) as store, Store.open(one) as before:
+        assert [s.session_id for s in store.sessions()] == [1] and store.verify() == []
+        assert len(store.chunks()) == len(before.chunks()) and len(store.frames()) == len(before.frames())
+        assert [(i.id, i.center.tolist()) for i in store.instances()] == [
+            (i.id, i.center.tolist()) for i in before.instances()
+        ]
 
 
 def test_a_session_whose_poses_are_given_is_placed_in_the_world_of_the_first(

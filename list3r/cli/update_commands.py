@@ -52,6 +52,7 @@ def update(
     detector: DetectorFile = None,
     detector_classes: ClassFile = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an update that was interrupted.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Give up an update that was interrupted.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Add one more video to a memory: it is placed against what is stored, and what has changed is written down.
@@ -69,8 +70,8 @@ def update(
     if not json:
         for line in told:
             note(line)
-    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
-    report = _run(memory, source, quiet=json, licence=models.licence, **run)
+    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers}
+    report = _run(memory, source, quiet=json, licence=models.licence, resume=resume, force=force, **run)
     after: dict[str, Any] = {"scale_anchor": scale_anchor, "detector": detector, "classes": detector_classes}
     notes, failure = finish(memory, source, options, quiet=json, **after)
     report = replace(report, notes=(*report.notes, *notes))

@@ -24,6 +24,14 @@ from list3r.memory.rows import (
 
 __all__ = ["ChunkVerbs", "LocalNode"]
 
+_OF_CHUNKS = (
+    ("edges", ("u", "v")),
+    ("overlaps", ("u", "v")),
+    *((table, ("chunk_id",)) for table in ("placements", "settled", "bends", "keyframes", "supports", "members")),
+    ("local_instances", ("chunk_id",)),
+)
+"""Tables of what chunks hold, and the columns that name the chunks."""
+
 
 class ChunkVerbs(LocalVerbs):
     """Writing what sessions and their chunks measured; call inside `transaction()`."""
@@ -39,6 +47,17 @@ class ChunkVerbs(LocalVerbs):
     def complete_session(self, session_id: int) -> None:
         """Mark a session as wholly built."""
         self._database.execute("UPDATE sessions SET state = 'complete' WHERE session_id = ?", (session_id,))
+
+    def drop_session(self, session_id: int) -> None:
+        """Take a session back, with all that its chunks hold. Its things must not be in the library yet."""
+        for table, columns in _OF_CHUNKS:
+            where = " OR ".join(f"{c} IN (SELECT chunk_id FROM chunks WHERE session_id = :session)" for c in columns)
+            self._database.execute(f"DELETE FROM {table} WHERE {where}", {"session": session_id})
+        votes = "SELECT 'label votes ' || chunk_id FROM chunks WHERE session_id = ?"
+        self._database.execute(f"DELETE FROM memory WHERE key IN ({votes})", (session_id,))
+        for table in ("frames", "chunks", "sessions"):
+            self._database.execute(f"DELETE FROM {table} WHERE session_id = ?", (session_id,))
+        self.forget_rows()
 
     def sessions(self) -> list[Session]:
         """All sessions in order."""

@@ -233,6 +233,10 @@ class Connection:
         """Set a value of the key-value table; anything JSON holds."""
         self._database.execute("INSERT OR REPLACE INTO memory VALUES (?, ?)", (key, to_json(value)))
 
+    def drop_value(self, key: str) -> None:
+        """Forget a value of the key-value table, if there is one."""
+        self._database.execute("DELETE FROM memory WHERE key = ?", (key,))
+
     def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         try:
             rows = self._database.execute(query, arguments).fetchall()
