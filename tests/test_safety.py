@@ -247,3 +247,19 @@ def test_a_reader_keeps_its_snapshot_when_the_same_process_opens_and_closes_the_
             assert len(reader.instances()) == count
             assert 3 in {o.instance_id for o in reader.observations()}
         assert len(writer.instances()) == count - 1
+
+
+def test_a_memory_whose_writer_was_killed_amid_a_commit_is_read(memory: Path, tmp_path: Path) -> None:
+    left = tmp_path / "left.l3r"
+    shutil.copy(memory, left)
+    writer = sqlite3.connect(left, isolation_level=None)
+    writer.execute("PRAGMA cache_size=1")
+    writer.execute("BEGIN")
+    writer.execute("UPDATE supports SET crc = crc + 1")
+    writer.execute("UPDATE chunks SET crc = crc + 1")
+    killed = tmp_path / "killed.l3r"
+    for end in ("", "-journal"):
+        shutil.copy(f"{left}{end}", f"{killed}{end}")
+    writer.close()
+    with Store.open(killed) as store, Store.open(memory) as before:
+        assert store.verify() == [] and len(store.instances()) == len(before.instances())

@@ -99,8 +99,10 @@ class Places:
         return points[:: max(1, len(points) // self._s.points)]
 
     def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
-        """The box of what was seen of it."""
+        """The box of what was seen of it; unless it has stayed, of what of that has changed."""
         points = self.points(n, session, before=before, stayed=stayed)
+        if not stayed:
+            points = self._without_what_stayed(points, self._views_across(n, session, before=before))
         upright = self._upright and self.component[n] == self._first
         return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
 
@@ -171,7 +173,7 @@ class Places:
         weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
         feature = np.average([self.shapes[k].feature[self._at(k, i)] for k, i in keys], axis=0, weights=weight)
         length = float(np.linalg.norm(feature))
-        views = self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
+        views = self._views_across(n, session, before=before)
         return Looks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
 
     def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[View]) -> Array:
@@ -180,14 +182,22 @@ class Places:
         sizes, weights = [], []
         for key, is_whole, w in zip(keys, whole, weight, strict=True):
             points = self._points_of(key)
-            changed = points[changed_points(points, views, self._s.visibility)]
-            points = changed if len(changed) >= self._s.least_changed * len(points) else points
+            points = self._without_what_stayed(points, views)
             if len(points) and (is_whole or not any(whole)):
                 sizes.append(self._sides(fit_box(points, upright=self._upright, trim=_SPREAD)))
                 weights.append(w)
         if not sizes:
             return np.ones(3)
         return np.array([_weighted_median(np.array(sizes)[:, d], np.array(weights)) for d in range(3)])
+
+    def _views_across(self, n: int, session: int, *, before: bool) -> list[View]:
+        """The views that tell what of a thing has changed: of this session where it was there before, else before."""
+        return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
+
+    def _without_what_stayed(self, points: Array, views: Sequence[View]) -> Array:
+        """The points that have changed, where that is enough of them."""
+        changed = points[changed_points(points, views, self._s.visibility)]
+        return changed if len(changed) >= self._s.least_changed * len(points) else points
 
     def _sides(self, box: OrientedBox) -> Array:
         if not self._upright:

@@ -52,6 +52,11 @@ class ChangeSettings:
     """Share of a new thing's surface that must lie where a thing stood that is gone, to be new there;"""
     replaced_slack_m: float = 0.02
     """within this."""
+    mostly_new: float = 0.5
+    """Share of a new thing's surface that earlier sessions see through, from which it is not mixed with what stood
+    there before."""
+    displaced: float = 0.5
+    """Share of what a thing showed that lies within something new of other looks, from which that has its place."""
     explained: float = 0.7
     """Share of a thing's surface that must be seen through, or lie at what is new, for that to stand in its place;"""
     replaced_link_m: float = 0.045

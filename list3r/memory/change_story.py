@@ -53,6 +53,8 @@ class Story:
         ]
         self._counts = [bool(show) and loose for show, loose in zip(shown, self._movable, strict=True)]
         self._thing = {n: _Thing([n], n) for n in range(len(groups))}
+        self._instead: set[int] = set()
+        """New things that stand where others stood."""
         self._events: list[tuple[int, Change]] = []
         self._decisions: list[MergeDecision] = []
 
@@ -67,9 +69,12 @@ class Story:
         left = {thing.now: p.box(thing.now, session, before=True) for thing, _ in gone}
         came = {n: p.box(n, session, before=False) for n in fresh}
         found_gone = {thing.now: found for thing, found in gone}
-        replaced = {n for n in fresh if self._replaces(n, left, session)}
+        replaced = {n for n in fresh if n in self._instead or self._replaces(n, left, session)}
         eligible = [n for n in fresh if looks[n].verdict != "there" or n in replaced]
-        for move in self._moves(gone, eligible, session):
+        news = {n: came[n] for n in eligible}
+        whole = [n for n in eligible if not self._scrap(n, news, session, before=False)]
+        lost = [(t, found) for t, found in gone if not self._scrap(t.now, left, session, before=True)]
+        for move in self._moves(lost, whole, session):
             fresh.remove(move.place)
             self._move(move, session, found_gone[move.thing.now])
         for thing, found in gone:
@@ -106,8 +111,10 @@ class Story:
                 thing.state = "unseen"
                 if self._movable[thing.now] and p.frames(thing.now, session) >= self._s.least_frames:
                     found = p.look_after(thing.now, session)
-                    if found.verdict == "gone" or self._taken(thing.now, found, fresh, session):
+                    other = self._displaced_by(thing.now, fresh, session)
+                    if found.verdict == "gone" or other is not None or self._taken(thing.now, found, fresh, session):
                         gone.append((thing, found))
+                        self._instead.update([] if other is None else [other])
                     elif found.verdict == "there" and self._counts[thing.now]:
                         self._still_there(thing, session, found)
         return gone
@@ -120,6 +127,20 @@ class Story:
         new = [m for m in fresh if p.component[m] == p.component[n]]
         new = [m for m in new if p.changed(m, session, before=False) >= s.seen_through / 2]
         return p.explained(n, new, session) >= s.explained
+
+    def _displaced_by(self, n: int, fresh: Sequence[int], session: int) -> int | None:
+        """Something new of other looks that is where most of a thing was: two bodies are never at one place."""
+        p, s = self._p, self._s
+        old = p.looks(n, session, before=True).feature
+        for m in fresh:
+            if p.component[m] == p.component[n] and p.changed(m, session, before=False) >= s.mostly_new:
+                box = p.box(m, session, before=False, stayed=True)
+                if (
+                    p.inside(n, box, 0.0, session, before=True) >= s.displaced
+                    and float(old @ p.looks(m, session, before=False).feature) < s.moved_cosine
+                ):
+                    return m
+        return None
 
     def _things(self) -> list[_Thing]:
         return [thing for n, thing in sorted(self._thing.items()) if thing.places[0] == n]

@@ -102,18 +102,12 @@ class Connection:
     @classmethod
     def _open_to_read(cls, path: Path) -> Self:
         try:
-            database = connected(path, "ro")
             try:
-                version = identified(path, database)
+                database, version = _identified_reader(path)
             except sqlite3.OperationalError as error:
-                database.close()
                 if getattr(error, "sqlite_errorname", "") not in _UNFINISHED or not _writable_now(cls, path):
                     raise
-                database = connected(path, "ro")
-                version = identified(path, database)
-            except BaseException:
-                database.close()
-                raise
+                database, version = _identified_reader(path)
             if version < SCHEMA_VERSION:
                 database.close()
                 database = connected(path, "ro") if _writable_now(cls, path) else migrated_copy(path)
@@ -289,6 +283,16 @@ def _size(database: sqlite3.Connection) -> int:
     """Bytes of a database, what is only in its log included."""
     pages = [database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")]
     return int(pages[0]) * int(pages[1])
+
+
+def _identified_reader(path: Path) -> tuple[sqlite3.Connection, int]:
+    """A connection for reading, and the schema version of what it reads."""
+    database = connected(path, "ro")
+    try:
+        return database, identified(path, database)
+    except BaseException:
+        database.close()
+        raise
 
 
 def _writable_now(kind: type[Connection], path: Path) -> bool:

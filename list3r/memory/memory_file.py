@@ -48,7 +48,11 @@ def connected(path: Path, mode: str) -> sqlite3.Connection:
     """A connection that runs nothing that the file brings along and holds no value larger than a blob may be."""
     uri = f"file:{quote(str(path.resolve()))}?mode={mode}"
     database = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_WAIT_S, check_same_thread=False)
-    protect(database)
+    try:
+        protect(database)
+    except BaseException:
+        database.close()
+        raise
     return database
 
 
