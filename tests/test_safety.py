@@ -249,7 +249,8 @@ def test_a_reader_keeps_its_snapshot_when_the_same_process_opens_and_closes_the_
         assert len(writer.instances()) == count - 1
 
 
-def test_a_memory_whose_writer_was_killed_amid_a_commit_is_read(memory: Path, tmp_path: Path) -> None:
+def test_a_memory_whose_writer_was_killed_amid_a_commit_is_read(make_memory: Make, tmp_path: Path) -> None:
+    memory = make_memory()
     left = tmp_path / "left.l3r"
     shutil.copy(memory, left)
     writer = sqlite3.connect(left, isolation_level=None)
