@@ -78,6 +78,8 @@ def update(
     job = prepare(source, options, settings, workers, licence)
     with Store.open(memory, writable=True) as store:
         session = _session(store, job.info, job.settings, resume=resume, force=force)
+        if _complete(store, session):
+            return _report(store, job.info, plan_session(store, session, job, look), started)
         try:
             plan = plan_session(store, session, job, look)
             add_chunks(store, job, plan, progress, library=False)
@@ -95,6 +97,10 @@ def update(
 def _begun(store: Store, session: int) -> bool:
     """Whether the camera of any frame of a session is placed."""
     return any(f.state == "posed" for f in store.frames(session))
+
+
+def _complete(store: Store, session: int) -> bool:
+    return any(s.session_id == session and s.state == "complete" for s in store.sessions())
 
 
 def _check_posed(store: Store, session: int, info: SourceInfo) -> None:
@@ -116,6 +122,8 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume:
         raise OptionError(f"{store.path} holds no video yet; make it with `list3r build {info.path} -m {store.path}`")
     for s in sessions:
         if s.state == "complete" and s.fingerprint == info.fingerprint:
+            if resume and s is sessions[-1] and len(sessions) > 1:
+                return s.session_id  # it was interrupted when all was done
             raise OptionError(f"{info.path} is in {store.path} already, as session {s.session_id}")
     begun = [s for s in sessions if s.state != "complete"]
     if begun and begun[0].session_id == sessions[0].session_id:

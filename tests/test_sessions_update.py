@@ -115,6 +115,8 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
         update(path, walks[1], settings=SETTINGS, workers=1)
     report = update(path, walks[1], settings=SETTINGS, workers=1, resume=True)
     assert report.resumed_chunks == 1
+    again = update(path, walks[1], settings=SETTINGS, workers=1, resume=True)
+    assert again.events == report.events and again.session == report.session
     with Store.open(path) as store, Store.open(two) as whole:
         assert [(e.instance_id, e.kind) for e in store.events()] == [(e.instance_id, e.kind) for e in whole.events()]
         assert [i.id for i in store.instances()] == [i.id for i in whole.instances()]
