@@ -52,6 +52,17 @@ def two(one: Path, walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFa
     return path
 
 
+def interrupt(path: Path, walk: Path) -> None:
+    """An update that is stopped after its first chunk."""
+
+    def stop(done: int, _: int) -> None:
+        if done > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        update(path, walk, settings=SETTINGS, workers=1, progress=stop)
+
+
 def test_the_second_session_lies_in_the_world_of_the_first(two: Path, one: Path) -> None:
     with Store.open(two) as store, Store.open(one) as before:
         assert {c.component for c in store.chunks()} == {store.chunks()[0].component}
@@ -102,12 +113,7 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
     path = tmp_path / "resumed.l3r"
     shutil.copy(one, path)
 
-    def stop(done: int, _: int) -> None:
-        if done > 0:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        update(path, walks[1], settings=SETTINGS, workers=1, progress=stop)
+    interrupt(path, walks[1])
     with Store.open(path) as store, Store.open(one) as before:
         assert [i.id for i in store.instances()] == [i.id for i in before.instances()]
         assert store.events() == []
@@ -127,12 +133,7 @@ def test_an_interrupted_update_can_be_given_up(one: Path, walks: tuple[Path, Pat
     path = tmp_path / "given-up.l3r"
     shutil.copy(one, path)
 
-    def stop(done: int, _: int) -> None:
-        if done > 0:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        update(path, walks[1], settings=SETTINGS, workers=1, progress=stop)
+    interrupt(path, walks[1])
     with Store.open(path) as store:
         assert len(store.sessions()) == 2 and store.chunks(2)
     with pytest.raises(OptionError, match="give it up with --force"):
