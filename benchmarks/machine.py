@@ -25,11 +25,16 @@ def machine() -> dict[str, Any]:
     return {"processor": model, "cores": cores, "python": platform.python_version(), "system": platform.platform()}
 
 
-def run_list3r(*arguments: str) -> tuple[dict[str, Any], dict[str, float]]:
-    """Run the program with --json; its answer, its wall seconds and the peak memory of all its processes."""
+def run_list3r(*arguments: str, kept: Path | None = None) -> tuple[dict[str, Any], dict[str, float]]:
+    """Run the program with --json; its answer, its wall seconds and the peak memory of all its processes.
+
+    `kept` is a folder for reconstructions, see `kept.py`.
+    """
     started = time.monotonic()
+    program = ["-m", "list3r"] if kept is None else [str(Path(__file__).with_name("kept.py"))]
+    environment = os.environ if kept is None else os.environ | {"LIST3R_KEPT": str(kept)}
     process = subprocess.Popen(
-        [sys.executable, "-m", "list3r", *arguments, "--json"], stdout=subprocess.PIPE, text=True
+        [sys.executable, *program, *arguments, "--json"], stdout=subprocess.PIPE, text=True, env=environment
     )
     peak = _watch(process)
     out = process.stdout.read() if process.stdout else ""

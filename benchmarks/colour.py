@@ -1,0 +1,270 @@
+"""Simulated walks given as colour pictures alone: trajectory, depth, instances and relations against the truth.
+
+    python benchmarks/colour.py --seeds 31,32,33 --keep FOLDER --json benchmarks/results/colour.json
+
+Each walk (two furnished rooms, 640x480, filmed at 12 frames a second) becomes a folder of its colour pictures, and
+`list3r build FOLDER --reconstruction sfm --intrinsics ...` a memory. `blank` is the share of 7 px windows, at 320 px
+width, whose deviation is below 2.5 grey levels: 0.20 in redkitchen. Things are matched one to one, by masks in every
+tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` says what the things lie on that match
+nothing. Relations are those among things matched by masks. Walks and reconstructions that are in `--keep` are used
+again, and then the time is that of what is left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from kept import read_kept
+from machine import machine, run_list3r, write_json
+from numpy.typing import NDArray
+
+from list3r.evaluation.instances import match_boxes
+from list3r.evaluation.scene import evaluate_scene, read_scene, relations_of_matches
+from list3r.evaluation.trajectory import Trajectory, align, position_errors, read_tum
+from list3r.memory.geometry import Sim3
+from list3r.memory.masks import decode_mask
+from list3r.memory.store import Store
+from list3r.scene_memory import open as open_memory
+from list3r.simulation.dataset import DEPTH_UNITS_PER_M, WalkSettings, write_walk
+
+SIZE = (640, 480)
+EVERY = 10
+"""Frames between those whose masks are compared."""
+STEP = 4
+"""Every so many pixels of a mask are compared."""
+LEAST_PX = 150
+"""True things that never cover so many pixels count neither way."""
+
+Masks = dict[int, dict[int, NDArray[np.bool_]]]
+"""By frame and id, thinned by `STEP`."""
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """How the masks of T true and E found instances overlap over all compared frames, px of the thinned masks."""
+
+    true_ids: list[int]
+    ids: list[int]
+    shared: NDArray[np.int64]
+    """Shape (T, E)."""
+    true_px: NDArray[np.int64]
+    """Shape (T,)."""
+    px: NDArray[np.int64]
+    """Shape (E,)."""
+
+    def iou(self) -> NDArray[np.float64]:
+        """Shape (T, E)."""
+        union = self.true_px[:, None] + self.px[None] - self.shared
+        return np.asarray(self.shared / np.maximum(union, 1), np.float64)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="31,32,33")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        root = words.keep or Path(scratch)
+        for seed in (int(word) for word in words.seeds.split(",")):
+            rows.append({"seed": seed, **measured(root / f"seed-{seed}", seed, words.workers)})
+            print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    known = {k: [r[k] for r in rows if r[k] is not None] for k in rows[0] if k != "seed"}
+    mean = {k: round(statistics.fmean(values), 4) if values else None for k, values in known.items()}
+    print(machine())
+    for key, value in mean.items():
+        print(f"{key:24} {value}")
+    write_json(words.json, {"mean": mean, "seeds": rows})
+
+
+def measured(folder: Path, seed: int, workers: int) -> dict[str, Any]:
+    """The figures of one walk, which is filmed, built and compared in `folder`."""
+    settings = WalkSettings(seed=seed, size=SIZE, write_ids=True)
+    walk = folder / "walk"
+    if not (walk / "truth.json").exists():
+        write_walk(walk, settings, workers)
+    colour = _colour_only(folder / "colour", walk)
+    camera = settings.camera()
+    intrinsics = ",".join(f"{v:g}" for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+    memory, depths = folder / "memory.l3r", folder / "reconstructions"
+    words = ["build", str(colour), "-m", str(memory), "--force", "--reconstruction", "sfm", "--intrinsics", intrinsics]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    report, usage = run_list3r(*words, "--workers", str(workers), kept=depths)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    row = {"frames": report["frames"], "posed": report["posed"], **usage, "cpu_s": round(spent, 1)}
+    row["blank"] = blank_share(colour)
+    return row | depth_errors(depths, walk) | scene_errors(memory, walk)
+
+
+def _colour_only(folder: Path, walk: Path) -> Path:
+    """A folder of links to the colour pictures, in order."""
+    folder.mkdir(exist_ok=True)
+    for path in sorted((walk / "rgb").iterdir()):
+        link = folder / path.name
+        if not link.exists():
+            link.symlink_to(path.resolve())
+    return folder
+
+
+def blank_share(colour: Path) -> float:
+    """Share of small windows without texture, over every twentieth picture."""
+    shares = []
+    for path in sorted(colour.iterdir())[::20]:
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None
+        gray = cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA).astype(np.float32)
+        variance = cv2.blur(gray * gray, (7, 7)) - cv2.blur(gray, (7, 7)) ** 2
+        shares.append(float((variance < 2.5**2).mean()))
+    return round(float(np.mean(shares)), 3)
+
+
+def depth_errors(reconstructions: Path, walk: Path) -> dict[str, float]:
+    """Share of pixels with depth and errors after one scale for each chunk, on every third pixel."""
+    known, ratios = [], []
+    for path in sorted(reconstructions.glob("parts-*.npz")):
+        for part in read_kept(path):
+            rows = np.flatnonzero(part.posed)[::5]
+            frames = part.frame_indices[rows].tolist()
+            pictures = [cv2.imread(str(walk / "depth" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED) for k in frames]
+            truth = np.stack([p for p in pictures if p is not None])[:, 1::3, 1::3] / DEPTH_UNITS_PER_M
+            depth = part.depth[rows][:, 1::3, 1::3]
+            both = (depth > 0) & (truth > 0)
+            known.append((depth > 0).mean(axis=(1, 2)))
+            ratio = depth[both] / truth[both]
+            ratios.append(np.abs(ratio / np.median(ratio) - 1.0))
+    error = np.concatenate(ratios)
+    return {
+        "depth_coverage": round(float(np.concatenate(known).mean()), 4),
+        "depth_median_error": round(float(np.median(error)), 4),
+        "depth_above_10_percent": round(float((error > 0.1).mean()), 4),
+    }
+
+
+def scene_errors(memory: Path, walk: Path) -> dict[str, Any]:
+    """Trajectory, things and relations of a memory."""
+    true_scene = read_scene(walk / "truth.json")
+    exported = memory.with_suffix(".json")
+    with open_memory(memory) as opened:
+        opened.export("json", str(exported))
+    scene = read_scene(exported)
+    S_truth_world, ate = _alignment(memory, walk)
+    frames = range(0, len(list((walk / "rgb").iterdir())), EVERY)
+    overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
+    boxes = evaluate_scene(scene, true_scene, S_truth_world)
+    out = {"ate_sim3_m": round(ate, 4), **_by_masks(overlaps, scene, true_scene)}
+    for name in ("0.25", "0.50"):
+        entry = boxes[f"instances_{name}"]
+        out[f"box_recall_{name}"] = round(entry["recall"], 3)
+        out[f"box_precision_{name}"] = round(entry["precision"], 3)
+    return out
+
+
+def _alignment(memory: Path, walk: Path) -> tuple[Sim3, float]:
+    """From the memory's world to the truth's, and the RMS distance of the cameras, metres."""
+    truth = read_tum(walk / "groundtruth.txt")
+    with Store.open(memory) as store:
+        poses = {f.frame_index: S for f, S in store.camera_poses()}
+    rows = np.array(sorted(poses))
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    for k, row in enumerate(rows.tolist()):
+        T[k, :3, :3], T[k, :3, 3] = poses[row].rotation, poses[row].translation
+    true, estimate = truth.at(rows), Trajectory(truth.time_s[rows], T)
+    S = align(true, estimate, with_scale=True)
+    return S, float(np.sqrt(np.square(position_errors(true, estimate, S)).mean()))
+
+
+def true_masks(walk: Path, frames: range) -> Masks:
+    """What is truly seen where."""
+    out: Masks = {}
+    for frame in frames:
+        ids = cv2.imread(str(walk / "ids" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert ids is not None
+        thin = ids[::STEP, ::STEP]
+        out[frame] = {int(k): thin == k for k in np.unique(thin) if k > 0}
+    return out
+
+
+def memory_masks(memory: Path, frames: range) -> Masks:
+    """What a memory saw where, all chunks together."""
+    out: Masks = {frame: {} for frame in frames}
+    with Store.open(memory) as store:
+        present = {i.id for i in store.instances()}
+        for seen in store.observations():
+            track = store.mask_track(seen.chunk_id, seen.local_id)
+            for frame, runs in zip(track.frames.tolist(), track.masks, strict=True):
+                if frame in out and seen.instance_id in present:
+                    mask = decode_mask(runs, track.image_size)[::STEP, ::STEP]
+                    before = out[frame].get(seen.instance_id)
+                    out[frame][seen.instance_id] = mask if before is None else before | mask
+    return out
+
+
+def compare_masks(truth: Masks, found: Masks) -> Overlaps:
+    """Areas and shared areas over all frames."""
+    true_ids = sorted({k for frame in truth.values() for k in frame})
+    ids = sorted({k for frame in found.values() for k in frame})
+    row, column = ({k: n for n, k in enumerate(each)} for each in (true_ids, ids))
+    shared = np.zeros((len(true_ids), len(ids)), np.int64)
+    true_px, px = np.zeros(len(true_ids), np.int64), np.zeros(len(ids), np.int64)
+    for frame, things in truth.items():
+        for t, mask in things.items():
+            true_px[row[t]] += mask.sum()
+        for e, other in found[frame].items():
+            px[column[e]] += other.sum()
+            for t, mask in things.items():
+                shared[row[t], column[e]] += (mask & other).sum()
+    return Overlaps(true_ids, ids, shared, true_px, px)
+
+
+def _by_masks(overlaps: Overlaps, scene: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Recall and precision of things by masks, what false ones lie on, and relations of the true ones."""
+    wanted = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= LEAST_PX}
+    things = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
+    rows = [n for n, k in enumerate(overlaps.true_ids) if k in wanted]
+    columns = [n for n, k in enumerate(overlaps.ids) if k in things and overlaps.px[n] > 0]
+    iou = overlaps.iou()[np.ix_(rows, columns)]
+    out: dict[str, Any] = {"things": len(columns), "true_things": len(rows)}
+    pairs: list[tuple[int, int]] = []
+    for threshold in (0.5, 0.25):
+        pairs = match_boxes(iou, threshold)
+        out[f"mask_recall_{threshold:.2f}"] = round(len(pairs) / max(len(rows), 1), 3)
+        out[f"mask_precision_{threshold:.2f}"] = round(len(pairs) / max(len(columns), 1), 3)
+    found = [(overlaps.true_ids[rows[r]], overlaps.ids[columns[c]], float(iou[r, c])) for r, c in pairs]
+    out |= _false_things(overlaps, columns, found, truth)
+    judged = relations_of_matches(scene, truth, found).by_predicate
+    for name, entry in judged.items():
+        out[f"{name}_recall"], out[f"{name}_precision"] = (
+            None if v is None else round(v, 3) for v in (entry.recall, entry.precision)
+        )
+    return out
+
+
+def _false_things(
+    overlaps: Overlaps, columns: list[int], found: list[tuple[int, int, float]], truth: Mapping[str, Any]
+) -> dict[str, int]:
+    """How many things that match nothing lie mostly on structure, on a thing that is found, and on one that is not."""
+    structure = {e["id"] for e in truth["instances"] if e["structure"]}
+    matched, known = {e for _, e, _ in found}, {t for t, _, _ in found}
+    out = {"false_on_structure": 0, "false_on_found": 0, "false_on_missed": 0}
+    for column in columns:
+        if overlaps.ids[column] not in matched:
+            below = overlaps.true_ids[int(overlaps.shared[:, column].argmax())]
+            place = "structure" if below in structure else "found" if below in known else "missed"
+            out[f"false_on_{place}"] += 1
+    return out
+
+
+if __name__ == "__main__":
+    main()
