@@ -190,7 +190,7 @@ CARDS: tuple[ModelCard, ...] = (
             Weights("depth-anything/DA3NESTED-GIANT-LARGE-1.1", CC_BY_NC),
         ),
         ("depth_anything_3",),
-        "pip install depth-anything-3",
+        f"{_GIT}/ByteDance-Seed/Depth-Anything-3",
         MemoryFigures(10000, 600, "DA3-Streaming's table, giant weights: 28.3 GB at 120 frames of 504x378"),
         504 * 378,
         "base and small weights are free for any use",

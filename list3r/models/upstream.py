@@ -4,28 +4,45 @@ from __future__ import annotations
 
 import contextlib
 import io
+import warnings
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from list3r.memory.errors import OptionError
-from list3r.models.cache import check_weights
+from list3r.models.cache import SINGLE_FILES, check_weights
 from list3r.models.cards import ModelCard
 
 if TYPE_CHECKING:
     import torch
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Swallow what a package prints and warns of while it is imported, loads or runs: standard output is for results,
+    and its deprecated calls are no concern of the user's."""
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def upstream_class(card: ModelCard, module: str, name: str) -> Any:
     """A class of the package that a card names. Raises `OptionError`, with what installs it, where it is missing."""
     try:
-        return getattr(import_module(module), name)
+        with quiet():
+            found = import_module(module)
     except ImportError as error:
         missing = error.name or module
         hint = card.install if missing.split(".")[0] in card.packages else f"pip install {missing.split('.')[0]}"
         raise OptionError(f"{card.name} needs the package {missing.split('.')[0]}: {hint}") from None
-    except AttributeError:
-        raise OptionError(f"this version of {module} has no {name}: {card.install}") from None
+    except (
+        Exception
+    ) as error:  # binary packages that do not fit each other raise anything
+        raise OptionError(f"{card.name} needs {module}, which cannot be imported here: {first_line(error)}") from None
+    if not hasattr(found, name):
+        raise OptionError(f"this version of {module} has no {name}: {card.install}")
+    return getattr(found, name)
 
 
 def load_upstream(cls: Any, path: Path, device: torch.device) -> Any:
@@ -37,9 +54,7 @@ def load_upstream(cls: Any, path: Path, device: torch.device) -> Any:
     """
     check_weights(path)
     try:
-        with contextlib.redirect_stdout(
-            io.StringIO()
-        ):  # packages print while they load; standard output is for results
+        with quiet():
             model, names = (_from_folder if path.is_dir() else _from_file)(cls, path)
     except OptionError:
         raise
@@ -57,8 +72,16 @@ def _from_folder(cls: Any, folder: Path) -> tuple[Any, set[str]]:
         with safe_open(file, framework="pt") as tensors:
             names.update(tensors.keys())
     if not names:
-        raise OptionError(f"{folder} holds no .safetensors file; give the checkpoint itself: --weights FILE")
+        return _from_file(cls, _only_checkpoint(folder))
     return cls.from_pretrained(str(folder), local_files_only=True), names
+
+
+def _only_checkpoint(folder: Path) -> Path:
+    """The one file of weights in a folder of an older kind (facebook/VGGT-1B-Commercial is such a repository)."""
+    files = [p for p in sorted(folder.iterdir()) if p.suffix in SINGLE_FILES]
+    if len(files) != 1:
+        raise OptionError(f"{folder} holds {len(files)} checkpoints and none is .safetensors; give one: --weights FILE")
+    return files[0]
 
 
 def _from_file(cls: Any, file: Path) -> tuple[Any, set[str]]:

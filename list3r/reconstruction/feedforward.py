@@ -24,7 +24,7 @@ from list3r.models.cards import ModelCard, find_card
 from list3r.models.device import MemoryBudget, find_gpu
 from list3r.models.licences import choose_weights
 from list3r.models.pretrained import pick_device
-from list3r.models.upstream import load_upstream, upstream_class
+from list3r.models.upstream import load_upstream, quiet, upstream_class
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.feedforward_output import WindowOutput, to_reconstruction, with_given_poses
 from list3r.reconstruction.feedforward_windows import run_windows
@@ -62,7 +62,7 @@ class PictureSize:
 
 Answer = Callable[[Any, "torch.Tensor", "torch.Tensor | None"], WindowOutput]
 """Poses, depth, confidence and focal lengths that a model tells of pictures (n, 3, h, w) in [0, 1]. The last argument
-are known intrinsics of the pictures, px, (3, 3), for models that can be told."""
+are known intrinsics of the pictures, px, (3, 3), pixel centres at whole numbers, for models that can be told."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,8 @@ class Network:
     size: PictureSize
     """How large its pictures are."""
     answer: Answer
+    load_class: Callable[[Any, Path, torch.device], Any] = load_upstream
+    """Makes the class with the weights at a path; an adapter wraps it where the package needs more care."""
 
     @property
     def card(self) -> ModelCard:
@@ -87,7 +89,7 @@ class Network:
 
     def load(self, path: Path, device: torch.device) -> Any:
         """The network with the weights at a path. Raises `OptionError` in one line."""
-        return load_upstream(upstream_class(self.card, self.module, self.class_name), path, device)
+        return self.load_class(upstream_class(self.card, self.module, self.class_name), path, device)
 
 
 class FeedforwardReconstructor:
@@ -133,7 +135,13 @@ class FeedforwardReconstructor:
             weights_mb = torch.cuda.memory_allocated(device) / 2**20
         stack = torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).float() / 255.0
         known = None if K is None else torch.from_numpy(K).float().to(device)
-        with torch.inference_mode(), torch.autocast(device.type, half_precision(device), enabled=cuda):
+        with (
+            quiet(),
+            torch.random.fork_rng(devices=[device] if cuda else []),
+            torch.inference_mode(),
+            torch.autocast(device.type, half_precision(device), enabled=cuda),
+        ):
+            torch.manual_seed(0)  # some networks draw samples; a chunk's answer depends on nothing but the chunk
             output = self._network.answer(self._model, stack, known)
         if cuda and self._budget is not None:
             self._budget.measured(len(pictures), torch.cuda.max_memory_allocated(device) / 2**20, weights_mb)

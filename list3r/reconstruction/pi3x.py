@@ -1,9 +1,15 @@
-"""Reconstruction `pi3x`, the successor of `pi3`: smoother, and can be told the intrinsics."""
+"""Reconstruction `pi3x`, the successor of `pi3`: smoother, and can be told the intrinsics.
+
+Told intrinsics count pixels from the picture's corner (the first centre is at a half). `decode` makes a mask over all
+pairs of tokens of all pictures, 9 GB for 100 of them, for poses that nobody gave; so it is not asked to look for poses.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from list3r.models.upstream import load_upstream
 from list3r.reconstruction.feedforward import FeedforwardReconstructor, Network, PictureSize
 from list3r.reconstruction.feedforward_output import WindowOutput
 from list3r.reconstruction.pi3 import PIXEL_LIMIT, read
@@ -18,13 +24,36 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
     return FeedforwardReconstructor(NETWORK, options)
 
 
+def load(cls: Any, path: Path, device: torch.device) -> Any:
+    """The network, whose decoder looks for no poses."""
+    model = load_upstream(cls, path, device)
+    if hasattr(model, "decode"):
+        _decode_without_poses(model)
+    return model
+
+
+def _decode_without_poses(model: Any) -> None:
+    decode = model.decode
+
+    def plain(hidden: torch.Tensor, count: int, height: int, width: int, *_: Any) -> Any:
+        before, model.use_multimodal = model.use_multimodal, False
+        try:
+            return decode(hidden, count, height, width, None, None)
+        finally:
+            model.use_multimodal = before
+
+    model.decode = plain
+
+
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
     """See `feedforward.Answer`."""
     if K is None:
         return read(model(imgs=pictures[None], with_prior=False))
-    told = K.expand(1, len(pictures), 3, 3)
+    told = K.clone()
+    told[:2, 2] += 0.5
     everywhere = pictures.new_ones((1, len(pictures))).bool()
+    told = told.expand(1, len(pictures), 3, 3)
     return read(model(imgs=pictures[None], intrinsics=told, mask_add_ray=everywhere))
 
 
-NETWORK = Network("pi3x", "pi3.models.pi3x", "Pi3X", PictureSize(max_pixels=PIXEL_LIMIT), answer)
+NETWORK = Network("pi3x", "pi3.models.pi3x", "Pi3X", PictureSize(max_pixels=PIXEL_LIMIT), answer, load)

@@ -3,15 +3,18 @@
 Pictures (1, n, 3, h, w) in [0, 1], the longer side 518. Out come `depth` (1, n, h, w, 1), `depth_conf` = 1 + exp(x),
 and `pose_enc` (1, n, 9): translation and quaternion (xyzw) of the camera *from* world pose with OpenCV axes, then the
 vertical and the horizontal field of view in radians. The first camera is the frame of reference; there is no scale.
+The heads for world points and for tracks are not needed.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from list3r.models.upstream import load_upstream
 from list3r.reconstruction.feedforward import (
     FeedforwardReconstructor,
     Network,
@@ -32,6 +35,13 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
     return FeedforwardReconstructor(NETWORK, options)
 
 
+def load(cls: Any, path: Path, device: torch.device) -> Any:
+    """The network without the heads whose answers are not read: a quarter of a pass and of its weights."""
+    model = load_upstream(cls, path, device)
+    model.point_head = model.track_head = None
+    return model
+
+
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
     """See `feedforward.Answer`; the network cannot be told the intrinsics."""
     output = model(pictures[None])
@@ -44,7 +54,7 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
     )
 
 
-NETWORK = Network("vggt", "vggt.models.vggt", "VGGT", PictureSize(longest=518), answer)
+NETWORK = Network("vggt", "vggt.models.vggt", "VGGT", PictureSize(longest=518), answer, load)
 
 
 def decode_poses(encoding: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
