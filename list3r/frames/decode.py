@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import FrameError
 
-_TAIL = 8192
-_ENDINGS = ((b"\xff\xd8", b"\xff\xd9"), (b"\x89PNG", b"IEND"))
-
 
 def read_color(path: Path, bits: int = 16) -> NDArray[np.uint8]:
     """An RGB image, turned upright by its EXIF tag. Shape (H, W, 3). Raises `FrameError`.
@@ -97,9 +94,8 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
         raise FrameError(f"{path.name} cannot be read ({error.strerror})") from None
     if not data:
         raise FrameError(f"{path.name} is empty")
-    for head, end in _ENDINGS:
-        if data.startswith(head) and end not in data[-_TAIL:]:
-            raise FrameError(f"{path.name} is cut off")
+    if _cut_off(data):
+        raise FrameError(f"{path.name} is cut off")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -107,6 +103,22 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     if image is None:
         raise FrameError(f"{path.name} cannot be decoded")
     return np.asarray(image)
+
+
+def _cut_off(data: bytes) -> bool:
+    """Whether a JPEG or PNG ends before its picture does. Phones put a film or maps of brightness behind a JPEG."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data
+    return data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", _scan_start(data)) < 0
+
+
+def _scan_start(data: bytes) -> int:
+    """Where the first scan of a JPEG begins: what lies before may hold a whole small picture (ITU-T T.81, annex B)."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        alone = data[at + 1] in (0x01, 0xFF) or 0xD0 <= data[at + 1] <= 0xD8  # markers without a segment, and filling
+        at += (1 if data[at + 1] == 0xFF else 2) if alone else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return at
 
 
 def _load_npy(path: Path) -> NDArray[Any]:

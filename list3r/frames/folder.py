@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -139,13 +140,13 @@ class FolderSource:
         count = len(self._chosen)
         spread = np.linspace(0, count - 1, _PROBES).astype(int).tolist()
         tried = dict.fromkeys([*range(min(3, count)), *spread])
+        paths = [self._layout.files[int(self._chosen.starts[k])] for k in tried]
         reason = ""
-        for position in tried:
-            file = self._layout.files[int(self._chosen.starts[position])]
+        for file in _usual_size_first(paths):
             try:
                 color = read_color(file.color)
                 self._first_picture = file.color
-                self._bits = used_bits([self._layout.files[int(self._chosen.starts[k])].color for k in tried])
+                self._bits = used_bits([f.color for f in paths])
                 if not self._has_depth:
                     return color.shape[:2], None
                 if file.depth is not None:
@@ -220,6 +221,19 @@ def fingerprint(kind: str, listing: list[tuple[str, int]], options: SourceOption
     said = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
     text = repr((kind, listing, sorted(said.items())))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
+    """The files in order, but those whose picture has not the size that most have behind the others."""
+    sizes = []
+    for file in files:
+        try:
+            sizes.append(read_gray(file.color, 8).shape)
+        except FrameError:
+            sizes.append(())
+    known = Counter(size for size in sizes if size)
+    usual = known.most_common(1)[0][0] if known else ()
+    return [files[k] for k in sorted(range(len(files)), key=lambda k: sizes[k] != usual)]
 
 
 def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:

@@ -29,11 +29,14 @@ class Upright:
     """Left and right are exchanged first."""
     interlaced: bool = False
     """Every other line was taken a moment later."""
+    hdr: bool = False
+    """Brightness is coded by SMPTE ST 2084, which looks grey where it is taken for the usual code."""
 
     @classmethod
     def of(cls, image: av.VideoFrame, aspect: Fraction) -> Upright:
         """As the first picture and its display matrix say; `aspect` is the width of its pixels by their height."""
-        return cls((image.height, image.width), aspect, *_orientation(image), bool(image.interlaced_frame))
+        hdr = getattr(image, "color_trc", None) == _PQ
+        return cls((image.height, image.width), aspect, *_orientation(image), bool(image.interlaced_frame), hdr)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -45,16 +48,20 @@ class Upright:
     def color(self, image: av.VideoFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
         """RGB, upright, of (height, width) `size`. Shape (H, W, 3).
 
-        Raises `FrameError` for a picture that is stored in another size than the first.
+        A call or a stream over a poor line goes on in smaller pictures of the same shape, which are enlarged. Raises
+        `FrameError` for a picture of another shape than the first.
         """
-        if (image.height, image.width) != self.stored:
-            was = f"{self.stored[1]}x{self.stored[0]}"
-            raise FrameError(f"the picture is {image.width}x{image.height}, the first one {was}")
+        here, was = (image.height, image.width), self.stored
+        if abs(image.width * was[0] - image.height * was[1]) > _SAME_SHAPE * image.height * was[1]:
+            raise FrameError(f"the picture is {here[1]}x{here[0]}, the first one {was[1]}x{was[0]}")
         height, width = size[::-1] if self.turns % 2 else size
-        if (height, width) == self.stored:
+        if (height, width) == here:
             rgb = image.to_ndarray(format="rgb24")
         else:
-            rgb = image.reformat(width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
+            how = "AREA" if height <= here[0] else "BICUBIC"
+            rgb = image.reformat(width=width, height=height, format="rgb24", interpolation=how).to_ndarray()
+        if self.hdr:
+            rgb = _PQ_TO_SRGB[rgb]
         if self.mirrored:
             rgb = rgb[:, ::-1]
         return np.ascontiguousarray(np.rot90(rgb, self.turns))
@@ -70,9 +77,29 @@ class Upright:
             out.append(f"pixels are {float(self.aspect):.3g} times as wide as high and are made square")
         if self.interlaced:
             out.append("frames are interlaced, which smears what moves; better deinterlace first (ffmpeg -vf bwdif)")
+        if self.hdr:
+            out.append("the video is HDR10 (PQ); its brightness is brought to that of ordinary video")
         return tuple(out)
 
 
+_SAME_SHAPE = 0.01
+"""Width by height may differ so much where pictures of a stream come in other sizes."""
+_PQ = 16
+"""FFmpeg's number of the transfer function of SMPTE ST 2084."""
+_WHITE_NITS = 203.0
+"""Diffuse white of HDR video (ITU-R BT.2408); what is brighter is white."""
+
+
+def _pq_to_srgb() -> NDArray[np.uint8]:
+    """The usual code (IEC 61966-2-1) of each value of ST 2084, both of 8 bits. Shape (256,)."""
+    v = np.linspace(0.0, 1.0, 256) ** (1.0 / 78.84375)
+    nits = 10000.0 * (np.maximum(v - 0.8359375, 0.0) / (18.8515625 - 18.6875 * v)) ** (1.0 / 0.1593017578125)
+    light = np.minimum(nits / _WHITE_NITS, 1.0)
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255.0 * code), np.uint8)
+
+
+_PQ_TO_SRGB = _pq_to_srgb()
 _LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 """Formats whose first plane is the picture in grey, one byte a pixel."""
 

@@ -62,7 +62,7 @@ class Rig:
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorted colour. Shape (H, W, 3). Raises `FrameError` for another size than the first frame's."""
         if image.shape[:2] != self.stored_size:
-            raise FrameError(f"colour is {_size(image.shape)}, the first frame {_size(self.stored_size)}")
+            raise FrameError(f"colour is {_size(image.shape)}, most frames {_size(self.stored_size)}")
         if self.color_size != self.stored_size:
             image = np.asarray(cv2.resize(image, self.color_size[::-1], interpolation=cv2.INTER_AREA))
         return self.straight(image)
@@ -74,7 +74,7 @@ class Rig:
     def depth(self, raw: NDArray[Any]) -> NDArray[np.float32]:
         """Metric depth on the pixels of `camera`. Shape (H, W). Raises `FrameError` for another size."""
         if raw.shape != self.depth_size:
-            raise FrameError(f"depth is {_size(raw.shape)}, the first frame {_size(self.depth_size or (0, 0))}")
+            raise FrameError(f"depth is {_size(raw.shape)}, most frames {_size(self.depth_size or (0, 0))}")
         depth = clean_depth(raw, self.depth_scale, self.max_depth_m)
         if self.registration is not None:
             depth = self.registration(depth)

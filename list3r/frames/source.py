@@ -24,6 +24,7 @@ FOLDERS: dict[str, Callable[[Path, SourceOptions], Layout | None]] = {
 """Readers of folders, the most particular first: the layout of a folder, or None for one of another kind."""
 
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
+_OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 _WANTED = (
     "give a video file, or a folder in 7-Scenes (frame-000000.color.png), TUM RGB-D (rgb.txt) or Replica "
     "(results/frame000000.jpg) layout, or of images"
@@ -74,8 +75,20 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     videos = sorted(p.name for p in root.iterdir() if p.suffix.lower() in _VIDEO_ENDINGS)
     if videos:
         raise SourceError(f"{root} is a folder with the video {videos[0]} in it; give the video: {root / videos[0]}")
+    if pictures := _pictures_to_convert(root):
+        raise SourceError(
+            f"{root} holds pictures like {pictures}, which cannot be read here; convert them to JPEG or PNG"
+        )
+    inside = next((p for p in sorted(root.iterdir()) if p.is_dir() and images.find(p, options)), None)
+    if inside is not None:
+        raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
     said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
     raise SourceError(f"{root} has {said}; {_WANTED}")
+
+
+def _pictures_to_convert(root: Path) -> str | None:
+    """A picture in the folder of a kind that cannot be read, None where there is none."""
+    return next((p.name for p in sorted(root.iterdir()) if p.suffix.lower() in _OTHER_PICTURES), None)
 
 
 def _open_file(path: Path, options: SourceOptions) -> FrameSource:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -18,7 +19,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.picture import Upright, small_gray
 from list3r.frames.rig import Rig, build_rig
 from list3r.frames.selection import select, sharpness
-from list3r.frames.stamps import list_stamps, packets, picture_stream
+from list3r.frames.stamps import list_stamps, open_container, packets, picture_stream
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
 _MEASURED_PX, _THUMBNAIL_PX, _LOOKED_AT_PX = 320, 160, 640
@@ -117,23 +118,24 @@ class VideoSource:
 
     def _decode_from(self, stamp: int | None, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame]]:
         """Frame numbers and pictures from the key frame at a stamp, or from the beginning."""
-        with av.open(str(self._path), options=self._stamps.words) as container:
+        with open_container(self._path, self._stamps.words) as container:
             stream = picture_stream(container)
             assert stream is not None
             if threads:
                 stream.thread_type = "AUTO"
-            if stamp is not None:
-                container.seek(stamp, stream=stream, backward=True)
-            count = 0
+            if stamp is not None and not _sought(container, stream, stamp):
+                return
+            count, last = 0, -1
             for packet in packets(container, stream):
                 try:
                     images = packet.decode()
                 except av.FFmpegError:
                     continue
                 for image in images:
-                    number = self._stamps.number(image, count)
+                    number = self._stamps.number(image, count, last)
                     count += 1
                     if number is not None:
+                        last = number
                         yield number, image
 
     def _time_s(self, number: int) -> float:
@@ -176,6 +178,15 @@ class VideoSource:
             image_size=rig.color_size,
             camera_guess=None if guess is None else centred_camera(guess, rig),
         )
+
+
+def _sought(container: Any, stream: Any, stamp: int) -> bool:
+    """Whether a file could be sent to a key frame."""
+    try:
+        container.seek(stamp, stream=stream, backward=True)
+    except av.FFmpegError:
+        return False
+    return True
 
 
 def _nothing(starts: NDArray[np.int64]) -> tuple[int, av.VideoFrame | None]:
