@@ -26,6 +26,7 @@ from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
+from list3r.models.device import memory_said
 from list3r.reconstruction.base import Reconstruction, Reconstructor
 from list3r.reconstruction.keyframe_record import KeyframeSettings, frame_samples, make_keyframes
 from list3r.reconstruction.learned import make_detector
@@ -175,7 +176,8 @@ def _described(
 ) -> ChunkResult:
     """What is found in a reconstruction, and what is kept of it."""
     named, tracker = _instance_models(task.settings)
-    library = build_library(frames, reconstruction, task.settings.instances, discoverer or named, tracker)
+    with memory_said("what finds and follows things"):
+        library = build_library(frames, reconstruction, task.settings.instances, discoverer or named, tracker)
     clock.mark("instances")
     keep, how = task.settings.keep_pictures, _keyframe_settings(task.settings)
     keyframes = make_keyframes(frames, reconstruction, keep, how)

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from list3r.association.joint_rgbd import RgbdJointReconstructor
 from list3r.calibration_stage import camera_key, with_camera
-from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_parts
+from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks
 from list3r.frames.cuts import find_cuts
@@ -27,6 +26,7 @@ from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import Selection
 from list3r.reconstruction.registry import MODELS, entry
+from list3r.window_stage import joint_windows
 from list3r.workers import OrderedPool, default_workers
 
 Progress = Callable[[int, int], None]
@@ -118,13 +118,13 @@ def add_chunks(
     if not plan.tasks:
         return
     first, session, count = plan.tasks[0], plan.session, job.info.frame_count
-    joint = RgbdJointReconstructor(store, {session: first.options}, joint_model(first))
     debug_dir = None if first.debug_dir is None else Path(first.debug_dir)
     bad = {index for s, index, _ in store.bad_frames() if s == session}
     if progress is not None:
         progress(len(store.frames(session)), count)
     known = {c.index for c in store.chunks(session)}
     pool = OrderedPool(process_parts, min(job.workers or usual_workers(job.settings), len(plan.tasks)))
+    joint = joint_windows(store, session, first, pool)
     try:
         with threadpool_limits(1):
             for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):

@@ -20,6 +20,8 @@ from list3r.memory.errors import List3rError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Question = TypeVar("Question")
+Answer = TypeVar("Answer")
 
 DEFAULT_LIMIT = 4
 """Processes started unless more are asked for; each holds one chunk of frames (about 0.4 GB at 640x480)."""
@@ -29,6 +31,11 @@ def default_workers() -> int:
     """As many processes as there are cores to run on, at most `DEFAULT_LIMIT`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     return max(1, min(cores, DEFAULT_LIMIT))
+
+
+_ENDED = (
+    "a worker process was ended from outside, most likely for want of memory; go on with --resume and fewer --workers"
+)
 
 
 class OrderedPool(Generic[Task, Result]):
@@ -55,10 +62,16 @@ class OrderedPool(Generic[Task, Result]):
             while waiting:
                 yield waiting.popleft().result()
         except BrokenProcessPool as error:
-            raise List3rError(
-                "a worker process was ended from outside, most likely for want of memory; "
-                "go on with --resume and fewer --workers"
-            ) from error
+            raise List3rError(_ENDED) from error
+
+    def ask(self, work: Callable[[Question], Answer], question: Question) -> Answer:
+        """What another function makes of its argument, in one of the processes, after the tasks that wait already."""
+        with _no_main_module():
+            coming = self._executor.submit(work, question)
+        try:
+            return coming.result()
+        except BrokenProcessPool as error:
+            raise List3rError(_ENDED) from error
 
     def stop(self) -> None:
         """End the processes at once."""

@@ -47,6 +47,7 @@ from list3r.models.choice import check_allowed, parse_weights, pinned_weights
 from list3r.models.device import Gpu
 from list3r.models.licences import PROFILES, choose_weights, objection, terms
 from list3r.models.presets import Selection, obstacle, select
+from list3r.models.upstream import load_upstream, upstream_class
 from list3r.reconstruction.registry import MODELS
 from list3r.session_stage import prepare, with_weights
 from tests import neural_scenes
@@ -387,3 +388,39 @@ def test_unknown_names_list_the_known_ones() -> None:
     with pytest.raises(OptionError, match=r"choose one of .*pi3"):
         cards_named("pi4")
     assert {c.part for c in cards_named("sam2")} == {"discovery", "tracking"}
+
+
+def test_memory_that_runs_out_is_said_in_one_line() -> None:
+    from list3r.models.device import memory_said
+
+    with pytest.raises(OptionError, match=r"^the tracker does not fit into the memory; .*--device cpu$"):
+        with memory_said("the tracker"):
+            raise torch.OutOfMemoryError("CUDA out of memory")
+    with pytest.raises(ValueError, match="other"), memory_said("the tracker"):
+        raise ValueError("other")
+
+
+def test_memory_is_that_of_the_weights() -> None:
+    card = find_card("da3", "geometry")
+    assert card is not None and card.memory is not None
+    giant, base = (card.memory_with(f"depth-anything/{name}@{'0' * 40}") for name in ("DA3-GIANT-1.1", "DA3-BASE"))
+    assert giant == card.memory_with("a-folder") == card.memory
+    assert base is not None and base == card.memory_with(None) and base.fixed_mb < card.memory.fixed_mb / 2
+
+
+def test_a_package_that_cannot_be_imported_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_package.py").write_text("print('hello')\nraise RuntimeError('operator does not exist')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    card = find_card("vggt", "geometry")
+    assert card is not None
+    with pytest.raises(OptionError, match=r"vggt needs broken_package, which cannot be imported here: operator does"):
+        upstream_class(card, "broken_package", "VGGT")
+
+
+def test_the_one_checkpoint_of_an_older_folder_is_read(tmp_path: Path) -> None:
+    torch.save(torch.nn.Linear(40, 40).state_dict(), tmp_path / "weights.pt")
+    made = load_upstream(lambda: torch.nn.Linear(40, 40), tmp_path, torch.device("cpu"))
+    assert torch.equal(made.weight, torch.load(tmp_path / "weights.pt", weights_only=True)["weight"])
+    torch.save({"x": torch.zeros(400)}, tmp_path / "more.pt")
+    with pytest.raises(OptionError, match="holds 2 checkpoints"):
+        load_upstream(lambda: torch.nn.Linear(40, 40), tmp_path, torch.device("cpu"))

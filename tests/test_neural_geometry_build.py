@@ -11,16 +11,18 @@ import pytest
 
 import list3r
 from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk
+from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk, process_parts
 from list3r.cli import model_options
 from list3r.cli.app import run
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.records import Session
 from list3r.models.device import Gpu
+from list3r.window_stage import joint_windows
+from list3r.workers import OrderedPool
 from tests import neural_models, neural_scenes
 
 
@@ -168,12 +170,26 @@ def test_windows_of_two_places_are_made_by_the_chunks_own_network(
     task = ChunkTask(str(pictures), SourceOptions(), ChunkSpan(0, 0, 12), settings)
 
     class Sessions:
-        def sessions(self) -> list[Session]:
-            return [Session(1, str(pictures), "", {}, 12, "complete")]
+        def __init__(self, source: Path) -> None:
+            self._source = source
 
-    joint = RgbdJointReconstructor(Sessions(), {1: SourceOptions()}, joint_model(task))
+        def sessions(self) -> list[Session]:
+            return [Session(1, str(self._source), "", {}, 12, "complete")]
+
+    joint = RgbdJointReconstructor(Sessions(pictures), {1: SourceOptions()}, joint_model(task))
     made = joint(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
     assert made is not None and made.scale_kind == "relative"
+    pool = OrderedPool(process_parts, 1)
+    try:
+        there = joint_windows(Sessions(pictures), 1, task, pool)(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
+        with pytest.raises(SourceError):
+            joint_windows(Sessions(tmp_path / "gone"), 1, task, pool)(1, [0, 1], 1, [8, 9])
+    finally:
+        pool.stop()
+    assert there is not None
+    for one, other in ((made.u, there.u), (made.v, there.v)):
+        np.testing.assert_array_equal(one.camera_frames, other.camera_frames)
+        np.testing.assert_allclose(one.points, other.points, rtol=1e-5)
     assert set(made.u.camera_frames) == {0, 1, 2, 3} and set(made.v.camera_frames) == {8, 9, 10, 11}
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("transformers")
 
@@ -23,6 +24,7 @@ from list3r.instances.video_tracker import VideoTracker, VideoTrackerSettings, _
 from list3r.instances.views import chunk_views
 from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
+from list3r.models import pretrained
 from list3r.models.images import InputShape, network_input, to_picture
 from tests import neural_models
 from tests.test_instances_library import SCENE, walk
@@ -75,6 +77,49 @@ def test_tracker_follows_prompts_through_the_chunk(model: str, checkpoints: dict
     assert library.feature_space == settings.feature_space
     again = build_library(frames, reconstruction, settings, GeometricDiscoverer(settings), tracker)
     assert [len(i.track.frames) for i in library.instances] == [len(i.track.frames) for i in again.instances]
+
+
+@pytest.fixture
+def half_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU."""
+    monkeypatch.setattr(pretrained, "network_dtype", lambda device: torch.bfloat16)
+
+
+@pytest.mark.parametrize("name", sorted(neural_models._MAKERS))
+def test_every_network_runs_in_half_precision(
+    name: str, half_precision: None, checkpoints: dict[str, Path], chunk
+) -> None:
+    part, model = name.split("/")
+    frames, reconstruction = chunk
+    color = frames[3].color
+    if part == "features":
+        made = list(Appearance(model, checkpoints[name], "cpu").tokens(color))
+    elif part == "discovery":
+        maker = SamMasks if model.startswith("sam") else QuerySegmenter
+        extra = {"sam": SAM_ALL} if maker is SamMasks else {"candidates": EVERYTHING}
+        found = maker(model, checkpoints[name], "cpu", **extra).look(color)
+        assert len(found.score) > 0
+        made = [found.probability, found.score, found.features]
+    else:
+        tracker = VideoTracker(model, checkpoints[name], "cpu", InstanceSettings(anchor_step=5))
+        proposals = [GeometricDiscoverer(tracker._settings)(frames, reconstruction, p) for p in (0, 5)]
+        things = _Things(proposals, chunk_views(frames, reconstruction, tracker._settings), tracker._tracker)
+        swept = tracker._sweep(frames, range(8), things, forwards=True)
+        made = [logits for _, masks in swept for logits in masks.values()]
+        assert len(made) >= 8
+    assert all(np.isfinite(array).all() for array in made)
+
+
+@pytest.mark.parametrize("model", ["eomt", "mask2former", "sam2"])
+def test_a_picture_without_things_has_none(model: str, checkpoints: dict[str, Path], chunk) -> None:
+    nothing = CandidateSettings(min_score=1.1)
+    if model == "sam2":
+        network = SamMasks(model, checkpoints["discovery/sam2"], "cpu", sam=SamMaskSettings(4, min_quality=1.1))
+    else:
+        network = QuerySegmenter(model, checkpoints[f"discovery/{model}"], "cpu", candidates=nothing)
+    frames, reconstruction = chunk
+    found = network(frames, reconstruction, 0)
+    assert len(found.score) == 0 and found.labels.max() == 0
 
 
 def test_the_tracker_state_stays_small(checkpoints: dict[str, Path], chunk) -> None:

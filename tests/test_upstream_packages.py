@@ -109,6 +109,10 @@ class Here:
     def __init__(self, work: Callable[[Any], Any], workers: int) -> None:
         self.map = functools.partial(map, work)
 
+    def ask(self, work: Callable[[Any], Any], question: Any) -> Any:
+        """What a function makes of its argument."""
+        return work(question)
+
     def stop(self) -> None:
         """Nothing runs."""
 

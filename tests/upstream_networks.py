@@ -104,11 +104,14 @@ def _teach_pi3(model: Any, truth: Truth) -> None:
         slopes, z = truth.slopes().expand(*truth.depth.shape, 2), truth.z().log()[..., None]
         if isinstance(out, torch.Tensor):
             return torch.cat([slopes, z], dim=-1)
+        slopes, z = (truth.next(name, t, len(out[0])) for name, t in (("slopes", slopes), ("z", z)))
         return [slopes.permute(0, 3, 1, 2), z.permute(0, 3, 1, 2)]
 
     def confidence(out: Any) -> Any:
-        said = truth.logit()
-        return said[..., None] if isinstance(out, torch.Tensor) else [said[:, None]]
+        said = truth.logit()[..., None]
+        if isinstance(out, torch.Tensor):
+            return said
+        return [truth.next("confidence", said, len(out[0])).permute(0, 3, 1, 2)]
 
     _hook(model.point_head, points)
     _hook(model.conf_head, confidence)
@@ -202,7 +205,7 @@ def cut_down(name: str, patch: pytest.MonkeyPatch) -> dict[str, Any]:
     if name in ("pi3", "pi3x"):
         module = import_module(f"pi3.models.{name}")
         _shallow(patch, "pi3.models.dinov2.models.vision_transformer")
-        patch.setattr(module, "range", lambda count: range(min(count, 2)), raising=False)
+        patch.setattr(module, "range", _two_layers, raising=False)
         for decoder in ("TransformerDecoder", "ContextOnlyTransformerDecoder"):
             if hasattr(module, decoder):
                 patch.setattr(module, decoder, functools.partial(getattr(module, decoder), depth=1))
@@ -216,6 +219,11 @@ def cut_down(name: str, patch: pytest.MonkeyPatch) -> dict[str, Any]:
         patch.setattr(module, "DPTHead", functools.partial(module.DPTHead, **layers))
         return {"embed_dim": 64}
     return {"model_name": "da3-small"} if name == "da3" else _mapanything()
+
+
+def _two_layers(*ends: int) -> range:
+    """`range`, for loops that make layers."""
+    return range(min(ends[0], 2)) if len(ends) == 1 else range(*ends)
 
 
 def _shallow(patch: pytest.MonkeyPatch, module: str, **sizes: int) -> None:

@@ -247,22 +247,23 @@ def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> Ch
         said = read_manifest(Path(settings.weights).expanduser())
         length, overlap = said.length, overlap or said.overlap
     elif length is None and card is not None:
-        length = _fitting(card, settings.device)
+        length = _fitting(card, settings.weights, settings.device)
     length = length or USUAL_CHUNK
     return ChunkSettings(length, overlap or max(1, min(30, round(0.3 * length))))
 
 
-def _fitting(card: ModelCard, device: str) -> int:
+def _fitting(card: ModelCard, weights: str | None, device: str) -> int:
     """Frames that the GPU holds at once by published figures, within bounds; the usual ones without a GPU."""
     from list3r.memory.errors import OptionError
     from list3r.models.device import find_gpu, pictures_that_fit
 
     gpu = find_gpu(device)
-    if gpu is None or card.memory is None:
+    figures = card.memory_with(weights)
+    if gpu is None or figures is None:
         return USUAL_CHUNK
-    fit = pictures_that_fit(gpu.free_mb, card.memory, card.pixels)
+    fit = pictures_that_fit(gpu.free_mb, figures, card.pixels)
     if fit < SHORTEST_CHUNK:
-        needed = card.memory.needed_mb(SHORTEST_CHUNK, card.pixels) / 1024
+        needed = figures.needed_mb(SHORTEST_CHUNK, card.pixels) / 1024
         raise OptionError(
             f"{card.name} needs about {needed:.1f} GB for {SHORTEST_CHUNK} frames and {gpu.name} has "
             f"{gpu.free_mb / 1024:.1f} GB free; free it, use another model, --device cpu, or give --chunk to try"

@@ -42,7 +42,8 @@ class QuerySegmenter:
         candidates: CandidateSettings | None = None,
     ) -> None:
         """`model` is eomt or mask2former, `folder` holds its configuration and weights. Raises `OptionError`."""
-        self._network, self._device = load_named(CLASSES, "discovery", model, folder, device)
+        exact = model == "mask2former"  # its deformable attention gives NaN in bfloat16
+        self._network, self._device = load_named(CLASSES, "discovery", model, folder, device, exact=exact)
         self._settings = settings or InstanceSettings()
         self._candidates = candidates or CandidateSettings()
         config = self._network.config

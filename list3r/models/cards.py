@@ -42,6 +42,20 @@ OTHER = Licence("other (see its repository)", "custom")
 
 
 @dataclass(frozen=True)
+class MemoryFigures:
+    """Published GPU memory: fixed + per_megapixel for each million pixels of all pictures at the network's size."""
+
+    fixed_mb: float
+    per_megapixel_mb: float
+    source: str
+    """Who measured it, on what."""
+
+    def needed_mb(self, pictures: int, pixels: int) -> float:
+        """Memory of one pass over so many pictures of `pixels` pixels."""
+        return self.fixed_mb + self.per_megapixel_mb * pictures * pixels / 1e6
+
+
+@dataclass(frozen=True)
 class Weights:
     """Weights of a model on the hub."""
 
@@ -54,25 +68,13 @@ class Weights:
     """Commit of the repository, or `main` where none is known."""
     files: tuple[str, ...] = ("*.json", "*.safetensors", "*.txt", "*.model")
     """Patterns of the files that are needed."""
+    memory: MemoryFigures | None = None
+    """Where these need another than the card says."""
 
     @property
     def pinned(self) -> bool:
         """Whether the revision is one commit."""
         return self.revision != UNPINNED
-
-
-@dataclass(frozen=True)
-class MemoryFigures:
-    """Published GPU memory: fixed + per_megapixel for each million pixels of all pictures at the network's size."""
-
-    fixed_mb: float
-    per_megapixel_mb: float
-    source: str
-    """Who measured it, on what."""
-
-    def needed_mb(self, pictures: int, pixels: int) -> float:
-        """Memory of one pass over so many pictures of `pixels` pixels."""
-        return self.fixed_mb + self.per_megapixel_mb * pictures * pixels / 1e6
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,14 @@ class ModelCard:
 
     def __post_init__(self) -> None:
         assert self.part in PARTS
+
+    def memory_with(self, weights: str | None) -> MemoryFigures | None:
+        """Published memory with weights named `owner/name` or `owner/name@revision`; None stands for the first ones."""
+        if weights is None:
+            known = self.weights[0] if self.weights else None
+        else:
+            known = find_weights(self, weights.partition("@")[0])
+        return self.memory if known is None or known.memory is None else known.memory
 
     @property
     def commercial(self) -> bool:
@@ -127,6 +137,8 @@ def _hub(
     return ModelCard(name, part, APACHE, weights, _TRANSFORMERS, _MODELS_EXTRA, about=about)
 
 
+DA3_SMALLER = MemoryFigures(2500, 600, "weights counted (0.14 G parameters); the rest as the giant's")
+
 CARDS: tuple[ModelCard, ...] = (
     ModelCard(
         "pi3",
@@ -146,7 +158,7 @@ CARDS: tuple[ModelCard, ...] = (
         (Weights("yyfz233/Pi3X", CC_BY_NC, revision="bb1deea4d7423de5b30691739cb451a3f57dc1d5"),),
         ("pi3",),
         f"{_GIT}/yyfz/Pi3",
-        MemoryFigures(3658, 212, "taken from pi3"),
+        MemoryFigures(5190, 212, "its authors' capacity table, A800, bfloat16, and the weights for what can be told"),
         255_000,
         "smoother than pi3, takes known intrinsics and poses",
     ),
@@ -160,7 +172,9 @@ CARDS: tuple[ModelCard, ...] = (
         ),
         ("vggt",),
         f"{_GIT}/facebookresearch/vggt",
-        MemoryFigures(1690, 1075, "its README, H100: 1.9 GB at 1 frame, 40.6 GB at 200"),
+        MemoryFigures(
+            9200, 1075, "its README, H100: 0.19 GB a frame before the heads; all weights and one head counted"
+        ),
         518 * 392,
         "first frame is the frame of reference",
     ),
@@ -174,7 +188,7 @@ CARDS: tuple[ModelCard, ...] = (
         ),
         ("mapanything",),
         f"{_GIT}/facebookresearch/map-anything",
-        MemoryFigures(3000, 345, "its README: 2,000 views in 140 GB, memory-efficient mode"),
+        MemoryFigures(9800, 330, "its README: 2,000 views in 140 GB, memory-efficient mode; weights and head counted"),
         518 * 392,
         "takes known intrinsics",
     ),
@@ -183,8 +197,13 @@ CARDS: tuple[ModelCard, ...] = (
         "geometry",
         APACHE,
         (
-            Weights("depth-anything/DA3-BASE", APACHE, revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e"),
-            Weights("depth-anything/DA3-SMALL", APACHE),
+            Weights(
+                "depth-anything/DA3-BASE",
+                APACHE,
+                revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
+                memory=DA3_SMALLER,
+            ),
+            Weights("depth-anything/DA3-SMALL", APACHE, memory=DA3_SMALLER),
             Weights("depth-anything/DA3-LARGE-1.1", CC_BY_NC),
             Weights("depth-anything/DA3-GIANT-1.1", CC_BY_NC),
             Weights("depth-anything/DA3NESTED-GIANT-LARGE-1.1", CC_BY_NC),

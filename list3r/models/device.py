@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+from list3r.memory.errors import OptionError
 from list3r.models.cards import MemoryFigures
 
 USABLE_SHARE = 0.9
@@ -27,6 +31,7 @@ def find_gpu(device: str = "auto") -> Gpu | None:
         return None
     index = torch.device("cuda" if device == "auto" else device).index or 0
     free, total = torch.cuda.mem_get_info(index)
+    free += torch.cuda.memory_reserved(index) - torch.cuda.memory_allocated(index)  # what this process keeps unused
     return Gpu(torch.cuda.get_device_name(index), total / 2**20, free / 2**20)
 
 
@@ -38,6 +43,17 @@ def is_out_of_memory(error: BaseException) -> bool:
         return True
     text = str(error).lower()
     return isinstance(error, RuntimeError) and ("out of memory" in text or "can't allocate memory" in text)
+
+
+@contextmanager
+def memory_said(what: str) -> Iterator[None]:
+    """Turn memory that runs out into an `OptionError` that says for what it was needed."""
+    try:
+        yield
+    except Exception as error:
+        if "torch" not in sys.modules or not is_out_of_memory(error):
+            raise
+        raise OptionError(f"{what} does not fit into the memory; free it, use another model, or --device cpu") from None
 
 
 def pictures_that_fit(free_mb: float, figures: MemoryFigures, pixels: int) -> int:

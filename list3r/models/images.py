@@ -74,4 +74,6 @@ def to_picture(maps: torch.Tensor, shape: InputShape, height: int, width: int) -
     rows = max(1, round(maps.shape[-2] * inner[0] / shape.height))
     columns = max(1, round(maps.shape[-1] * inner[1] / shape.width))
     cut = maps[None, :, :rows, :columns].float()
+    if len(maps) == 0:
+        return cut.new_zeros((0, height, width))
     return functional.interpolate(cut, size=(height, width), mode="bilinear", align_corners=False)[0]

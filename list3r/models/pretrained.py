@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from list3r.memory.errors import OptionError
 from list3r.models.cache import CONFIG, check_weights
+from list3r.models.device import memory_said
 from list3r.models.upstream import first_line
 
 if TYPE_CHECKING:
@@ -30,19 +31,30 @@ def pick_device(name: str) -> torch.device:
     return device
 
 
-def load_named(kinds: Mapping[str, str], option: str, name: str, folder: Path, device: str) -> tuple[Any, torch.device]:
+def load_named(
+    kinds: Mapping[str, str], option: str, name: str, folder: Path, device: str, *, exact: bool = False
+) -> tuple[Any, torch.device]:
     """The network that a model's name stands for, by its class, and the device that it lies on.
 
+    `exact` keeps it in float32 everywhere, for networks that half precision breaks.
     Raises `OptionError` as `pick_device` and `load_pretrained` do, and for a name that is none of the kinds.
     """
     if name not in kinds:
         raise OptionError(f"--{option} {name} is not known; choose one of {', '.join(kinds)}")
     chosen = pick_device(device)
-    return load_pretrained(kinds[name], folder, chosen), chosen
+    return load_pretrained(kinds[name], folder, chosen, exact=exact), chosen
 
 
-def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
-    """The network of a folder with `config.json` and weights, in evaluation mode, float32 on a CPU, bfloat16 else.
+def network_dtype(device: torch.device) -> torch.dtype:
+    """bfloat16 on a GPU that computes in it (compute capability 8 and up), float32 elsewhere."""
+    import torch
+
+    new = device.type == "cuda" and torch.cuda.get_device_capability(device)[0] >= 8
+    return torch.bfloat16 if new else torch.float32
+
+
+def load_pretrained(class_name: str, folder: Path, device: torch.device, *, exact: bool = False) -> Any:
+    """The network of a folder with `config.json` and weights, in evaluation mode, of `network_dtype` or float32.
 
     Raises `OptionError` when the package is missing, the folder is not such a folder, or the weights are of another
     network (a missing or an unexpected layer, another shape).
@@ -52,7 +64,7 @@ def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
     import torch
     from transformers.utils import logging
 
-    dtype = torch.float32 if device.type == "cpu" else torch.bfloat16
+    dtype = torch.float32 if exact else network_dtype(device)
     level = logging.get_verbosity()
     logging.set_verbosity_error()  # type: ignore[no-untyped-call]
     try:
@@ -67,7 +79,8 @@ def load_pretrained(class_name: str, folder: Path, device: torch.device) -> Any:
             f"{folder} holds other weights than {class_name} needs: {len(wrong)} of its layers are missing or have "
             f"another shape, first {wrong[0]}"
         )
-    return model.to(device).eval()
+    with memory_said(f"the network {folder}"):
+        return model.to(device).eval()
 
 
 def check_folder(folder: Path) -> None:

@@ -111,7 +111,7 @@ class FeedforwardReconstructor:
         if self._budget is None:
             gpu = find_gpu(str(self._device))
             free = None if gpu is None else gpu.free_mb
-            self._budget = MemoryBudget(self._network.card.memory, free, height * width)
+            self._budget = MemoryBudget(self._network.card.memory_with(self.weights), free, height * width)
         if self._model is None:
             self._model = self._network.load(locate(self.weights), self._device)
         K = _scaled(camera, height, width) if self._options.camera_known else None

@@ -2,10 +2,12 @@
 
 Told intrinsics count pixels from the picture's corner (the first centre is at a half). `decode` makes a mask over all
 pairs of tokens of all pictures, 9 GB for 100 of them, for poses that nobody gave; so it is not asked to look for poses.
+Its heads take 64 pictures at once, which can need more memory than all that went before.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,16 +21,22 @@ if TYPE_CHECKING:
     import torch
 
 
+AT_ONCE = 8
+"""Pictures that go through its heads together."""
+
+
 def make(options: ModelOptions) -> FeedforwardReconstructor:
     """The model with the weights that the options name."""
     return FeedforwardReconstructor(NETWORK, options)
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """The network, whose decoder looks for no poses."""
+    """The network, whose decoder looks for no poses and whose heads take a few pictures at a time."""
     model = load_upstream(cls, path, device)
     if hasattr(model, "decode"):
         _decode_without_poses(model)
+    if hasattr(model, "_chunked_conv_head"):
+        model._chunked_conv_head = partial(model._chunked_conv_head, chunk_size=AT_ONCE)
     return model
 
 
