@@ -217,6 +217,15 @@ def test_a_picture_survives_the_way_to_the_network_and_back() -> None:
     assert np.abs(back - color[..., 0] / 255.0).mean() < 0.02
 
 
+def test_a_picture_is_filled_up_as_its_network_was_trained() -> None:
+    color = np.full((30, 40, 3), 255, np.uint8)
+    for black in (False, True):
+        shape = InputShape(40, 40, keep_aspect=True, black=black)
+        picture = network_input(color, shape, torch.device("cpu"), torch.float32)[0]
+        below = picture[:, 35:].mean(dim=(1, 2)) * torch.tensor(shape.std) + torch.tensor(shape.mean)
+        torch.testing.assert_close(below, torch.zeros(3) if black else torch.tensor(shape.mean))
+
+
 def test_better_masks_take_the_pixels_and_redundant_ones_go(chunk) -> None:
     frames, reconstruction = chunk
     views = chunk_views(frames, reconstruction, InstanceSettings())

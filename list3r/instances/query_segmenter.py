@@ -47,8 +47,8 @@ class QuerySegmenter:
         self._settings = settings or InstanceSettings()
         self._candidates = candidates or CandidateSettings()
         config = self._network.config
-        height, width = (config.image_size, config.image_size) if model == "eomt" else MASK2FORMER_SIZE
-        self._shape = InputShape(height, width, keep_aspect=True)
+        height, width = _sides(config.image_size) if model == "eomt" else MASK2FORMER_SIZE
+        self._shape = InputShape(height, width, keep_aspect=True, black=model == "eomt")
         self._names: dict[int, str] = {int(k): str(v) for k, v in config.id2label.items()}
         self._queries = int(config.num_queries)
         width = config.hidden_size if model == "eomt" else config.hidden_dim
@@ -86,3 +86,8 @@ class QuerySegmenter:
             return states[0] if states.shape[0] == 1 else states[:, 0]
         last: torch.Tensor = out.last_hidden_state
         return last[0, : self._queries]
+
+
+def _sides(size: Any) -> tuple[int, int]:
+    """Height and width of a size as configurations have it."""
+    return (int(size), int(size)) if isinstance(size, int) else (int(size[0]), int(size[1]))

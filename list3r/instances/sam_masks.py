@@ -104,7 +104,7 @@ class SamMasks:
         found_logits, found_quality = [], []
         step, done = self._sam.points_at_once, 0
         while done < len(grid):
-            points = grid[done : done + step].to(self._network.dtype)[None, :, None, :]
+            points = grid[done : done + step][None, :, None, :]  # whole pixels are lost in half precision
             try:
                 out = self._network(image_embeddings=list(embeddings), input_points=points, multimask_output=True)
             except torch.OutOfMemoryError:

@@ -26,6 +26,8 @@ class InputShape:
     """Size of the network's input, px."""
     keep_aspect: bool = False
     """Scale by one factor, fill up at the right and at the bottom; else stretch both sides."""
+    black: bool = False
+    """Fill up with black instead of the mean colour."""
     mean: tuple[float, float, float] = IMAGENET_MEAN
     std: tuple[float, float, float] = IMAGENET_STD
 
@@ -61,9 +63,11 @@ def network_input(
     inner = shape.inner(*color.shape[:2])
     if inner != tuple(color.shape[:2]):
         picture = functional.interpolate(picture, size=inner, mode="bilinear", align_corners=False, antialias=True)
-    picture = normalised(picture, shape.mean, shape.std)
     pad = (0, shape.width - inner[1], 0, shape.height - inner[0])
-    return functional.pad(picture, pad).to(dtype) if any(pad) else picture.to(dtype)
+    if any(pad) and shape.black:
+        picture = functional.pad(picture, pad)
+    picture = normalised(picture, shape.mean, shape.std)
+    return functional.pad(picture, pad).to(dtype) if any(pad) and not shape.black else picture.to(dtype)
 
 
 def to_picture(maps: torch.Tensor, shape: InputShape, height: int, width: int) -> torch.Tensor:

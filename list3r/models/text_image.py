@@ -53,7 +53,7 @@ class TextImageModel:
         import torch
 
         filled = {"padding": "max_length", "max_length": WORDS} if self._siglip else {"padding": True}
-        words = self._tokenizer([f"a photo of a {text}"], truncation=True, return_tensors="pt", **filled)
+        words = self._tokenizer([f"a photo of a {text}".lower()], truncation=True, return_tensors="pt", **filled)
         with torch.inference_mode():
             asked = {"input_ids": words["input_ids"].to(self._device)}
             if not self._siglip:
