@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,13 +151,17 @@ def test_chunks_are_as_long_as_the_gpu_holds(monkeypatch: pytest.MonkeyPatch) ->
 
     def length(free_mb: float, **given: object) -> ChunkSettings:
         monkeypatch.setattr(device, "find_gpu", lambda name="auto": Gpu("a GPU", free_mb, free_mb))
-        settings = BuildSettings(reconstruction=str(given.pop("name", "pi3")))
+        things: Any = given.pop("instance_weights", ())
+        settings = BuildSettings(reconstruction=str(given.pop("name", "pi3")), instance_weights=things)
         return model_options._cut(settings, given.get("chunk"), None)  # type: ignore[arg-type]
 
     assert length(80_000) == ChunkSettings(240, 30)
     assert length(8_000) == ChunkSettings(65, 20)
     assert length(80_000, name="vggt") == ChunkSettings(240, 30)
     assert length(24_000, name="vggt").length < 100
+    things = (("discovery/eomt", "x"), ("tracking/sam3", "y"))
+    assert length(8_000, instance_weights=things).length < length(8_000).length - 30
+    assert length(8_000, name="da3").length > 16, "its first weights are small ones"
     assert length(1_000, chunk=40) == ChunkSettings(40, 12)
     with pytest.raises(OptionError, match=r"pi3 needs about .* GB for 16 frames and a GPU has 3\.9 GB free"):
         length(4_000)

@@ -128,6 +128,9 @@ class CutWords:
 USUAL_CHUNK, LONGEST_CHUNK, SHORTEST_CHUNK = 100, 240, 16
 """Frames: the paper's; the most that a GPU is filled with, from where passes grow slow and no figure shows a gain; the
 fewest that make a chunk."""
+OTHER_NETWORK_MB = 1000
+"""Left free on a GPU for each network that finds, follows or describes things: the weights of the largest, half of a
+SAM 3, and what a picture takes."""
 
 
 def build_settings(
@@ -247,23 +250,24 @@ def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> Ch
         said = read_manifest(Path(settings.weights).expanduser())
         length, overlap = said.length, overlap or said.overlap
     elif length is None and card is not None:
-        length = _fitting(card, settings.weights, settings.device)
+        length = _fitting(card, settings)
     length = length or USUAL_CHUNK
     return ChunkSettings(length, overlap or max(1, min(30, round(0.3 * length))))
 
 
-def _fitting(card: ModelCard, weights: str | None, device: str) -> int:
+def _fitting(card: ModelCard, settings: BuildSettings) -> int:
     """Frames that the GPU holds at once by published figures, within bounds; the usual ones without a GPU."""
     from list3r.memory.errors import OptionError
     from list3r.models.device import find_gpu, pictures_that_fit
 
-    gpu = find_gpu(device)
-    figures = card.memory_with(weights)
+    gpu = find_gpu(settings.device)
+    figures = card.memory_with(settings.weights)
     if gpu is None or figures is None:
         return USUAL_CHUNK
-    fit = pictures_that_fit(gpu.free_mb, figures, card.pixels)
+    others_mb = OTHER_NETWORK_MB * len(settings.instance_weights)
+    fit = pictures_that_fit(gpu.free_mb - others_mb, figures, card.pixels)
     if fit < SHORTEST_CHUNK:
-        needed = figures.needed_mb(SHORTEST_CHUNK, card.pixels) / 1024
+        needed = (figures.needed_mb(SHORTEST_CHUNK, card.pixels) + others_mb) / 1024
         raise OptionError(
             f"{card.name} needs about {needed:.1f} GB for {SHORTEST_CHUNK} frames and {gpu.name} has "
             f"{gpu.free_mb / 1024:.1f} GB free; free it, use another model, --device cpu, or give --chunk to try"
