@@ -14,6 +14,8 @@ from list3r.instances.features import object_feature
 from list3r.instances.fusion import View
 from list3r.instances.segments import Segmentation, segment_cloud
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
+from list3r.instances.snapping import snap_things, without_segments
+from list3r.instances.things import least_size
 from list3r.instances.views import ChunkViews, chunk_views
 from list3r.reconstruction.base import Reconstruction
 
@@ -47,7 +49,8 @@ class GeometricDiscoverer:
         poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
         cut = segment_cloud(cloud, poses, views.unit, settings)
         if views.reconstruction.depth_noise is not None:
-            cut = above_noise(views, cloud, cut, settings.least_spread)
+            least = least_size(settings.thing_size_m * views.unit, cloud.voxel)
+            cut = above_noise(views, cloud, snap_things(views, cloud, cut, least), settings.least_spread)
         features = np.zeros((len(cut.segments), 64), np.float32)
         rgb = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8)
         for number in range(len(cut.segments)):
@@ -82,9 +85,7 @@ def above_noise(views: ChunkViews, cloud: Cloud, cut: Segmentation, least_spread
         if segment.kind == "thing" and len(mine) and len(points) > 2:
             second = float(np.linalg.eigvalsh(np.cov(points.T))[1])
             kept[number] = second >= (least_spread * float(np.median(mine))) ** 2
-    renumber = np.where(kept, np.cumsum(kept) - 1, 0).astype(np.int32)
-    segments = tuple(s for s, keep in zip(cut.segments, kept[1:], strict=True) if keep)
-    return Segmentation(renumber[cut.labels], segments, cut.up)
+    return without_segments(cut, kept[1:])
 
 
 def _doubts(views: ChunkViews, cloud: Cloud, cut: Segmentation) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

@@ -68,7 +68,12 @@ def _grow_into(scene: Scene, labels: Labels, free: NDArray[np.int64], taken: int
 
 def least_voxels(scene: Scene) -> int:
     """Voxels on the visible half of the smallest thing."""
-    return int(1.4 * (scene.settings.thing_size_m * scene.unit / scene.cloud.voxel) ** 2)
+    return least_size(scene.settings.thing_size_m * scene.unit, scene.cloud.voxel)
+
+
+def least_size(diameter: float, voxel: float) -> int:
+    """Voxels on the visible half of a thing of some diameter."""
+    return int(1.4 * (diameter / voxel) ** 2)
 
 
 def attach_parts(scene: Scene, surfaces: list[Surface], labels: Labels) -> Labels:
