@@ -25,6 +25,7 @@ from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.reprojection_edge import refine_loop
 from list3r.association.revisits import RevisitSettings, find_loops
 from list3r.association.session_ties import hold_back
+from list3r.association.surface_graph import place_by_surfaces
 from list3r.frames.base import Camera
 from list3r.instances.changed_places import add_changed_places
 from list3r.instances.loop_overlays import write_loop
@@ -241,6 +242,8 @@ def _straightened(
     bends: dict[int, Bend] = {}
     if len(rigid) < len(chunks):
         graph, bends = bend_chunks(store.frame_samples, graph, rigid, metric, nodes, settings)
+    if not metric and not rigid and all(_from_motion(store, k) for k in {c.session_id for c in chunks}):
+        graph, bends = place_by_surfaces(store.frame_samples, graph, bends)
     store.set_bends(bends)
     return graph
 

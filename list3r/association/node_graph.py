@@ -45,7 +45,7 @@ _STEPS = 10
 
 
 @dataclass(frozen=True)
-class _Pieces:
+class Pieces:
     """What the graph is made of."""
 
     nodes: dict[int, ChunkNodes]
@@ -72,7 +72,7 @@ def bend_chunks(
     believed = [e for e in graph.edges if e.u in known and e.v in known and (e.accepted or "trust" in e.scores)]
     if not chosen.enabled or not believed:
         return graph, {}
-    pieces = _pieces(read_samples, sorted(graph.S_graph_chunk), believed, rigid, chosen)
+    pieces = pieces_of(read_samples, sorted(graph.S_graph_chunk), believed, rigid, chosen)
     first, count = {}, 0
     for chunk, nodes in pieces.nodes.items():
         first[chunk], count = count, count + len(nodes.at)
@@ -82,13 +82,13 @@ def bend_chunks(
     return _settled(placed, pieces.nodes, first, graph, rigid)
 
 
-def _pieces(
+def pieces_of(
     read_samples: Callable[[int], FrameSamples],
     ids: Sequence[int],
     believed: Sequence[Edge],
     rigid: Collection[int],
     settings: NodeSettings,
-) -> _Pieces:
+) -> Pieces:
     """Nodes of all chunks and relations of adjacent ones, in one pass over the samples."""
     to = {e.v: e for e in believed if e.kind == "adjacent" and e.accepted}
     nodes: dict[int, ChunkNodes] = {}
@@ -107,11 +107,11 @@ def _pieces(
             there = before[1] if before is not None and before[0] == edge.u else _known_poses(read_samples(edge.u))
             relations.append((edge, relate_frames(there, samples, edge, nodes[edge.u])))
         before = (chunk, samples)
-    return _Pieces(nodes, relations)
+    return Pieces(nodes, relations)
 
 
 def _problem(
-    pieces: _Pieces,
+    pieces: Pieces,
     believed: Sequence[Edge],
     first: Mapping[int, int],
     count: int,
@@ -143,7 +143,7 @@ def _problem(
         if ties:
             tied.add((edge.u, edge.v))
     size = 6 if metric else 7
-    information = _inverse(np.array(covariances).reshape(-1, 7, 7)[:, :size, :size])
+    information = inverses(np.array(covariances).reshape(-1, 7, 7)[:, :size, :size])
     rest = [e for e in believed if e.kind != "adjacent" or (e.u, e.v) not in tied]
     for edge in rest:
         tie = _whole(edge, pieces.nodes)
@@ -180,22 +180,22 @@ def _settled(
     for chunk, mine in nodes.items():
         S = graph.S_graph_chunk[chunk]
         here = take(placed, np.arange(first[chunk], first[chunk] + len(mine.at)))
-        x = (_many(S.inverse(), len(mine.at)) @ here).log()
+        x = (repeated(S.inverse(), len(mine.at)) @ here).log()
         poses[chunk] = S @ Sim3.exp(np.asarray(mine.count @ x / mine.count.sum()))
         if len(mine.at) > 1 and chunk not in rigid:
-            bends[chunk] = Bend(mine.at, (_many(poses[chunk].inverse(), len(mine.at)) @ here).log())
+            bends[chunk] = Bend(mine.at, (repeated(poses[chunk].inverse(), len(mine.at)) @ here).log())
     back = {c: graph.S_graph_chunk[c] @ poses[c].inverse() for c in poses if graph.components[c] == c}
     moved = {c: back[graph.components[c]] @ S for c, S in poses.items()}
     return replace(graph, S_graph_chunk=moved), bends
 
 
-def _inverse(covariance: Array) -> Array:
+def inverses(covariance: Array) -> Array:
     """Inverses of symmetric matrices, symmetric. Shape (E, D, D)."""
     inverse = np.linalg.inv(covariance)
     return np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2.0)
 
 
-def _many(S: Sim3, count: int) -> Sim3:
+def repeated(S: Sim3, count: int) -> Sim3:
     """The same similarity many times over."""
     return Sim3(np.full(count, float(S.scale)), np.tile(S.rotation, (count, 1, 1)), np.tile(S.translation, (count, 1)))
 
