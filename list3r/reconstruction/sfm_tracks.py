@@ -4,6 +4,10 @@ frame where the corner was first seen, so that a track does not creep.
 On the way frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where
 nearly all corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in
 those too (a jerk) all tracks end and a new run of tracks begins.
+
+Pictures are first brought to one brightness where the camera changed it (`as_bright`). With an exposure that swings
+2.8-fold in half a second a corner of redkitchen then lives 21 frames, as with a constant one, and 7 to 10 without;
+brightness told by the ranks of grey values, or contrast by their spread, cost a quarter where nothing had changed.
 """
 
 from __future__ import annotations
@@ -42,6 +46,8 @@ class TrackSettings:
     """Farthest from its start that a corner may come out when it is followed back."""
     most_difference: float = 22.0
     """Largest mean difference of grey values between a corner and where it was first seen."""
+    least_brightening: float = 3.0
+    """Grey values that a picture has to be brighter or darker than another to be brought to its brightness first."""
     keyframe_flow: float = 0.05
     """A frame is a keyframe when half of the corners of the last one have moved so far, by the longer side."""
     keyframe_survival: float = 0.55
@@ -82,6 +88,58 @@ def follow_corners(grays: Sequence[Gray], settings: TrackSettings | None = None)
         else:
             follower.note(skipped, ahead[skipped])
     return follower.tracks()
+
+
+def as_bright(
+    old: Gray, new: Gray, least: float = 3.0, places: tuple[Floats, Floats] | None = None, samples: int = 512
+) -> Gray:
+    """`old` with the brightness and contrast of `new`, as a camera changes them between two frames; `old` itself where
+    they differ by less than `least` grey values.
+
+    Pixels that show the same are told by `places`, (N, 2) px in either; without, all pixels are compared by rank, as of
+    frames that follow each other. What is black or blown out in either tells nothing.
+    """
+    if places is None:
+        ranks = np.linspace(0.02, 0.98, 49)
+        a, b = (np.quantile(p[::8, ::8], ranks) for p in (old, new))
+    else:
+        step = max(1, len(places[0]) // samples)
+        a, b = (_around(p, xy[::step]) for p, xy in zip((old, new), places, strict=True))
+    told = (a > _BLACK) & (a < _WHITE) & (b > _BLACK) & (b < _WHITE)
+    if told.sum() < _LEAST_TOLD:
+        return old
+    a, b = a[told], b[told]
+    kept, gain, offset = np.ones(len(a), bool), 1.0, 0.0
+    for _ in range(3):
+        middle_a, middle_b = a[kept].mean(), b[kept].mean()
+        spread = float(((a[kept] - middle_a) ** 2).sum())
+        gain = float(((a[kept] - middle_a) * (b[kept] - middle_b)).sum()) / spread if spread > len(a) else 1.0
+        gain = float(np.clip(gain, *_GAINS))
+        offset = middle_b - gain * middle_a
+        off = np.abs(gain * a + offset - b)
+        kept = off <= max(2.0, 3.0 * float(np.median(off)))
+    was, left = np.median(np.abs(a - b)), np.median(np.abs(gain * a + offset - b))
+    if was < least or left > _UNTOLD * was:
+        return old
+    return np.asarray(
+        cv2.LUT(old, np.clip(np.rint(gain * np.arange(256.0) + offset), 0, 255).astype(np.uint8)), np.uint8
+    )
+
+
+_UNTOLD = 0.5
+"""Most that brightness and contrast may leave of the difference that they are to explain."""
+_BLACK, _WHITE = 8.0, 247.0
+"""Grey values beyond which a camera tells no difference."""
+_LEAST_TOLD = 12
+"""Fewest values that tell how brightness changed."""
+_GAINS = (0.25, 4.0)
+"""Changes of contrast that are believed."""
+
+
+def _around(gray: Gray, xy: Floats) -> NDArray[np.float64]:
+    """Mean grey values of the 7 x 7 px round places (N, 2); those outside count as the rim. Shape (N,)."""
+    x, y = np.clip(np.rint(xy), 0, np.array(gray.shape[::-1]) - 1).astype(int).T
+    return np.asarray(cv2.blur(gray, (7, 7))[y, x], np.float64)
 
 
 @dataclass
@@ -184,7 +242,8 @@ class _Follower:
         return Tracks(tuple(self.ids), tuple(self.xy), keyframes, run, np.array(self.flows, np.float32))
 
     def _followed(self, gray: Gray) -> _Alive:
-        s, alive, before = self.settings, self.alive, self.pictures[self.last]
+        s, alive = self.settings, self.alive
+        before = as_bright(self.pictures[self.last], gray, s.least_brightening)
         size, criteria = (s.window_px, s.window_px), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
         xy, found, _ = cv2.calcOpticalFlowPyrLK(
             before, gray, alive.xy, np.zeros_like(alive.xy), winSize=size, maxLevel=s.levels, criteria=criteria
@@ -200,8 +259,12 @@ class _Follower:
             mine = np.flatnonzero(good & (alive.origin == origin))
             if origin == self.last:
                 continue
+            first = self.pictures[origin]
+            first = as_bright(
+                first, gray, s.least_brightening, (alive.origin_xy[mine], np.asarray(xy[mine], np.float32))
+            )
             place, found, difference = cv2.calcOpticalFlowPyrLK(
-                self.pictures[origin], gray, alive.origin_xy[mine], xy[mine].copy(), winSize=size, maxLevel=0,
+                first, gray, alive.origin_xy[mine], xy[mine].copy(), winSize=size, maxLevel=0,
                 criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
             near = np.linalg.norm(place - xy[mine], axis=1) < s.most_creep_px
