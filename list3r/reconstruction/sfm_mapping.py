@@ -3,20 +3,29 @@
 Nothing touches the disk: the correspondences lie in a database in memory. pycolmap's pixels have their origin at the
 corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
 correspondences give the same structure.
+
+Growing a map is a local search. Of windows of 100 frames of a camera that turns by 3 degrees and moves by 1 cm a frame,
+at angles of 3, 6 and 10 degrees between the first two keyframes (error px; ATE m):
+0.469; 0.010, 0.461; 0.010, 0.461; 0.010 on one, 0.500; 0.125, 0.493; 0.118, 0.464; 0.011 on another,
+0.457; 0.008, 0.457; 0.008, 0.483; 0.140 on a third: a bent room explains the pictures worse, so the least error is
+right. Adjusting one again from the bent room, with more iterations, ends in it. On redkitchen all angles agree.
+Adjusting the whole at growth 1.1 instead of 1.4 costs 1.4 times the CPU and ends in the same places.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.colmap import pycolmap
 from list3r.reconstruction.sfm_turning import only_turns
+
+pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -35,8 +44,13 @@ class MappingSettings:
     """Largest error of a correspondence of structure and picture when a keyframe is added."""
     point_error_px: float = 2.0
     """Largest error of an observation that stays."""
-    first_angle_deg: float = 3.0
-    """Least angle between the rays of the first two keyframes."""
+    first_angles_deg: tuple[float, ...] = (3.0, 6.0, 10.0)
+    """Least angles between the rays of the first two keyframes. A map is grown from each, and the one that explains
+    the pictures best is taken: while a camera turns fast and moves little, growing may end in a bent room."""
+    growth: float = 1.4
+    """The whole map is adjusted each time it has grown by this factor."""
+    alike: float = 0.95
+    """Maps with at least this share of the keyframes of the largest are compared by their error."""
     point_angle_deg: float = 1.0
     """Least angle between the rays to a point."""
     least_points: int = 40
@@ -101,13 +115,30 @@ def build_maps(
     cache = _cache(problem, camera, free_camera, chosen)
     if cache is None:
         return []
-    manager = pycolmap.ReconstructionManager()
-    pycolmap.IncrementalPipeline(_options(camera, free_camera, chosen), cache, manager).run()
-    maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
-    maps = [m for m in maps if len(m.points) >= chosen.least_points and len(m.T_map_cam) >= 2]
+    angles = chosen.first_angles_deg[:1] if free_camera == "focal" else chosen.first_angles_deg
+    maps = best_of([_grown(cache, problem, camera, free_camera, angle, chosen) for angle in angles], chosen.alike)
     places = {key: view.xy for key, view in problem.views.items()}
-    maps = [m for m in maps if not only_turns(places, problem.pairs, m.T_map_cam, camera)]
+    return [m for m in maps if not only_turns(places, problem.pairs, m.T_map_cam, camera)]
+
+
+def _grown(
+    cache: Any, problem: MapProblem, camera: Camera, free_camera: str, angle_deg: float, settings: MappingSettings
+) -> list[SparseMap]:
+    """Maps that grow from two keyframes whose rays are at least so far apart, the largest first."""
+    options = _options(camera, free_camera, settings)
+    options.mapper.init_min_tri_angle = angle_deg
+    manager = pycolmap.ReconstructionManager()
+    pycolmap.IncrementalPipeline(options, cache, manager).run()
+    maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
+    maps = [m for m in maps if len(m.points) >= settings.least_points and len(m.T_map_cam) >= 2]
     return sorted(maps, key=lambda m: (-len(m.T_map_cam), min(m.T_map_cam)))
+
+
+def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
+    """Those whose largest map has the least error among the ones that are about as large as any."""
+    most = max((len(maps[0].T_map_cam) for maps in grown if maps), default=0)
+    large = [maps for maps in grown if maps and len(maps[0].T_map_cam) >= alike * most]
+    return min(large, key=lambda maps: maps[0].error_px, default=[])
 
 
 def triangulate(
@@ -243,9 +274,10 @@ def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any
     options.ba_refine_principal_point = False
     options.ba_local_max_num_iterations, options.ba_global_max_num_iterations = 10, 25
     options.ba_global_max_refinements = 3
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
     mapper, unit = options.mapper, _unit(camera)
     mapper.num_threads, mapper.random_seed = 1, settings.seed
-    mapper.init_min_num_inliers, mapper.init_min_tri_angle = 2 * settings.least_matches, settings.first_angle_deg
+    mapper.init_min_num_inliers = 2 * settings.least_matches
     mapper.init_max_error = settings.pair_error_px * unit * (2.0 if free_camera else 1.0)
     mapper.abs_pose_min_num_inliers = settings.least_matches
     mapper.abs_pose_max_error = settings.pose_error_px * unit
