@@ -51,7 +51,7 @@ def save(name: str, folder: Path) -> Path:
 
     logging.disable_progress_bar()
     torch.manual_seed(0)
-    _MAKERS[name]().save_pretrained(folder)
+    {**_MAKERS, "sam3": _sam3_whole}[name]().save_pretrained(folder)
     return folder
 
 
@@ -121,6 +121,25 @@ def _sam3_video() -> Any:
     parts = {"prompt_encoder_config": _prompt(112, 14), "mask_decoder_config": DECODER}
     config = t.Sam3TrackerVideoConfig(vision_config=_sam3_vision(), **parts, **MEMORY, **ATTENTION, image_size=112)
     return t.Sam3TrackerVideoModel(config)
+
+
+def _sam3_whole() -> Any:
+    """As the published weights are: a detector and a tracker in one."""
+    import transformers as t
+
+    small = {"hidden_size": 128, "num_attention_heads": 2, "intermediate_size": 32}
+    words = {"vocab_size": 64, "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 1}
+    detector = {
+        "vision_config": _sam3_vision(),
+        "text_config": {**words, "num_attention_heads": 2, "max_position_embeddings": 16, "projection_dim": 32},
+        "geometry_encoder_config": {**small, "num_layers": 1},
+        "detr_encoder_config": {**small, "num_layers": 1},
+        "detr_decoder_config": {**small, "num_layers": 1, "num_queries": 4},
+        "mask_decoder_config": {"hidden_size": 128, "num_upsampling_stages": 1, "num_attention_heads": 2},
+    }
+    parts = {"prompt_encoder_config": _prompt(112, 14), "mask_decoder_config": DECODER}
+    tracker = {"vision_config": _sam3_vision(), **parts, **MEMORY, **ATTENTION, "image_size": 112}
+    return t.Sam3VideoModel(t.Sam3VideoConfig(detector_config=detector, tracker_config=tracker))
 
 
 def _eomt() -> Any:

@@ -180,6 +180,14 @@ def test_registry_makes_what_is_named(checkpoints: dict[str, Path]) -> None:
             check_choice(*wrong)
 
 
+def test_published_weights_of_sam_serve_masks_and_tracking(tmp_path: Path) -> None:
+    for model in ("sam2", "sam3"):
+        folder = neural_models.save("sam3" if model == "sam3" else "tracking/sam2", tmp_path / model)
+        masks, tracker = SamMasks(model, folder, "cpu"), VideoTracker(model, folder, "cpu")
+        one, other = (n._network.mask_decoder.conv_s0.weight for n in (masks, tracker))
+        assert torch.equal(one, other), "both are read from one checkpoint"
+
+
 def test_weights_of_another_network_are_refused(checkpoints: dict[str, Path], tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"other weights|cannot be loaded"):
         Appearance("dinov2", checkpoints["features/dinov3"], "cpu")

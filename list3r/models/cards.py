@@ -131,10 +131,12 @@ def _hub(
     *,
     gated: bool = False,
     revision: str = UNPINNED,
+    also: tuple[str, ...] = (),
 ) -> ModelCard:
-    """A model that the package transformers runs."""
+    """A model that the package transformers runs, with the help of other packages."""
     weights = (Weights(repository, licence, gated, revision),)
-    return ModelCard(name, part, APACHE, weights, _TRANSFORMERS, _MODELS_EXTRA, about=about)
+    install = " ".join((_MODELS_EXTRA, *also))
+    return ModelCard(name, part, APACHE, weights, (*_TRANSFORMERS, *also), install, about=about)
 
 
 DA3_SMALLER = MemoryFigures(2500, 600, "weights counted (0.14 G parameters); the rest as the giant's")
@@ -220,7 +222,7 @@ CARDS: tuple[ModelCard, ...] = (
     _hub("sam3", "discovery", "facebook/sam3", SAM_LICENCE, "masks of everything", gated=True, revision=SAM3_COMMIT),
     _hub("sam2", "tracking", "facebook/sam2.1-hiera-tiny", APACHE, "video tracker", revision=SAM2_COMMIT),
     _hub("sam3", "tracking", "facebook/sam3", SAM_LICENCE, "video tracker", gated=True, revision=SAM3_COMMIT),
-    _hub("edgetam", "tracking", "yonigozlan/EdgeTAM-hf", APACHE, "small video tracker"),
+    _hub("edgetam", "tracking", "yonigozlan/EdgeTAM-hf", APACHE, "small video tracker", also=("timm",)),
     _hub(
         "dinov2",
         "features",

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     import torch
 
 
+RENAMED = {"Sam3TrackerModel": {r"^tracker_model\.": ""}}
+"""What layers are called otherwise in published weights, by class, where transformers 5.23 does not know it:
+facebook/sam3 is one checkpoint of a detector and a tracker."""
+
+
 def pick_device(name: str) -> torch.device:
     """`auto` is the first GPU where there is one. Raises `OptionError` for a device that is not there."""
     import torch
@@ -68,8 +73,10 @@ def load_pretrained(class_name: str, folder: Path, device: torch.device, *, exac
     level = logging.get_verbosity()
     logging.set_verbosity_error()  # type: ignore[no-untyped-call]
     try:
-        model, report = cls.from_pretrained(folder, dtype=dtype, local_files_only=True, output_loading_info=True)
-    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError) as error:
+        model, report = cls.from_pretrained(
+            folder, dtype=dtype, local_files_only=True, output_loading_info=True, key_mapping=RENAMED.get(class_name)
+        )
+    except (OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError, ImportError) as error:
         raise OptionError(f"{folder} cannot be loaded as {class_name}: {first_line(error)}") from None
     finally:
         logging.set_verbosity(level)
