@@ -19,13 +19,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.colmap import pycolmap
 from list3r.reconstruction.sfm_turning import only_turns
-
-pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
