@@ -120,8 +120,9 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
         found = measure_edge(*ends, _camera(v), metric, settings)
     except DegenerateError:
         return [] if by_cameras is None else [by_cameras]
-    for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):
-        store.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
+    if by_cameras is None:  # where points lie less well than cameras, what they disagree in has not moved
+        for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):
+            store.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
     if debug_dir is not None:
         pictures = [k for c in (u, v) for k in store.keyframes(c.chunk_id)]
         write_support(found, pictures, _camera(v), debug_dir)
