@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.meetings import Key, Meetings, Numbering, PairScores
-from list3r.memory.missed import frames_beside, looks_at
+from list3r.memory.missed import bears_out, frames_beside, looks_at
 from list3r.memory.shapes import ChunkShapes, Ints
 
 
@@ -85,15 +85,20 @@ def weigh(
     chunk_of = np.array([k for k, _ in numbering.keys], np.int64)
     meet = Meetings.of(pairs, numbering)
     against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
+    beside = frames_beside(chunks, pairs)
     for inner, outer, cover in ((meet.a, meet.b, meet.a_on_b), (meet.b, meet.a, meet.b_on_a)):
         a, b = home[inner], home[outer]
         swallowed = np.flatnonzero((a != b) & weighed[a] & (cover >= settings.swallowed))
+        met = zip(inner[swallowed].tolist(), outer[swallowed].tolist(), strict=True)
+        agreed = [
+            bears_out(numbering.keys[x], numbering.keys[y], chunks, beside, settings.missed_share) for x, y in met
+        ]
+        swallowed = swallowed[np.array(agreed, bool)]
         seen_by = chunk_of[outer[swallowed]].tolist()
         rows = zip(a[swallowed].tolist(), b[swallowed].tolist(), cover[swallowed].tolist(), seen_by, strict=True)
         for n, other, share, chunk in rows:
             claim = (share, -other)
             against[n][chunk] = max(claim, against[n].get(chunk, claim))
-    beside = frames_beside(chunks, pairs)
     out = []
     for n, group in enumerate(groups):
         own = {k for k, _ in group}

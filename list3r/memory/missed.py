@@ -48,3 +48,25 @@ def looks_at(
             known = np.bincount(at, np.isin(mine, chunks[other].samples), minlength=len(frames))
             seen.update(frames[known >= least_share * np.bincount(at, minlength=len(frames))].tolist())
     return SAMPLED_FRAMES * len(seen) >= least_frames
+
+
+def bears_out(
+    inner: Key,
+    outer: Key,
+    chunks: Mapping[int, ChunkShapes],
+    beside: Mapping[int, Mapping[int, Ints]],
+    least_share: float,
+) -> bool:
+    """Whether pixels agree that a local instance is part of one of another chunk of computed depth: in the frames that
+    both saw, at least `least_share` of its pixels are the other's. True where they saw none together.
+
+    Surfaces that meet do not tell: what computed depth makes too wide reaches over what stands beside it.
+    """
+    shared = beside.get(inner[0], {}).get(outer[0])
+    if shared is None:
+        return True
+    a, b = chunks[inner[0]], chunks[outer[0]]
+    mine = a.samples[a.sample_owner == int(np.searchsorted(a.local_id, inner[1]))]
+    mine = mine[np.isin(mine >> PIXEL_BITS, shared)]
+    theirs = b.samples[b.sample_owner == int(np.searchsorted(b.local_id, outer[1]))]
+    return len(mine) == 0 or float(np.isin(mine, theirs).mean()) >= least_share
