@@ -54,7 +54,7 @@ class BuildSettings:
     instance_weights: tuple[tuple[str, str], ...] = ()
     """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
     local_features: str = "sift"
-    """What finds a keyframe again: sift, aliked or xfeat."""
+    """What finds a keyframe again, and links pictures of `sfm` where nothing can be followed: sift, aliked or xfeat."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
     chunks: ChunkSettings = field(default_factory=ChunkSettings)
@@ -269,7 +269,8 @@ def joint_model(task: ChunkTask) -> Reconstructor | None:
 @lru_cache(maxsize=2)
 def _model(settings: BuildSettings, camera_known: bool) -> Reconstructor:
     """The model, loaded once in a process."""
-    options = ModelOptions(settings.poses, camera_known, settings.device, settings.weights)
+    s = settings
+    options = ModelOptions(s.poses, camera_known, s.device, s.weights, s.local_features, s.feature_weights)
     return make_reconstructor(settings.reconstruction, options)
 
 

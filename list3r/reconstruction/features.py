@@ -99,7 +99,14 @@ def match(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float) -> NDArray[n
         return np.zeros((0, 2), np.int64)
     if a.shape[1] != SIFT_WIDTH:
         ratio = max(ratio, LEARNED_RATIO)
-    likeness = _root(a) @ _root(b).T
+    return nearest_pairs(_root(a), _root(b), ratio)
+
+
+def nearest_pairs(a: Floats, b: Floats, ratio: float) -> NDArray[np.int64]:
+    """Mutual nearest neighbours of unit descriptors (N, D), (M, D) that pass the ratio test. Shape (K, 2)."""
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), np.int64)
+    likeness = a @ b.T
     forth, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
     rows = np.flatnonzero(back[forth] == np.arange(len(a)))
     top = np.partition(likeness[rows], -2, axis=1)[:, -2:]

@@ -23,6 +23,10 @@ class ModelOptions:
     """cpu, cuda, cuda:1, ... or auto: the first GPU where there is one."""
     weights: str | None = None
     """A folder, a file or `repository@revision` of weights instead of the model's own; None for its own."""
+    local_features: str = "sift"
+    """What `sfm` links pictures by where nothing can be followed: sift, aliked or xfeat."""
+    feature_weights: str | None = None
+    """File of the weights of learned local features."""
 
 
 @dataclass(frozen=True)

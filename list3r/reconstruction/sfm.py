@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,10 +25,12 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.learned import LearnedDetector, make_detector
 from list3r.reconstruction.mvs import MvsSettings, dense_depth, stereo_noise
 from list3r.reconstruction.odometry import OdometrySettings
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd import is_rigid, select_keyframes
+from list3r.reconstruction.sfm_features import make_finder
 from list3r.reconstruction.sfm_fill import FillSettings, Segment, fill_segments
 from list3r.reconstruction.sfm_links import LinkSettings, keyframe_problem
 from list3r.reconstruction.sfm_mapping import MappingSettings, SparseMap, build_maps, triangulate
@@ -44,7 +47,11 @@ def make(options: ModelOptions) -> SfmReconstructor:
     device = options.device
     if device == "auto":
         device = "cpu" if find_gpu() is None else "cuda"
-    return SfmReconstructor(poses=options.poses, device=device, camera_known=options.camera_known)
+    detector = None
+    if options.local_features != "sift":
+        where = "cpu" if options.device == "auto" else options.device
+        detector = make_detector(options.local_features, Path(options.feature_weights or ""), where)
+    return SfmReconstructor(poses=options.poses, device=device, camera_known=options.camera_known, detector=detector)
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,8 @@ class SfmReconstructor:
     device: str = "cpu"
     camera_known: bool = True
     """Otherwise the focal length is estimated from the chunk alone."""
+    detector: LearnedDetector | None = None
+    """What finds the features of keyframes that nothing can be followed between; None for SIFT."""
 
     def __post_init__(self) -> None:
         if self.poses not in ("given", "estimate"):
@@ -105,7 +114,8 @@ class SfmReconstructor:
         """Posed frames with their points, the largest segment first."""
         s = self.settings
         tracks = follow_corners(grays, s.tracks)
-        problem = keyframe_problem(tracks, grays, s.links)
+        finder = make_finder(grays, [f.color for f in frames], self.detector, s.links.features)
+        problem = keyframe_problem(tracks, grays, s.links, finder)
         if self.poses == "given":
             return [self._given(frames, tracks, problem, camera)]
         _check_motion(frames, tracks, s)

@@ -70,6 +70,8 @@ def _fill(found: SparseMap, tracks: Tracks, positions: Iterable[int], settings: 
         known = np.isin(tracks.ids[position], numbers)
         xy = tracks.xy[position][known]
         points = places[np.searchsorted(numbers, tracks.ids[position][known])]
+        if position in found.seen:
+            xy, points = _with_features(found, position, tracks, xy, points)
         start = segment.T_map_cam.get(position - 1)
         if position in found.T_map_cam or start is None:
             start = found.T_map_cam[min(registered, key=lambda k: (abs(k - position), k))]
@@ -81,6 +83,19 @@ def _fill(found: SparseMap, tracks: Tracks, positions: Iterable[int], settings: 
             segment.T_map_cam[position] = found.T_map_cam[position]
             segment.seen[position] = xy, points
     return segment
+
+
+def _with_features(
+    found: SparseMap, position: int, tracks: Tracks, xy: Floats, points: NDArray[np.float64]
+) -> tuple[Floats, NDArray[np.float64]]:
+    """What a keyframe sees of the map by its corners, and what it sees by other features."""
+    seen = found.seen[position]
+    rows = np.flatnonzero(~np.isin(seen.ids, tracks.ids[position])).tolist()
+    if not rows:
+        return xy, points
+    others = seen.where(rows)
+    places = np.array([found.points[int(n)] for n in others.ids]).reshape(-1, 3)
+    return np.concatenate([xy, others.xy]), np.concatenate([points, places])
 
 
 def _bridge(segment: Segment, grays: Sequence[Gray], positions: Sequence[int], settings: FillSettings) -> None:
