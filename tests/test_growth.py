@@ -160,12 +160,15 @@ def test_what_neighbours_of_computed_depth_miss_grows_alike(walks: ModuleType, s
         )
         renumbered = tuple(dataclasses.replace(i, local_id=n) for n, i in enumerate(kept))
         library = dataclasses.replace(made.library, instances=renumbered, cannot_link=np.zeros((0, 2), np.int32))
+        things = len(made.library.instances)
+        owner = np.full(things, -1, np.int32)
+        owner[[n for n in range(things) if (n + index) % 3]] = np.arange(len(kept))
         samples = FrameSamples(
-            frame=np.repeat(frames, len(kept)),
-            pixel=np.tile(np.arange(len(kept), dtype=np.int32), len(frames)),
-            points=np.zeros((len(frames) * len(kept), 3), np.float32),
-            confidence=np.ones(len(frames) * len(kept), np.float32),
-            instance=np.tile(np.arange(len(kept), dtype=np.int32), len(frames)),
+            frame=np.repeat(frames, things),
+            pixel=np.tile(np.arange(things, dtype=np.int32), len(frames)),
+            points=np.zeros((len(frames) * things, 3), np.float32),
+            confidence=np.ones(len(frames) * things, np.float32),
+            instance=np.tile(owner, len(frames)),
             camera_frames=frames,
             T_chunk_cam=made.T_chunk_cam,
         )

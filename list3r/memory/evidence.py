@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.meetings import Key, Meetings, Numbering, PairScores
-from list3r.memory.missed import bears_out, frames_beside, looks_at
+from list3r.memory.missed import LookSettings, bears_out, frames_beside, misses
 from list3r.memory.shapes import ChunkShapes, Ints
 
 
@@ -31,11 +31,8 @@ class EvidenceSettings:
     """Edge of the cells in which the claims of things to a place are counted."""
     claims: int = 4
     """A bit that one chunk alone gives to a thing, and this many to another, is not part of it."""
-    missed_frames: int = 8
-    """Frames that two chunks of computed depth share in which one must see a thing and the other look at its place,
-    for the other to have missed it: as many as a track of a chunk of 100 frames needs."""
-    missed_share: float = 0.25
-    """Share of a thing in a frame where the other has depth, to look at its place: a part of it would do."""
+    looks: LookSettings = field(default_factory=LookSettings)
+    """When a chunk of computed depth has missed a thing."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def weigh(
         swallowed = np.flatnonzero((a != b) & weighed[a] & (cover >= settings.swallowed))
         met = zip(inner[swallowed].tolist(), outer[swallowed].tolist(), strict=True)
         agreed = [
-            bears_out(numbering.keys[x], numbering.keys[y], chunks, beside, settings.missed_share) for x, y in met
+            bears_out(numbering.keys[x], numbering.keys[y], chunks, beside, settings.looks.least_share) for x, y in met
         ]
         swallowed = swallowed[np.array(agreed, bool)]
         seen_by = chunk_of[outer[swallowed]].tolist()
@@ -109,8 +106,7 @@ def weigh(
         ranked = tuple(sorted(votes, key=lambda g: (-votes[g], g)))
         asked = weighed[n] and not all(_bounds(chunks, key) for key in group)
         silent = {v for u in own for v in beside.get(u, {})} - own - against[n].keys() if asked else set()
-        least, share = settings.missed_frames, settings.missed_share
-        missed = sum(looks_at(v, group, chunks, beside, least_frames=least, least_share=share) for v in silent)
+        missed = sum(misses(v, group, chunks, beside, settings.looks) for v in silent)
         out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked, missed))
     return out
 
