@@ -6,8 +6,9 @@ Each walk (two furnished rooms, 640x480, filmed at 12 frames a second) becomes a
 `list3r build FOLDER --reconstruction sfm --intrinsics ...` a memory. `blank` is the share of 7 px windows, at 320 px
 width, whose deviation is below 2.5 grey levels: 0.20 in redkitchen. Things are matched one to one, by masks in every
 tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` says what the things lie on that match
-nothing. Relations are those among things matched by masks. Walks and reconstructions that are in `--keep` are used
-again, and then the time is that of what is left.
+nothing. `things_scale` is the scale of the world by the middles of the things that are matched at IoU 0.5, over that
+by the cameras: 1 where things lie where the cameras saw them. Relations are those among things matched by masks.
+Walks and reconstructions that are in `--keep` are used again, and then the time is that of what is left.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from machine import machine, run_list3r, write_json
 from numpy.typing import NDArray
 
 from list3r.evaluation.instances import match_boxes
-from list3r.evaluation.scene import evaluate_scene, read_scene, relations_of_matches
+from list3r.evaluation.scene import evaluate_scene, read_scene, relations_of_matches, scene_boxes
 from list3r.evaluation.trajectory import Trajectory, align, position_errors, read_tum
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.masks import decode_mask
 from list3r.memory.store import Store
 from list3r.scene_memory import open as open_memory
@@ -80,12 +81,16 @@ def main() -> None:
         for seed in (int(word) for word in words.seeds.split(",")):
             rows.append({"seed": seed, **measured(root / f"seed-{seed}", seed, words.workers)})
             print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-    known = {k: [r[k] for r in rows if r[k] is not None] for k in rows[0] if k != "seed"}
-    mean = {k: round(statistics.fmean(values), 4) if values else None for k, values in known.items()}
+            write_json(words.json, {"mean": means(rows), "seeds": rows})
     print(machine())
-    for key, value in mean.items():
+    for key, value in means(rows).items():
         print(f"{key:24} {value}")
-    write_json(words.json, {"mean": mean, "seeds": rows})
+
+
+def means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    """Over the walks that have a figure."""
+    known = {k: [r[k] for r in rows if r[k] is not None] for k in rows[0] if k != "seed"}
+    return {k: round(statistics.fmean(values), 4) if values else None for k, values in known.items()}
 
 
 def measured(folder: Path, seed: int, workers: int) -> dict[str, Any]:
@@ -163,7 +168,9 @@ def scene_errors(memory: Path, walk: Path) -> dict[str, Any]:
     frames = range(0, len(list((walk / "rgb").iterdir())), EVERY)
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     boxes = evaluate_scene(scene, true_scene, S_truth_world)
-    out = {"ate_sim3_m": round(ate, 4), **_by_masks(overlaps, scene, true_scene)}
+    by_masks, found = _by_masks(overlaps, scene, true_scene)
+    out = {"ate_sim3_m": round(ate, 4), "things_scale": _things_scale(scene, true_scene, found, S_truth_world)}
+    out |= by_masks
     for name in ("0.25", "0.50"):
         entry = boxes[f"instances_{name}"]
         out[f"box_recall_{name}"] = round(entry["recall"], 3)
@@ -183,6 +190,18 @@ def _alignment(memory: Path, walk: Path) -> tuple[Sim3, float]:
     true, estimate = truth.at(rows), Trajectory(truth.time_s[rows], T)
     S = align(true, estimate, with_scale=True)
     return S, float(np.sqrt(np.square(position_errors(true, estimate, S)).mean()))
+
+
+def _things_scale(
+    scene: Mapping[str, Any], truth: Mapping[str, Any], found: list[tuple[int, int, float]], S_truth_world: Sim3
+) -> float | None:
+    """Scale from the memory's world to the truth's by the middles of things, over that by the cameras."""
+    boxes, true_boxes = scene_boxes(scene), scene_boxes(truth)
+    pairs = [(boxes[e].center, true_boxes[t].center) for t, e, iou in found if iou >= 0.5]
+    if len(pairs) < 4:
+        return None
+    ours, theirs = (np.array(side) for side in zip(*pairs, strict=True))
+    return round(float(umeyama(ours, theirs, with_scale=True).scale / S_truth_world.scale), 3)
 
 
 def true_masks(walk: Path, frames: range) -> Masks:
@@ -228,8 +247,12 @@ def compare_masks(truth: Masks, found: Masks) -> Overlaps:
     return Overlaps(true_ids, ids, shared, true_px, px)
 
 
-def _by_masks(overlaps: Overlaps, scene: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Recall and precision of things by masks, what false ones lie on, and relations of the true ones."""
+def _by_masks(
+    overlaps: Overlaps, scene: Mapping[str, Any], truth: Mapping[str, Any]
+) -> tuple[dict[str, Any], list[tuple[int, int, float]]]:
+    """Recall and precision of things by masks, what false ones lie on, relations of the true ones; and the pairs
+    (true id, id, IoU) at IoU 0.25.
+    """
     wanted = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= LEAST_PX}
     things = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
     rows = [n for n, k in enumerate(overlaps.true_ids) if k in wanted]
@@ -248,7 +271,7 @@ def _by_masks(overlaps: Overlaps, scene: Mapping[str, Any], truth: Mapping[str, 
         out[f"{name}_recall"], out[f"{name}_precision"] = (
             None if v is None else round(v, 3) for v in (entry.recall, entry.precision)
         )
-    return out
+    return out, found
 
 
 def _false_things(
