@@ -276,6 +276,7 @@ def test_relations_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None
             store.set_value("scale_kind", "relative")
         found = settings_of(store, given)
         assert found.relations == RelationSettings(contact_m=0.05, noise_m=RelationSettings().computed_noise_m)
+        assert found.structure.floor_band_m == found.structure.computed_floor_band_m > given.structure.floor_band_m
         assert settings_of(store, found) == found
 
 

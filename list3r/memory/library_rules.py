@@ -50,7 +50,12 @@ def settings_of(store: Store, settings: ConsolidationSettings | None) -> Consoli
     s = settings or ConsolidationSettings()
     if store.get_value("scale_kind", "metric") == "metric":
         return s
-    return replace(s, relations=replace(s.relations, noise_m=max(s.relations.noise_m, s.relations.computed_noise_m)))
+    noise, band = s.relations.computed_noise_m, s.structure.computed_floor_band_m
+    return replace(
+        s,
+        relations=replace(s.relations, noise_m=max(s.relations.noise_m, noise)),
+        structure=replace(s.structure, floor_band_m=max(s.structure.floor_band_m, band)),
+    )
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,9 @@ class StructureSettings:
     thickness: float = 0.04
     """nor one thicker than this share of its second longest edge: depth noise grows with the room."""
     floor_band_m: float = 0.12
-    """Level surfaces this near to the floor are floor."""
+    """Level surfaces this near to the floor are floor,"""
+    computed_floor_band_m: float = 0.2
+    """and this near where depth was computed: rooms bend, and up is known to two degrees."""
     min_area_m2: float = 0.25
     wall_height_m: float = 1.2
     wall_width_m: float = 0.8
