@@ -54,7 +54,8 @@ class BuildSettings:
     instance_weights: tuple[tuple[str, str], ...] = ()
     """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
     local_features: str = "sift"
-    """What finds a keyframe again, and links pictures of `sfm` where nothing can be followed: sift, aliked or xfeat."""
+    """What finds a keyframe again: sift, aliked or xfeat; aliked also ties frames of `sfm` between which nothing can be
+    followed."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
     chunks: ChunkSettings = field(default_factory=ChunkSettings)

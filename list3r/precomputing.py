@@ -79,8 +79,10 @@ def precompute(
             options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
     opened = open_source(source, options)
     known = opened.info.camera is not None
+    s = settings
     model = make_reconstructor(
-        settings.reconstruction, ModelOptions(settings.poses, known, settings.device, settings.weights)
+        s.reconstruction,
+        ModelOptions(s.poses, known, s.device, s.weights, s.local_features, s.feature_weights),
     )
     posed: set[int] = set()
     for span in spans:

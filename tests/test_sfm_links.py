@@ -12,8 +12,10 @@ import pytest
 
 from list3r.frames.base import Camera, Frame
 from list3r.frames.source import SourceOptions, open_source
+from list3r.memory.errors import OptionError
 from list3r.memory.geometry import umeyama
 from list3r.reconstruction.learned import LearnedDetector, make_detector
+from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm import SfmReconstructor, SfmSettings
 from list3r.reconstruction.sfm_consistency import contradicted, epipolar_errors
 from list3r.reconstruction.sfm_features import FinderSettings, LocalFeatures, likely_pairs, make_finder, match_features
@@ -138,3 +140,10 @@ def test_keyframes_known_by_features_alone_keep_their_poses():
     segment = fill_segments(maps, apart, grays)[0]
     assert sorted(segment.T_map_cam) == list(range(FRAMES // 3))
     assert min(len(xy) for xy, _ in segment.seen.values()) >= 20
+
+
+def test_xfeat_finds_keyframes_again_but_ties_no_frames():
+    model = make_reconstructor("sfm", ModelOptions(device="cpu", local_features="xfeat", feature_weights="nowhere"))
+    assert isinstance(model, SfmReconstructor) and model.detector is None
+    with pytest.raises(OptionError, match="nowhere"):
+        make_reconstructor("sfm", ModelOptions(device="cpu", local_features="aliked", feature_weights="nowhere"))

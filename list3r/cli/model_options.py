@@ -62,8 +62,8 @@ LocalFeatures = Annotated[
     typer.Option(
         "--local-features",
         metavar="KIND[=FILE]",
-        help="What finds a keyframe again, and links frames of colour alone where nothing can be followed: sift, or "
-        "aliked=FILE or xfeat=FILE with their weights.",
+        help="What finds a keyframe again: sift, or aliked=FILE or xfeat=FILE with their weights; aliked also ties "
+        "frames of colour alone between which nothing can be followed.",
     ),
 ]
 LicenceProfile = Annotated[

@@ -24,7 +24,7 @@ class ModelOptions:
     weights: str | None = None
     """A folder, a file or `repository@revision` of weights instead of the model's own; None for its own."""
     local_features: str = "sift"
-    """What `sfm` links pictures by where nothing can be followed: sift, aliked or xfeat."""
+    """What `sfm` ties pictures by where nothing can be followed: aliked; with any other name it takes SIFT."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
 

@@ -48,7 +48,7 @@ def make(options: ModelOptions) -> SfmReconstructor:
     if device == "auto":
         device = "cpu" if find_gpu() is None else "cuda"
     detector = None
-    if options.local_features != "sift":
+    if options.local_features == "aliked":
         where = "cpu" if options.device == "auto" else options.device
         detector = make_detector(options.local_features, Path(options.feature_weights or ""), where)
     return SfmReconstructor(poses=options.poses, device=device, camera_known=options.camera_known, detector=detector)
