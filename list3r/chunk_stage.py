@@ -8,14 +8,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from list3r.association.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
-from list3r.frames.borrowing import Repeat, borrow
+from list3r.frames.borrowing import Repeat, borrow, frames_around
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
@@ -27,7 +27,7 @@ from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.models.device import memory_said
-from list3r.reconstruction.base import Reconstruction, Reconstructor
+from list3r.reconstruction.base import Around, Reconstruction, Reconstructor
 from list3r.reconstruction.keyframe_record import KeyframeSettings, frame_samples, make_keyframes
 from list3r.reconstruction.learned import make_detector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
@@ -128,7 +128,7 @@ def _reconstructed(
     """
     model = _model(task.settings, source.info.camera is not None)
     try:
-        return frames, _parts(model, frames, camera), ()
+        return frames, _parts(model, frames, camera, _around(task, source)), ()
     except BaselineError as error:
         if task.shot is None:
             raise
@@ -142,10 +142,19 @@ def _reconstructed(
         return more.frames, parts, more.repeats
 
 
-def _parts(model: Reconstructor, frames: Sequence[Frame], camera: Camera) -> Sequence[Reconstruction]:
+def _parts(
+    model: Reconstructor, frames: Sequence[Frame], camera: Camera, around: Around | None = None
+) -> Sequence[Reconstruction]:
     """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
     parts = getattr(model, "parts", None)
-    return [model(frames, camera)] if parts is None else parts(frames, camera)
+    return [model(frames, camera)] if parts is None else parts(frames, camera, around)
+
+
+def _around(task: ChunkTask, source: FrameSource) -> Around | None:
+    """What hands out frames from around the chunk; None where its shot is not known."""
+    if task.shot is None:
+        return None
+    return partial(frames_around, source, (task.span.start, task.span.stop), task.shot)
 
 
 def _with_repeats(result: ChunkResult, repeats: Sequence[Repeat]) -> ChunkResult:

@@ -1,7 +1,8 @@
-"""Frames for a stretch through which the camera stands still or hardly moves: those before and behind that do move.
+"""Frames from before and behind a stretch of a video.
 
-Of frames that show the same one is enough, and of those around the stretch the nearest, so that what is held does not
-grow with how long the camera stands.
+`frames_around` gives some of them at even steps. `borrow` is for a stretch through which the camera stands still or
+hardly moves, and gives those around it that do move: of frames that show the same one is enough, and of those around
+the stretch the nearest, so that what is held does not grow with how long the camera stands.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -91,6 +93,26 @@ def borrow(
             if len(behind) == s.frames:
                 break
     return Borrowed((*before, *kept, *behind), tuple(repeats), own)
+
+
+def frames_around(
+    source: FrameSource, span: tuple[int, int], shot: tuple[int, int], step: int, count: int
+) -> tuple[list[Frame], list[Frame]]:
+    """Up to `count` frames before and behind positions `span` = [start, stop), `step` apart, from within `shot`."""
+    start, stop = span
+    first = start - step * min(count, (start - shot[0]) // step)
+    before = _thinned(source, first, start, step)
+    behind = _thinned(source, stop - 1 + step, min(shot[1], stop + step * count), step)
+    return before, behind
+
+
+def _thinned(source: FrameSource, start: int, stop: int, step: int) -> list[Frame]:
+    """The frames at positions start, start + step, ... before `stop` that can be decoded."""
+    thinned = getattr(source, "read_every", None)
+    if start >= stop:
+        return []
+    found = thinned(start, stop, step) if thinned else islice(source.read(start, stop), 0, None, step)
+    return [frame for frame in found if not isinstance(frame, BadFrame)]
 
 
 @dataclass

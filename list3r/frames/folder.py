@@ -63,7 +63,11 @@ class FolderSource:
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        for position in range(len(self._chosen))[start:stop]:
+        return self.read_every(start, stop, 1)
+
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
+        for position in range(len(self._chosen))[start:stop:step]:
             number = self._number(position)
             try:
                 yield self._frame(number)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,11 @@ class VideoSource:
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        for number, image in self._pictures(start, stop, threads=False):
+        return self.read_every(start, stop, 1)
+
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
+        for number, image in islice(self._pictures(start, stop, threads=False), 0, None, step):
             if image is None:
                 yield BadFrame(number, "the video is damaged here")
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -68,6 +68,10 @@ class Reconstruction:
         assert self.posed.shape == (count,)
         assert self.T_chunk_cam.shape == (count, 4, 4)
         assert self.depth.shape == self.confidence.shape == (count, self.camera.height, self.camera.width)
+
+
+Around = Callable[[int, int], tuple[Sequence[Frame], Sequence[Frame]]]
+"""(step, count) gives up to `count` frames before and as many behind a chunk, `step` apart, in order of time."""
 
 
 class Reconstructor(Protocol):

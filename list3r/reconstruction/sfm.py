@@ -14,7 +14,7 @@ as well 0.046 (with a focal length that the pictures tell 0.038), plain pycolmap
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
-from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.base import Around, Reconstruction
 from list3r.reconstruction.learned import LearnedDetector, make_detector
 from list3r.reconstruction.mvs import MvsSettings, dense_depth, stereo_noise
 from list3r.reconstruction.odometry import OdometrySettings
@@ -32,8 +32,8 @@ from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd import is_rigid, select_keyframes
 from list3r.reconstruction.sfm_features import make_finder
 from list3r.reconstruction.sfm_fill import FillSettings, Segment, fill_segments
-from list3r.reconstruction.sfm_links import LinkSettings, keyframe_problem
-from list3r.reconstruction.sfm_mapping import MappingSettings, SparseMap, build_maps, triangulate
+from list3r.reconstruction.sfm_links import LinkSettings, keyframe_problem, step_beside, with_neighbours
+from list3r.reconstruction.sfm_mapping import MappingSettings, MapProblem, SparseMap, build_maps, triangulate
 from list3r.reconstruction.sfm_tracks import Gray, Tracks, TrackSettings, follow_corners
 
 Poses = NDArray[np.float64]
@@ -93,16 +93,16 @@ class SfmReconstructor:
 
         Raises `TrackingError` when the camera cannot be followed through any two frames, with the reason.
         """
-        grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
+        grays = [_gray(f) for f in frames]
         return self._finish(frames, self._segments(frames, grays, camera)[0])
 
-    def parts(self, frames: Sequence[Frame], camera: Camera) -> list[Reconstruction]:
+    def parts(self, frames: Sequence[Frame], camera: Camera, around: Around | None = None) -> list[Reconstruction]:
         """All parts of a chunk that hang together, in order of time; what lies in none is among the largest's frames.
 
-        Raises `TrackingError` as above.
+        With `around` some frames before and behind the chunk are mapped with it. Raises `TrackingError` as above.
         """
-        grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
-        first, *others = self._segments(frames, grays, camera)
+        grays = [_gray(f) for f in frames]
+        first, *others = self._segments(frames, grays, camera, around)
         others = [s for s in others if len(s.T_map_cam) >= self.settings.least_segment]
         elsewhere = {k for s in others for k in s.T_map_cam}
         groups = [(first, [k for k in range(len(frames)) if k not in elsewhere])]
@@ -110,7 +110,9 @@ class SfmReconstructor:
         groups.sort(key=lambda group: max(group[0].T_map_cam))
         return [self._finish([frames[k] for k in kept], _renumbered(s, kept)) for s, kept in groups]
 
-    def _segments(self, frames: Sequence[Frame], grays: Sequence[Gray], camera: Camera) -> list[Segment]:
+    def _segments(
+        self, frames: Sequence[Frame], grays: Sequence[Gray], camera: Camera, around: Around | None = None
+    ) -> list[Segment]:
         """Posed frames with their points, the largest segment first."""
         s = self.settings
         tracks = follow_corners(grays, s.tracks)
@@ -119,19 +121,37 @@ class SfmReconstructor:
         if self.poses == "given":
             return [self._given(frames, tracks, problem, camera)]
         _check_motion(frames, tracks, s)
-        maps = build_maps(problem, camera, free_camera="" if self.camera_known else "focal", settings=s.mapping)
+        maps = self._maps(frames, tracks, problem, camera, around)
         segments = fill_segments(maps, tracks, grays, s.fill)
         if not segments:
             raise _no_map(frames, tracks)
         return segments
 
-    def _given(self, frames: Sequence[Frame], tracks: Tracks, problem: object, camera: Camera) -> Segment:
+    def _maps(
+        self,
+        frames: Sequence[Frame],
+        tracks: Tracks,
+        problem: MapProblem,
+        camera: Camera,
+        around: Around | None,
+    ) -> list[SparseMap]:
+        """Maps of the keyframes, made with the help of frames around the chunk."""
+        s, free = self.settings, "" if self.camera_known else "focal"
+        before, behind = ((), ()) if around is None else around(step_beside(tracks, s.links), s.links.beside)
+        seen = [*frames, *before, *behind]
+        early, late = np.split(np.arange(len(frames), len(seen)), [len(before)])
+        few = replace(s.links.features, count=s.links.ahead_features, learned_count=s.links.ahead_features)
+        finder = make_finder([_gray(f) for f in seen], [f.color for f in seen], self.detector, few)
+        wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
+        return build_maps(wider, camera, free_camera=free, settings=s.mapping)
+
+    def _given(self, frames: Sequence[Frame], tracks: Tracks, problem: MapProblem, camera: Camera) -> Segment:
         poses = {
             k: f.T_source_cam for k, f in enumerate(frames) if f.T_source_cam is not None and is_rigid(f.T_source_cam)
         }
         if not poses:
             raise TrackingError(f"{_span(frames)}: none has a valid pose; use --poses estimate")
-        found = triangulate(problem, camera, poses, self.settings.mapping)  # type: ignore[arg-type]
+        found = triangulate(problem, camera, poses, self.settings.mapping)
         return _with_given_poses(found or SparseMap({}, {}, camera), poses, tracks)
 
     def _finish(self, frames: Sequence[Frame], segment: Segment) -> Reconstruction:
@@ -160,6 +180,10 @@ class SfmReconstructor:
             keyframes=np.array(keyframes, np.int64),
             depth_noise=stereo_noise(depth, confidence),
         )
+
+
+def _gray(frame: Frame) -> Gray:
+    return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _renumbered(segment: Segment, kept: Sequence[int]) -> Segment:

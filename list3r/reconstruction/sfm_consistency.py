@@ -71,4 +71,5 @@ def epipolar_errors(
 def _share(key: int, left: set[int], told: Mapping[tuple[int, int], tuple[int, int]]) -> float:
     """Share of a keyframe's matches with the others that agree; 1 without any."""
     mine = [n for pair, n in told.items() if key in pair and pair[0] in left and pair[1] in left]
-    return sum(agree for _, agree in mine) / sum(count for count, _ in mine) if mine else 1.0
+    count = sum(count for count, _ in mine)
+    return sum(agree for _, agree in mine) / count if count else 1.0
