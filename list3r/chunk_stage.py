@@ -28,8 +28,8 @@ from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibr
 from list3r.models.cache import locate
 from list3r.models.device import memory_said
 from list3r.reconstruction.base import Around, Reconstruction, Reconstructor
+from list3r.reconstruction.detectors import make_detector
 from list3r.reconstruction.keyframe_record import KeyframeSettings, frame_samples, make_keyframes
-from list3r.reconstruction.learned import make_detector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 
 

@@ -63,6 +63,12 @@ def test_reading_from_any_start_is_the_same_as_from_the_first(uneven: Path, star
     assert found[0].time_s == pytest.approx(STAMPS[start] / 1000.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(("start", "stop", "step"), [(0, 20, 1), (3, 17, 4), (1, 20, 7), (18, 20, 5), (5, 5, 2)])
+def test_reading_some_is_reading_all_and_leaving_out_the_rest(uneven: Path, start: int, stop: int, step: int) -> None:
+    found = [number_in(f) for f in open_source(uneven).read_every(start, stop, step) if isinstance(f, Frame)]
+    assert found == list(range(start, stop, step))
+
+
 def test_every_start_stop_and_rate(uneven: Path) -> None:
     options = SourceOptions(every=4, start=3, stop=17, intrinsics=(90, 90, 48, 32), sharpest=False)
     source = open_source(uneven, options)

@@ -14,7 +14,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import umeyama
-from list3r.reconstruction.learned import LearnedDetector, make_detector
+from list3r.reconstruction.detectors import make_detector
+from list3r.reconstruction.learned import LearnedDetector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm import SfmReconstructor, SfmSettings
 from list3r.reconstruction.sfm_consistency import contradicted, epipolar_errors

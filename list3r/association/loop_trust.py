@@ -124,7 +124,8 @@ def _as_stated_or_drifted(
     if not loop.any() or not robust:
         return problem.solve(start, ones, settings.iterations), ones, np.ones(2)
     poses, trust = _first(problem, start, tree, loop, limit, settings)
-    enough = trust[loop].mean() >= settings.least_loops and trust[~loop].mean() >= settings.least_adjacent
+    chain = trust[~loop]
+    enough = trust[loop].mean() >= settings.least_loops and (not len(chain) or chain.mean() >= settings.least_adjacent)
     drift = 1.0 if enough else drift_factor(problem, start, tree, loop, settings)
     if drift > 1.0:
         poses, trust = _first(problem.scaled(np.where(loop, 1.0, drift)), start, tree, loop, limit, settings)

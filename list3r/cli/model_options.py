@@ -176,7 +176,7 @@ def build_settings(
 def _local_features(words: str) -> tuple[str, str | None]:
     """Kind and file of `--local-features`. Raises `OptionError` for what is not known or cannot be loaded."""
     from list3r.memory.errors import OptionError
-    from list3r.reconstruction.learned import KINDS, make_detector
+    from list3r.reconstruction.detectors import KINDS, make_detector
 
     kind, _, file = words.partition("=")
     if kind == "sift" and not file:

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-from list3r.memory.errors import OptionError
-
-KINDS = ("aliked", "xfeat")
 
 
 @dataclass(frozen=True)
@@ -35,19 +30,6 @@ class LearnedDetector(Protocol):
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
         """The `count` surest features of a picture (H, W, 3)."""
         ...
-
-
-def make_detector(kind: str, weights: Path, device: str = "cpu") -> LearnedDetector:
-    """The detector of that kind, aliked or xfeat. Raises `OptionError`."""
-    if kind == "aliked":
-        from list3r.reconstruction.aliked import Aliked
-
-        return Aliked(weights, device)
-    if kind == "xfeat":
-        from list3r.reconstruction.xfeat import XFeat
-
-        return XFeat(weights)
-    raise OptionError(f"local features {kind} are not known; choose one of sift, {', '.join(KINDS)}")
 
 
 def match_unit(a: NDArray[np.float32], b: NDArray[np.float32], min_cosine: float = 0.7) -> NDArray[np.int64]:

@@ -25,7 +25,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, Reconstruction
-from list3r.reconstruction.learned import LearnedDetector, make_detector
+from list3r.reconstruction.detectors import make_detector
+from list3r.reconstruction.learned import LearnedDetector
 from list3r.reconstruction.mvs import MvsSettings, dense_depth, stereo_noise
 from list3r.reconstruction.odometry import OdometrySettings
 from list3r.reconstruction.registry import ModelOptions
