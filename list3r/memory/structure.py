@@ -22,7 +22,7 @@ class StructureSettings:
     thickness: float = 0.04
     """nor one thicker than this share of its second longest edge: depth noise grows with the room."""
     floor_band_m: float = 0.12
-    """Level surfaces this near to the floor are floor,"""
+    """Level surfaces this near to the floor, and no thicker, are floor,"""
     computed_floor_band_m: float = 0.2
     """and this near where depth was computed: rooms bend, and up is known to two degrees."""
     min_area_m2: float = 0.25
@@ -88,11 +88,14 @@ def _classify(
     along = body.points @ body.normal
     thickness = float(np.ptp(np.quantile(along, [0.1, 0.9])))
     edges = np.sort(body.box.size)
-    if thickness > max(s.thickness_m * unit, s.thickness * edges[1]) or edges[1] * edges[2] < s.min_area_m2 * unit**2:
+    height, most = float(np.median(body.points[:, 2])), max(s.thickness_m * unit, s.thickness * edges[1])
+    level = abs(body.normal[2]) > np.cos(np.radians(s.level_deg))
+    low = level and floor_height is not None and abs(height - floor_height) < s.floor_band_m * unit
+    most = max(most, s.floor_band_m * unit) if low else most
+    if thickness > most or edges[1] * edges[2] < s.min_area_m2 * unit**2:
         return None
-    height = float(np.median(body.points[:, 2]))
-    if abs(body.normal[2]) > np.cos(np.radians(s.level_deg)):
-        if floor_height is not None and abs(height - floor_height) < s.floor_band_m * unit:
+    if level:
+        if low:
             return "floor"
         above = body.normal[2] < 0 and height > eye_level(body) + 0.2 * unit
         if above and (cloud[:, 2] > height + 0.1 * unit).mean() < s.under_ceiling:
