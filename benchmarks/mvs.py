@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +24,21 @@ import torch
 from machine import machine, write_json
 from numpy.typing import NDArray
 
-from list3r.frames.base import Camera, Frame
+from list3r.frames.base import Camera, Frame, FrameSource
+from list3r.frames.borrowing import frames_around
 from list3r.frames.options import SourceOptions, parse_intrinsics
 from list3r.frames.source import open_source
 from list3r.reconstruction.mvs import dense_depth
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
+from list3r.reconstruction.sfm import SfmReconstructor
 
 Poses = NDArray[np.float64]
 
 
-def poses_of(frames: list[Frame], camera: Camera, kind: str) -> tuple[NDArray[np.bool_], Poses, Camera]:
-    """Which frames have a pose, the poses, and the camera."""
+def poses_of(
+    source: FrameSource, frames: list[Frame], span: tuple[int, int], camera: Camera, kind: str
+) -> tuple[NDArray[np.bool_], Poses, Camera]:
+    """Which frames have a pose, the poses, and the camera; `sfm` with frames around, as in a build."""
     if kind == "given":
         known = [f.T_source_cam is not None and bool(np.isfinite(f.T_source_cam).all()) for f in frames]
         T = [
@@ -41,7 +46,15 @@ def poses_of(frames: list[Frame], camera: Camera, kind: str) -> tuple[NDArray[np
             for f, ok in zip(frames, known, strict=True)
         ]
         return np.array(known), np.stack(T), camera
-    found = make_reconstructor(kind, ModelOptions())(frames, camera)
+    model = make_reconstructor(kind, ModelOptions())
+    if isinstance(model, SfmReconstructor):
+        parts = model.parts(frames, camera, partial(frames_around, source, span, (0, source.info.frame_count)))
+        found = max(parts, key=lambda part: int(part.posed.sum()))
+        at = np.searchsorted([f.index for f in frames], found.frame_indices)
+        posed, T = np.zeros(len(frames), bool), np.tile(np.eye(4), (len(frames), 1, 1))
+        posed[at], T[at] = found.posed, found.T_chunk_cam
+        return posed, T, found.camera
+    found = model(frames, camera)
     return found.posed, found.T_chunk_cam, found.camera
 
 
@@ -99,8 +112,9 @@ def run(path: str, options: SourceOptions, starts: list[int], count: int, kind: 
         raise SystemExit("the intrinsics of the source are unknown; give --intrinsics fx,fy,cx,cy")
     rows = []
     for start in starts:
-        frames = [f for f in source.read(start, min(start + count, source.info.frame_count)) if isinstance(f, Frame)]
-        posed, T, found = poses_of(frames, camera, kind)
+        span = start, min(start + count, source.info.frame_count)
+        frames = [f for f in source.read(*span) if isinstance(f, Frame)]
+        posed, T, found = poses_of(source, frames, span, camera, kind)
         begin = time.process_time()
         depth, confidence = dense_depth(frames, posed, T, found)
         spent = time.process_time() - begin
