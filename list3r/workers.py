@@ -75,9 +75,16 @@ class OrderedPool(Generic[Task, Result]):
 
     def stop(self) -> None:
         """End the processes at once."""
+        results = getattr(self._executor, "_result_queue", None)
         self._executor.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.kill()
+            process.join()
+        # One that was ended amid handing over a result leaves half of it, whose rest the pool would wait for for ever
+        # while anybody could still write it; no other process can, and this one never does.
+        writer = getattr(results, "_writer", None)
+        if writer is not None and not writer.closed:
+            writer.close()
 
 
 @contextlib.contextmanager
