@@ -15,7 +15,7 @@ import numpy as np
 
 from list3r.association.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
-from list3r.frames.borrowing import Repeat, borrow, frames_around
+from list3r.frames.borrowing import Borrowed, Repeat, borrow, frames_around
 from list3r.frames.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
@@ -101,7 +101,7 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     try:
         if not frames:
             raise TrackingError("no frame of the chunk could be decoded")
-        used, parts, repeats = _reconstructed(task, source, frames, camera)
+        used, parts, repeats = reconstruct(task, source, frames, camera)
     except TrackingError as error:
         return (replace(_without_geometry(task, frames, camera, bad, clock.seconds), lost_reason=str(error)),)
     clock.mark("reconstruction")
@@ -119,7 +119,7 @@ PART_STEP = 1_000_000
 """The n-th part of a chunk, but for the last, is numbered so much times n beyond its span."""
 
 
-def _reconstructed(
+def reconstruct(
     task: ChunkTask, source: FrameSource, frames: Sequence[Frame], camera: Camera
 ) -> tuple[Sequence[Frame], Sequence[Reconstruction], Sequence[Repeat]]:
     """The frames that were looked at, the parts that hang together, and frames that show what one of these shows.
@@ -127,19 +127,31 @@ def _reconstructed(
     Where the camera moves too little through the chunk frames from around it are borrowed. Raises `TrackingError`.
     """
     model = _model(task.settings, source.info.camera is not None)
+    parts: Sequence[Reconstruction] = ()
+    failed: BaselineError | None = None
     try:
-        return frames, _parts(model, frames, camera, _around(task, source)), ()
+        parts = _parts(model, frames, camera, _around(task, source))
     except BaselineError as error:
-        if task.shot is None:
-            raise
+        failed = error
+    alone = sum(int(part.posed.sum()) for part in parts)
+    if task.shot is not None and (failed or (hasattr(model, "parts") and 2 * alone < len(frames))):
         more = borrow(source, (task.span.start, task.span.stop), task.shot, frames)
-        try:
-            parts = [p for p in _parts(model, more.frames, camera) if more.own & set(p.frame_indices[p.posed].tolist())]
-        except TrackingError:
-            parts = []
-        if not parts:
-            raise error from None
-        return more.frames, parts, more.repeats
+        if failed or 2 * len(more.repeats) > len(frames) - alone:
+            found = _borrowed_parts(model, more, camera)
+            shown = {i for part in found for i in part.frame_indices[part.posed].tolist()}
+            if len(shown & {f.index for f in frames}) + sum(r.shown in shown for r in more.repeats) > alone:
+                return more.frames, found, more.repeats
+    if failed:
+        raise failed
+    return frames, parts, ()
+
+
+def _borrowed_parts(model: Reconstructor, more: Borrowed, camera: Camera) -> list[Reconstruction]:
+    """Parts of a chunk with borrowed frames that hold a frame of its own, or what shows one."""
+    try:
+        return [p for p in _parts(model, more.frames, camera) if more.own & set(p.frame_indices[p.posed].tolist())]
+    except TrackingError:
+        return []
 
 
 def _parts(

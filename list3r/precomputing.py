@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from list3r.calibration_stage import estimated_camera, told_camera
-from list3r.chunk_stage import BuildSettings
-from list3r.frames.base import Camera, Frame, FrameSource, SourceInfo, guessed_camera
-from list3r.frames.chunks import ChunkSpan, plan_chunks
+from list3r.chunk_stage import BuildSettings, ChunkTask, reconstruct
+from list3r.frames.base import Frame, FrameSource, SourceInfo, guessed_camera
+from list3r.frames.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.cuts import find_cuts
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
@@ -29,7 +29,6 @@ from list3r.reconstruction.precomputed_files import (
     write_manifest,
     write_piece,
 )
-from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.session_stage import Look, check_buildable, resolve_settings, with_weights
 
 
@@ -78,22 +77,16 @@ def precompute(
         if camera is not None:
             options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
     opened = open_source(source, options)
-    known = opened.info.camera is not None
-    s = settings
-    model = make_reconstructor(
-        s.reconstruction,
-        ModelOptions(s.poses, known, s.device, s.weights, s.local_features, s.feature_weights),
-    )
     posed: set[int] = set()
     for span in spans:
         path = _file(out, span)
         if force or not path.exists():
             try:
-                made = model(*_chunk(opened, span))
+                shot = shot_of(span, cuts, info.frame_count)
+                _write(path, *_chunk(ChunkTask(str(source), options, span, settings, shot=shot), opened))
             except TrackingError as error:
                 notes.append(f"chunk {span.index} is left out: {error}")
                 continue
-            _write(path, made)
         piece = read_piece(path)
         posed.update(piece.frames[np.isfinite(piece.T_world_cam).all(axis=(1, 2))].tolist())
         if progress is not None:
@@ -130,20 +123,27 @@ def _file(out: Path, span: ChunkSpan) -> Path:
     return out / f"chunk-{span.index:04d}.npz"
 
 
-def _chunk(source: FrameSource, span: ChunkSpan) -> tuple[list[Frame], Camera]:
-    """The frames of a chunk that can be decoded, and their camera."""
-    frames = [f for f in source.read(span.start, span.stop) if isinstance(f, Frame)]
+def _chunk(task: ChunkTask, source: FrameSource) -> tuple[Reconstruction, dict[int, int]]:
+    """The largest part of a chunk that hangs together, and of its frames the numbers, each with that of the frame that
+    shows what it shows. Raises `TrackingError`."""
+    frames = [f for f in source.read(task.span.start, task.span.stop) if isinstance(f, Frame)]
     if not frames:
         raise TrackingError("no frame of it could be decoded")
-    return frames, source.info.camera or guessed_camera(source.info)
+    _, parts, repeats = reconstruct(task, source, frames, source.info.camera or guessed_camera(source.info))
+    shown = {r.index: r.shown for r in repeats}
+    return max(parts, key=lambda part: int(part.posed.sum())), {f.index: shown.get(f.index, f.index) for f in frames}
 
 
-def _write(path: Path, made: Reconstruction) -> None:
+def _write(path: Path, made: Reconstruction, shown: dict[int, int]) -> None:
     """Write a file; until it is whole it has another name."""
-    camera, count = made.camera, len(made.frame_indices)
-    T = np.where(made.posed[:, None, None], made.T_chunk_cam, np.nan)
-    intrinsics = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (count, 1))
-    piece = Piece(made.frame_indices, T, intrinsics, made.depth, made.confidence.astype(np.float32))
+    place = {index: k for k, index in enumerate(made.frame_indices.tolist())}
+    held = {index: place[s] for index, s in sorted(shown.items()) if s in place}
+    camera, rows = made.camera, list(held.values())
+    T = np.where(made.posed[:, None, None], made.T_chunk_cam, np.nan)[rows]
+    intrinsics = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (len(rows), 1))
+    noise = None if made.depth_noise is None else np.array(astuple(made.depth_noise))
+    indices, confidence = np.array(list(held), np.int64), made.confidence[rows].astype(np.float32)
+    piece = Piece(indices, T, intrinsics, made.depth[rows], confidence, depth_noise=noise)
     part = path.with_suffix(".part")
     write_piece(part, piece)
     part.replace(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from list3r.calibration_stage import camera_key, with_camera
 from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import SourceInfo
-from list3r.frames.chunks import ChunkSpan, plan_chunks
+from list3r.frames.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.cuts import find_cuts
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
@@ -91,13 +90,11 @@ def plan_session(
     spans = plan_chunks(count, job.settings.chunks, cuts)
     done = {c.index for c in store.chunks(session)}
     options = with_camera(store, session, job.source, job.options, job.settings.reconstruction, job.info, look)
-    shots = [0, *cuts, count]
     tasks = []
     for span in spans:
         if span.index not in done:
-            at = bisect_right(shots, span.start)
             where = None if debug_dir is None else str(debug_dir)
-            tasks.append(ChunkTask(str(job.source), options, span, job.settings, where, (shots[at - 1], shots[at])))
+            tasks.append(ChunkTask(str(job.source), options, span, job.settings, where, shot_of(span, cuts, count)))
     return Plan(session, spans, done, tasks)
 
 

@@ -18,6 +18,7 @@ from list3r.instances.registry import check_choice, make_discoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.geometry import Sim3
+from list3r.reconstruction.base import DepthNoise
 from list3r.reconstruction.precomputed_files import (
     Manifest,
     Piece,
@@ -83,12 +84,14 @@ def test_round_trip(tmp_path: Path) -> None:
         whole.confidence,
         np.ones((10, 42, 56), np.int32),
         np.eye(3, dtype=np.float32),
+        np.array([0.01, 0.02, 0.03]),
     )
     write_piece(tmp_path / "a.npz", extra)
     back = read_piece(tmp_path / "a.npz")
     assert np.array_equal(back.frames, whole.frames) and np.array_equal(back.T_world_cam, whole.T_world_cam)
     assert np.allclose(back.depth, whole.depth, rtol=1e-3) and np.allclose(back.confidence, 0.75)
     assert back.masks is not None and back.features is not None and back.features.shape == (3, 3)
+    assert back.depth_noise is not None and back.depth_noise.tolist() == [0.01, 0.02, 0.03]
     assert np.array_equal(read_frames(tmp_path / "a.npz"), whole.frames)
     manifest = Manifest("metric", "m", 100, 30)
     write_manifest(tmp_path, manifest)
@@ -122,6 +125,21 @@ def test_files_of_their_own_gauge_are_joined_by_the_frames_they_share(tmp_path: 
     assert np.allclose(np.median(made.depth, axis=(1, 2)), np.median(whole.depth[2:11], axis=(1, 2)), rtol=2e-3)
     one = reader(tmp_path)(frames(4, 8), CAMERA)  # type: ignore[operator]
     assert np.allclose(one.T_chunk_cam, np.linalg.inv(whole.T_world_cam[4]) @ whole.T_world_cam[4:8], atol=1e-9)
+
+
+def test_noise_of_computed_depth_is_in_the_units_of_the_depth(tmp_path: Path) -> None:
+    whole, said = piece(), np.array([0.01, 0.004, 0.03])
+    write_manifest(tmp_path, Manifest("relative", "", 6, 2))
+    S = Sim3(np.asarray(2.0), np.eye(3), np.zeros(3))
+    write_piece(tmp_path / "a.npz", rows(whole, 0, 6))
+    write_piece(tmp_path / "b.npz", replace(rows(whole, 4, 10, S), depth_noise=said))
+    alone, both = (reader(tmp_path)(frames(first, 10), CAMERA) for first in (4, 0))  # type: ignore[operator]
+    assert alone.depth_noise == DepthNoise(*said)
+    in_units_of_a = both.depth_noise.sigma(np.array([1.5], np.float32))
+    assert in_units_of_a == pytest.approx(DepthNoise(*said).sigma(np.array([3.0], np.float32)) / 2, rel=1e-3)
+    assert both.depth_noise.half_share == 0.03
+    write_piece(tmp_path / "b.npz", rows(whole, 4, 10, S))
+    assert reader(tmp_path)(frames(4, 10), CAMERA).depth_noise is None  # type: ignore[operator]
 
 
 def test_files_of_one_world_need_no_common_frames(tmp_path: Path) -> None:
@@ -181,6 +199,7 @@ def damaged(path: Path, **change: object) -> None:
         ({"depth": np.zeros((4, 42, 56), np.int32)}, "depth must be real numbers"),
         ({"masks": np.zeros((4, 42, 56), np.float32)}, "masks must be whole numbers"),
         ({"features": np.zeros(3, np.float32)}, "features has shape"),
+        ({"depth_noise": np.array([0.1, -0.1, 0.0])}, "depth_noise must be three finite numbers"),
         ({"depth": np.array([{"a": 1}], dtype=object)}, "only numbers are read"),
     ],
 )

@@ -95,3 +95,16 @@ def test_files_for_another_machine_have_one_estimated_camera_and_say_it(pictures
     cameras = np.concatenate([read_piece(p).intrinsics for p in sorted((tmp_path / "files").glob("*.npz"))])
     assert report.files == 2 and (cameras == cameras[0]).all() and abs(cameras[0, 0] / CAMERA.fx - 1) < 0.1
     assert any("give the build the same: --intrinsics" in line for line in report.notes)
+    assert all(read_piece(p).depth_noise is not None for p in (tmp_path / "files").glob("*.npz"))
+
+
+def test_files_hold_frames_of_a_chunk_that_stands_still(tmp_path: Path) -> None:
+    folder = save(tmp_path / "stops", [pose(k) for k in range(18)] + [pose(17)] * 12)
+    options = SourceOptions(intrinsics=(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), distortion=())
+    settings = BuildSettings(reconstruction="sfm", chunks=ChunkSettings(18, 2), device="cpu")
+    task = ChunkTask(str(folder), options, ChunkSpan(1, 16, 30), settings, shot=(0, 30))
+    assert process_parts(task)[-1].posed.all()
+    report = precompute(folder, tmp_path / "files", options, settings, open_source(folder, options).info)
+    still = read_piece(tmp_path / "files" / "chunk-0001.npz")
+    assert report.files == 2 and report.posed == 30 and still.frames.tolist() == list(range(16, 30))
+    assert np.allclose(still.T_world_cam[1:], still.T_world_cam[1], atol=0.01)

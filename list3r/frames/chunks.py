@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -46,6 +47,13 @@ def plan_chunks(frame_count: int, settings: ChunkSettings, cuts: Sequence[int] =
     for start, stop in pairwise([0, *inside, frame_count]):
         spans += _plan_shot(start, stop, settings, len(spans))
     return spans
+
+
+def shot_of(span: ChunkSpan, cuts: Sequence[int], frame_count: int) -> tuple[int, int]:
+    """Positions [start, stop) of the shot between two cuts that a span lies in; `cuts` ascend."""
+    shots = [0, *cuts, frame_count]
+    at = bisect_right(shots, span.start)
+    return shots[at - 1], shots[at]
 
 
 def _plan_shot(start: int, stop: int, settings: ChunkSettings, first: int) -> list[ChunkSpan]:

@@ -24,6 +24,10 @@ class DepthNoise:
     half_share: float = 0.0
     """Deviation, as a share of depth, at which confidence is one half; 0 where confidence does not tell."""
 
+    def scaled(self, scale: float) -> DepthNoise:
+        """The same where a unit is `scale` units of before."""
+        return DepthNoise(self.base * scale, self.quadratic / scale, self.half_share)
+
     def sigma(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Standard deviation of depths, chunk units. Shape (...)."""
         return np.asarray(self.base + self.quadratic * depth * depth, np.float32)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import TrackingError
-from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.confidence import beside_edge
 from list3r.reconstruction.odometry import OdometrySettings
 from list3r.reconstruction.rgbd import select_keyframes
@@ -83,11 +83,14 @@ def focal_from_points(points_cam: NDArray[np.float32], weights: NDArray[np.float
     return np.array(found)
 
 
-def to_reconstruction(frames: Sequence[Frame], camera: Camera, output: WindowOutput) -> Reconstruction:
+def to_reconstruction(
+    frames: Sequence[Frame], camera: Camera, output: WindowOutput, noise: DepthNoise | None = None
+) -> Reconstruction:
     """A chunk's reconstruction at the frames' own size, in the frame of its first posed camera; scale is relative.
 
-    `camera` says the frames' size. Its focal lengths are replaced by the network's, for its points and poses are true
-    to those alone. Raises `TrackingError` when the network has an answer for fewer than two frames.
+    `camera` says the frames' size, `noise` how rough depth is that is no network's, whose edges are not smeared. Its
+    focal lengths are replaced by the network's, for its points and poses are true to those alone. Raises
+    `TrackingError` when the network has an answer for fewer than two frames.
     """
     posed = output.valid()
     if posed.sum() < min(2, len(frames)):
@@ -102,7 +105,9 @@ def to_reconstruction(frames: Sequence[Frame], camera: Camera, output: WindowOut
     shape = (len(frames), camera.height, camera.width)
     depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float16)
     for position in np.flatnonzero(posed).tolist():
-        depth[position], confidence[position] = _enlarged(output.part(slice(position, position + 1)), camera)
+        depth[position], confidence[position] = _enlarged(
+            output.part(slice(position, position + 1)), camera, noise is None
+        )
     keyframes = select_keyframes(T, posed, list(depth), OdometrySettings())
     return Reconstruction(
         frame_indices=np.array([f.index for f in frames], np.int64),
@@ -113,6 +118,7 @@ def to_reconstruction(frames: Sequence[Frame], camera: Camera, output: WindowOut
         confidence=confidence,
         scale_kind="relative",
         keyframes=np.array(keyframes, np.int64),
+        depth_noise=noise,
     )
 
 
@@ -124,13 +130,14 @@ def network_camera(camera: Camera, output: WindowOutput, posed: NDArray[np.bool_
     return Camera(camera.width, camera.height, fx * camera.width / width, fy * camera.height / height, *middle)
 
 
-def _enlarged(one: WindowOutput, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
+def _enlarged(one: WindowOutput, camera: Camera, smeared: bool) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
     """Depth and confidence of one frame at the frames' size; unknown where a pixel's neighbours are not all known."""
     size = (camera.width, camera.height)
     known = one.known()[0]
     depth = np.where(known, one.depth[0], np.float32(0))
     confidence = np.where(known, np.clip(one.confidence[0], 0.0, 1.0), np.float32(0)).astype(np.float32)
-    confidence[beside_edge(depth, known, EDGE_STEP)] *= np.float32(EDGE_CONFIDENCE)
+    if smeared:
+        confidence[beside_edge(depth, known, EDGE_STEP)] *= np.float32(EDGE_CONFIDENCE)
     large = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.999
     out = np.where(large, cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR), np.float32(0))
     sure = np.where(large, cv2.resize(confidence, size, interpolation=cv2.INTER_LINEAR), 0.0)
@@ -163,4 +170,5 @@ def with_given_poses(made: Reconstruction, frames: Sequence[Frame]) -> Reconstru
         confidence=np.where(posed[:, None, None], made.confidence, np.float16(0)),
         scale_kind="metric",
         keyframes=made.keyframes[posed[made.keyframes]],
+        depth_noise=None if made.depth_noise is None else made.depth_noise.scaled(scale),
     )

@@ -7,7 +7,7 @@ and frames of several files are joined by the frames that the files share; else 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import DegenerateError, OptionError, TrackingError
 from list3r.memory.geometry import Sim3
-from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.feedforward_output import WindowOutput, to_reconstruction, with_given_poses
 from list3r.reconstruction.feedforward_windows import between, regauged
 from list3r.reconstruction.precomputed_files import Manifest, read_frames, read_manifest, read_piece
@@ -72,9 +72,9 @@ class PrecomputedReconstructor:
         Raises `TrackingError` when fewer than two are held, `OptionError` for files that are damaged or do not fit.
         """
         wanted = np.array([f.index for f in frames], np.int64)
-        output, principal = self._gather(wanted)
+        output, principal, noise = self._gather(wanted)
         try:
-            made = to_reconstruction(frames, camera, output)
+            made = to_reconstruction(frames, camera, output, noise)
         except TrackingError:
             raise TrackingError(f"{self._path} holds too little of frames {wanted[0]} to {wanted[-1]}") from None
         sy, sx = (full / small for full, small in zip(made.depth.shape[1:], output.depth.shape[1:], strict=True))
@@ -82,9 +82,10 @@ class PrecomputedReconstructor:
         made = replace(made, camera=replace(made.camera, cx=cx, cy=cy), scale_kind=self._folder.manifest.scale)
         return with_given_poses(made, frames) if self._poses == "given" else made
 
-    def _gather(self, wanted: NDArray[np.int64]) -> tuple[WindowOutput, NDArray[np.float64]]:
-        """The answer for the wanted frames, in the gauge of the first file, and principal points (F, 2), px."""
+    def _gather(self, wanted: NDArray[np.int64]) -> tuple[WindowOutput, NDArray[np.float64], DepthNoise | None]:
+        """The answer for the wanted frames, in the gauge of the first file, principal points (F, 2), px, and noise."""
         output: WindowOutput | None = None
+        noises: list[DepthNoise] = []
         principal = np.full((len(wanted), 2), np.nan)
         filled = np.zeros(len(wanted), bool)
         for k in self._folder.holding(wanted):
@@ -98,17 +99,20 @@ class PrecomputedReconstructor:
                 output = _unknown(len(wanted), part.depth.shape[1:])
             if output.depth.shape[1:] != part.depth.shape[1:]:
                 raise OptionError(f"{self._folder.files[k]}: depth images of another size than in the files before it")
-            shared = filled[where]
+            shared, scale = filled[where], 1.0
             if self._folder.manifest.length is not None and filled.any():
-                part = regauged(part, self._between(output, where[shared], part, shared, k))
+                S = self._between(output, where[shared], part, shared, k)
+                part, scale = regauged(part, S), float(S.scale)
             fresh = where[~shared]
             for target, source in zip(output.arrays(), part.arrays(), strict=True):
                 target[fresh] = source[~shared]
             principal[fresh] = piece.intrinsics[rows[~shared], 2:]
             filled[fresh] = True
+            if piece.depth_noise is not None:
+                noises.append(DepthNoise(*piece.depth_noise.tolist()).scaled(scale))
         if output is None:
             raise TrackingError(f"{self._path} holds none of the frames {wanted[0]} to {wanted[-1]}")
-        return output, principal
+        return output, principal, _roughest(noises)
 
     def _between(
         self, output: WindowOutput, where: NDArray[np.int64], part: WindowOutput, shared: NDArray[np.bool_], k: int
@@ -121,6 +125,13 @@ class PrecomputedReconstructor:
                 f"{self._folder.files[k]} shares no posed frame with the files before it; give --chunk and --overlap "
                 "as it was made with"
             ) from None
+
+
+def _roughest(noises: Sequence[DepthNoise]) -> DepthNoise | None:
+    """Noise that is not less than that of any file; None where no file says it."""
+    if not noises:
+        return None
+    return DepthNoise(*(max(values) for values in zip(*(astuple(n) for n in noises), strict=True)))
 
 
 def _unknown(count: int, size: tuple[int, ...]) -> WindowOutput:

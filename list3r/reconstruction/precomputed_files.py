@@ -27,7 +27,7 @@ MAX_BYTES = 8 * 2**30
 """No file unpacks to more: 1,000 frames of 1,000 x 1,000 pixels."""
 _MAX_MANIFEST = 2**20
 _NEEDED = {"frames": "iu", "T_world_cam": "f", "intrinsics": "f", "depth": "f", "confidence": "f"}
-_OPTIONAL = {"masks": "iu", "features": "f"}
+_OPTIONAL = {"masks": "iu", "features": "f", "depth_noise": "f"}
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,8 @@ class Piece:
     """Thing at each pixel, 0 for none; the same number is the same thing throughout the file. Shape (F, h, w)."""
     features: NDArray[np.float32] | None = None
     """Object feature of thing n in row n - 1. Shape (N, D)."""
+    depth_noise: NDArray[np.float64] | None = None
+    """`base`, `quadratic` and `half_share` of a `DepthNoise`, in the file's units. Shape (3,)."""
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -109,6 +111,8 @@ def write_piece(path: Path, piece: Piece) -> None:
         arrays["masks"] = piece.masks.astype("<i4")
     if piece.features is not None:
         arrays["features"] = piece.features.astype("<f4")
+    if piece.depth_noise is not None:
+        arrays["depth_noise"] = piece.depth_noise.astype("<f8")
     with path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
@@ -137,7 +141,9 @@ def read_piece(path: Path) -> Piece:
             raise OptionError(f"{path}: {name} has shape {found[name].shape}; {shape} is needed")
     if "features" in found and found["features"].ndim != 2:
         raise OptionError(f"{path}: features has shape {found['features'].shape}; (N, D) is needed")
-    masks, features = found.get("masks"), found.get("features")
+    masks, features, noise = (found.get(name) for name in _OPTIONAL)
+    if noise is not None and (noise.shape != (3,) or not np.isfinite(noise).all() or noise.min() < 0):
+        raise OptionError(f"{path}: depth_noise must be three finite numbers that are not negative")
     return Piece(
         frames,
         found["T_world_cam"].astype(np.float64),
@@ -146,6 +152,7 @@ def read_piece(path: Path) -> Piece:
         found["confidence"].astype(np.float32),
         None if masks is None else masks.astype(np.int32),
         None if features is None else features.astype(np.float32),
+        None if noise is None else noise.astype(np.float64),
     )
 
 

@@ -122,7 +122,7 @@ class SfmReconstructor:
         if self.poses == "given":
             return [self._given(frames, tracks, problem, camera)]
         _check_motion(frames, tracks, s)
-        maps = self._maps(frames, tracks, problem, camera, around)
+        maps = self._maps(frames, grays, tracks, problem, camera, around)
         segments = fill_segments(maps, tracks, grays, s.fill)
         if not segments:
             raise _no_map(frames, tracks)
@@ -131,6 +131,7 @@ class SfmReconstructor:
     def _maps(
         self,
         frames: Sequence[Frame],
+        grays: Sequence[Gray],
         tracks: Tracks,
         problem: MapProblem,
         camera: Camera,
@@ -139,10 +140,11 @@ class SfmReconstructor:
         """Maps of the keyframes, made with the help of frames around the chunk."""
         s, free = self.settings, "" if self.camera_known else "focal"
         before, behind = ((), ()) if around is None else around(step_beside(tracks, s.links), s.links.beside)
-        seen = [*frames, *before, *behind]
-        early, late = np.split(np.arange(len(frames), len(seen)), [len(before)])
+        beside = [*before, *behind]
+        early, late = np.split(len(frames) + np.arange(len(beside)), [len(before)])
         few = replace(s.links.features, count=s.links.ahead_features, learned_count=s.links.ahead_features)
-        finder = make_finder([_gray(f) for f in seen], [f.color for f in seen], self.detector, few)
+        seen, colors = [*grays, *map(_gray, beside)], [f.color for f in (*frames, *beside)]
+        finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         return build_maps(wider, camera, free_camera=free, settings=s.mapping)
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.reconstruction.sfm_mapping import MappingSettings, Poses, SparseMap, pose_of
+from list3r.frames.base import Camera
+from list3r.reconstruction.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
+from list3r.reconstruction.sfm_mapping import MappingSettings, Poses, SparseMap
 from list3r.reconstruction.sfm_tracks import Gray, Tracks
 
 Floats = NDArray[np.float32]
@@ -96,6 +99,57 @@ def _with_features(
     others = seen.where(rows)
     places = np.array([found.points[int(n)] for n in others.ids]).reshape(-1, 3)
     return np.concatenate([xy, others.xy]), np.concatenate([points, places])
+
+
+def pose_of(
+    xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: MappingSettings
+) -> tuple[Poses, NDArray[np.bool_]] | None:
+    """T_map_cam from points (N, 3) and where they are seen (N, 2), and which agree; None when too few do.
+
+    From `start` by robust refinement; where that fails, or without one, by sampling.
+    """
+    if len(xy) < settings.least_matches:
+        return None
+    lens, px = make_lens(camera, ""), xy.astype(np.float64) + 0.5
+    gate = settings.pose_error_px * pixel_unit(camera)
+    if start is not None:
+        found = _refined(px, points, lens, camera, start, np.ones(len(px), bool), gate)
+        if found is not None and found[1].mean() > 0.6:
+            return found
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, settings.seed, 1
+    guess = pycolmap.estimate_and_refine_absolute_pose(px, points, lens, options)
+    if guess is None or guess["num_inliers"] < settings.least_matches:
+        return None
+    T = inverse(matrix_of(guess["cam_from_world"]))
+    found = _refined(px, points, lens, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
+    return found if found is not None and found[1].mean() > 0.3 else None
+
+
+def _refined(
+    px: NDArray[np.float64],
+    points: NDArray[np.float64],
+    lens: Any,
+    camera: Camera,
+    start: Poses,
+    rows: NDArray[np.bool_],
+    gate: float,
+) -> tuple[Poses, NDArray[np.bool_]] | None:
+    T_cam_map = inverse(start)
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.loss_function_scale, options.gradient_tolerance = 0.5 * pixel_unit(camera), 1e-3
+    for _ in range(2):
+        found = pycolmap.refine_absolute_pose(rigid_of(T_cam_map), px, points, rows, lens, options)
+        if found is None:
+            return None
+        T_cam_map = matrix_of(found["cam_from_world"])
+        seen = points @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
+        z = np.maximum(seen[:, 2], 1e-9)
+        at = seen[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx + 0.5, camera.cy + 0.5)
+        rows = (seen[:, 2] > 0) & (np.linalg.norm(at - px, axis=1) < gate)
+        if rows.sum() < 12:
+            return None
+    return inverse(T_cam_map), rows
 
 
 def _bridge(segment: Segment, grays: Sequence[Gray], positions: Sequence[int], settings: FillSettings) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.colmap import pycolmap
+from list3r.reconstruction.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm_consistency import contradicted
 from list3r.reconstruction.sfm_turning import only_turns
 
@@ -215,7 +215,7 @@ def triangulate(
     made = pycolmap.Reconstruction()
     mapper.begin_reconstruction(made)
     for image_id, image in sorted(made.images.items()):
-        image.frame.set_cam_from_world(image.camera_id, _rigid(_inverse(T_map_cam[image_id - 1])))
+        image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
         made.register_frame(image.frame_id)
     options = _options(camera, "", chosen)
     for image_id in sorted(made.images):
@@ -226,61 +226,10 @@ def triangulate(
     return found if len(found.points) >= chosen.least_points else None
 
 
-def pose_of(
-    xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: MappingSettings
-) -> tuple[Poses, NDArray[np.bool_]] | None:
-    """T_map_cam from points (N, 3) and where they are seen (N, 2), and which agree; None when too few do.
-
-    From `start` by robust refinement; where that fails, or without one, by sampling.
-    """
-    if len(xy) < settings.least_matches:
-        return None
-    lens, px = _lens(camera, ""), xy.astype(np.float64) + 0.5
-    gate = settings.pose_error_px * _unit(camera)
-    if start is not None:
-        found = _refined(px, points, lens, camera, start, np.ones(len(px), bool), gate)
-        if found is not None and found[1].mean() > 0.6:
-            return found
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, settings.seed, 1
-    guess = pycolmap.estimate_and_refine_absolute_pose(px, points, lens, options)
-    if guess is None or guess["num_inliers"] < settings.least_matches:
-        return None
-    T = _inverse(_matrix(guess["cam_from_world"]))
-    found = _refined(px, points, lens, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
-    return found if found is not None and found[1].mean() > 0.3 else None
-
-
-def _refined(
-    px: NDArray[np.float64],
-    points: NDArray[np.float64],
-    lens: Any,
-    camera: Camera,
-    start: Poses,
-    rows: NDArray[np.bool_],
-    gate: float,
-) -> tuple[Poses, NDArray[np.bool_]] | None:
-    T_cam_map = _inverse(start)
-    options = pycolmap.AbsolutePoseRefinementOptions()
-    options.loss_function_scale, options.gradient_tolerance = 0.5 * _unit(camera), 1e-3
-    for _ in range(2):
-        found = pycolmap.refine_absolute_pose(_rigid(T_cam_map), px, points, rows, lens, options)
-        if found is None:
-            return None
-        T_cam_map = _matrix(found["cam_from_world"])
-        seen = points @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
-        z = np.maximum(seen[:, 2], 1e-9)
-        at = seen[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx + 0.5, camera.cy + 0.5)
-        rows = (seen[:, 2] > 0) & (np.linalg.norm(at - px, axis=1) < gate)
-        if rows.sum() < 12:
-            return None
-    return _inverse(T_cam_map), rows
-
-
 def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
     """pycolmap's correspondence graph; None when no two views have anything in common."""
     database = pycolmap.Database.open(":memory:")
-    lens = _lens(camera, free_camera)
+    lens = make_lens(camera, free_camera)
     lens.camera_id = 1
     database.write_camera(lens, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=1)
@@ -325,7 +274,7 @@ def _two_view(
         return None
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers, options.detect_watermark = settings.least_matches, False
-    options.ransac.max_error = settings.pair_error_px * _unit(camera) * (2.0 if free_camera else 1.0)
+    options.ransac.max_error = settings.pair_error_px * pixel_unit(camera) * (2.0 if free_camera else 1.0)
     options.ransac.random_seed, options.ransac.num_threads = settings.seed, 1
     if matched:
         options.min_E_F_inlier_ratio, options.ransac.min_inlier_ratio = 0.0, settings.matched_share
@@ -346,7 +295,7 @@ def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any
     options.ba_local_max_num_iterations, options.ba_global_max_num_iterations = 10, 25
     options.ba_global_max_refinements = 3
     options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
-    mapper, unit = options.mapper, _unit(camera)
+    mapper, unit = options.mapper, pixel_unit(camera)
     mapper.num_threads, mapper.random_seed = 1, settings.seed
     mapper.init_min_num_inliers = 2 * settings.least_matches
     mapper.init_max_error = settings.pair_error_px * unit * (2.0 if free_camera else 1.0)
@@ -366,7 +315,7 @@ def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any
 def _sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
     poses: dict[int, Poses] = {}
     for image_id in sorted(made.reg_image_ids()):
-        poses[image_id - 1] = _inverse(_matrix(made.images[image_id].cam_from_world()))
+        poses[image_id - 1] = inverse(matrix_of(made.images[image_id].cam_from_world()))
     points: dict[int, NDArray[np.float64]] = {}
     best: dict[int, int] = {}
     rows: dict[int, list[int]] = {key: [] for key in poses}
@@ -387,33 +336,3 @@ def _sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
         k1 = 0.0
     error = float(made.compute_mean_reprojection_error()) if made.num_points3D() else 0.0
     return SparseMap(poses, points, camera, k1, error, seen)
-
-
-def _lens(camera: Camera, free_camera: str) -> Any:
-    c = camera
-    if free_camera:
-        model, params = "SIMPLE_RADIAL", [0.5 * (c.fx + c.fy), c.cx + 0.5, c.cy + 0.5, 0.0]
-    else:
-        model, params = "PINHOLE", [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5]
-    lens = pycolmap.Camera(model=model, width=c.width, height=c.height, params=params)
-    lens.has_prior_focal_length = free_camera != "focal"
-    return lens
-
-
-def _unit(camera: Camera) -> float:
-    """Px of this camera that are one px of a picture 640 wide."""
-    return max(camera.width, camera.height) / 640.0
-
-
-def _matrix(rigid: Any) -> Poses:
-    T = np.eye(4)
-    T[:3] = rigid.matrix()
-    return T
-
-
-def _inverse(T: Poses) -> Poses:
-    return np.asarray(np.linalg.inv(T), np.float64)
-
-
-def _rigid(T: Poses) -> Any:
-    return pycolmap.Rigid3d(T[:3].copy())
