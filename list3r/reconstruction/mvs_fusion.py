@@ -171,9 +171,10 @@ def carry(maps: Sequence[DepthMap], warps: Sequence[Warp], tolerance: float = 0.
 def _splat(depth: DepthMap, warp: Warp) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Pixels, inverse depth, sigma and bilinear share of a keyframe's points in another frame, four pixels each."""
     height, width = depth.inverse.shape
-    known = depth.inverse > 0
-    x, y, ratio = (value[known] for value in warp.place(depth.inverse))
-    inverse, sigma = depth.inverse[known] / ratio.clamp_min(1e-4), depth.sigma[known]
+    known = torch.nonzero(depth.inverse.flatten() > 0)[:, 0]
+    x, y, ratio = (value.flatten().index_select(0, known) for value in warp.place(depth.inverse))
+    inverse, sigma = (value.flatten().index_select(0, known) for value in (depth.inverse, depth.sigma))
+    inverse = inverse / ratio.clamp_min(1e-4)
     left, top = torch.floor(x), torch.floor(y)
     parts = []
     for j in (0, 1):
@@ -181,8 +182,9 @@ def _splat(depth: DepthMap, warp: Warp) -> tuple[Tensor, Tensor, Tensor, Tensor]
             column, row = left + i, top + j
             share = (1.0 - (x - column).abs()) * (1.0 - (y - row).abs())
             ok = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (ratio > 1e-3) & (share > 0.05)
+            rows = torch.nonzero(ok)[:, 0]
             index = (row * width + column).long()
-            parts.append((index[ok], inverse[ok], sigma[ok], share[ok]))
+            parts.append(tuple(value.index_select(0, rows) for value in (index, inverse, sigma, share)))
     index, inverse, sigma, share = (torch.cat(part) for part in zip(*parts, strict=True))
     return index, inverse, sigma, share
 
@@ -198,8 +200,9 @@ def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: floa
     y = (torch.arange(H, device=full.device) + 0.5) * (height / H) - 0.5
     x = (torch.arange(W, device=full.device) + 0.5) * (width / W) - 0.5
     top, left = torch.floor(y).long(), torch.floor(x).long()
-    zero = torch.zeros_like(full)
+    zero = torch.zeros((), device=full.device)
     values, weights, sigmas = [], [], []
+    best, most = torch.zeros_like(full), torch.full_like(full, -1.0)
     for j in (0, 1):
         for i in (0, 1):
             row, column = (top + j).clamp(0, height - 1), (left + i).clamp(0, width - 1)
@@ -207,16 +210,22 @@ def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: floa
             pick = (row[:, None], column[None])
             inverse = depth.inverse[pick]
             likeness = torch.exp(-(gray[pick] - full).abs() / edge)
-            weights.append(torch.where(inverse > 0, near * likeness + 1e-6, zero))
+            weight = torch.where(inverse > 0, near * likeness + 1e-6, zero)
+            best = torch.where(weight > most, inverse, best)
+            most = torch.maximum(weight, most)
+            weights.append(weight)
             values.append(inverse)
             sigmas.append(depth.sigma[pick])
-    stack, weight = torch.stack(values), torch.stack(weights)
-    best = stack.gather(0, weight.argmax(dim=0, keepdim=True))
-    weight = torch.where((stack - best).abs() < step * best, weight, torch.zeros((), device=full.device))
-    total = weight.sum(dim=0).clamp_min(1e-12)
-    known = (stack > 0).sum(dim=0) >= 2
-    inverse = torch.where(known, (weight * stack).sum(dim=0) / total, zero)
-    return inverse, torch.where(known, (weight * torch.stack(sigmas)).sum(dim=0) / total, zero)
+    known = torch.zeros_like(full)
+    total, mean, sigma = torch.zeros_like(full), torch.zeros_like(full), torch.zeros_like(full)
+    for inverse, weight, unsure in zip(values, weights, sigmas, strict=True):
+        weight = torch.where((inverse - best).abs() < step * best, weight, zero)
+        known += inverse > 0
+        total += weight
+        mean += weight * inverse
+        sigma += weight * unsure
+    total = total.clamp_min(1e-12)
+    return torch.where(known >= 2, mean / total, zero), torch.where(known >= 2, sigma / total, zero)
 
 
 def speckles_out(depth: DepthMap, radius: int = 2, share: float = 0.35) -> DepthMap:
