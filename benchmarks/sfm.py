@@ -36,6 +36,7 @@ def main() -> None:
     )
     parser.add_argument("--intrinsics", help="fx,fy,cx,cy of the colour camera; estimated where left out")
     parser.add_argument("--frames", type=int, help="only the first so many")
+    parser.add_argument("--every", type=int, help="`list3r build` takes every n-th frame")
     parser.add_argument("--plain-every", type=int, default=8, help="plain pycolmap maps every n-th frame")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--given-as", choices=("folder", "mp4", "phone"), default="folder")
@@ -111,6 +112,7 @@ def _ours(folder: Path, scratch: Path, words: argparse.Namespace, truth: Traject
     memory = words.keep or scratch / "memory.l3r"
     options = ["--reconstruction", "sfm", "--workers", str(words.workers)]
     options += ["--intrinsics", words.intrinsics] if words.intrinsics else []
+    options += ["--every", str(words.every)] if words.every else []
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     report, usage = run_list3r("build", str(folder), "-m", str(memory), *options)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
