@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from list3r.instances.segments import Segment, Segmentation
-from list3r.instances.snapping import _elected, snapped, without_segments
+from list3r.instances.snapping import _elected, snap_things, snapped, without_segments
 
 TABLE, MUG, OTHER = 1, 2, 3
 THING = np.array([False, False, True, True])
@@ -78,3 +80,17 @@ def test_what_is_left_out_leaves_the_others_in_order() -> None:
     kept = without_segments(cut, np.array([True, False, True]))
     assert kept.labels.tolist() == [0, 1, 0, 2, 0]
     assert [s.score for s in kept.segments] == [0.1, 0.3]
+
+
+def test_a_surface_of_which_a_thing_took_all_is_left_out() -> None:
+    rgb, mug = picture()
+    strip = np.zeros_like(mug)
+    strip[36:60, 94] = True
+    rgb[strip] = WHITE
+    labels = np.where(strip, 3, np.where(mug, MUG, TABLE)).ravel().astype(np.int32)
+    segments = tuple(Segment(kind, None, False, 0.5) for kind in ("surface", "thing", "surface"))
+    views = SimpleNamespace(anchors=[0], view=lambda position: SimpleNamespace(rgb=rgb))
+    cloud = SimpleNamespace(index=[np.arange(rgb[..., 0].size).reshape(mug.shape)])
+    cut = snap_things(views, cloud, Segmentation(labels, segments, np.array([0.0, 0.0, 1.0])), least=20)  # type: ignore[arg-type]
+    assert [s.kind for s in cut.segments] == ["surface", "thing"]
+    assert np.bincount(cut.labels).argmin() == 0 and (cut.labels > 0).all()

@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 def snap_things(views: ChunkViews, cloud: Cloud, cut: Segmentation, least: int) -> Segmentation:
     """The cut with voxels near the border of a thing given to what they look like a part of, by most of the views, and
-    without things of which fewer than `least` voxels and half are left.
+    without things of which fewer than `least` voxels and half are left, and what a thing took as a whole.
     """
     thing = np.array([False, *(s.kind == "thing" for s in cut.segments)])
     votes = [np.zeros(0, np.int64)]
@@ -41,7 +41,7 @@ def snap_things(views: ChunkViews, cloud: Cloud, cut: Segmentation, least: int) 
         votes.append(index[known].astype(np.int64) * len(thing) + found[known])
     labels = _elected(cut.labels, np.concatenate(votes), len(thing))
     before, after = (np.bincount(x, minlength=len(thing)) for x in (cut.labels, labels))
-    gone = thing & (after < np.minimum(least, 0.5 * before))
+    gone = (after == 0) | (thing & (after < np.minimum(least, 0.5 * before)))
     labels = np.where(gone[labels], 0, labels)
     return without_segments(Segmentation(labels, cut.segments, cut.up), ~gone[1:])
 
