@@ -93,4 +93,4 @@ def test_a_surface_of_which_a_thing_took_all_is_left_out() -> None:
     cloud = SimpleNamespace(index=[np.arange(rgb[..., 0].size).reshape(mug.shape)])
     cut = snap_things(views, cloud, Segmentation(labels, segments, np.array([0.0, 0.0, 1.0])), least=20)  # type: ignore[arg-type]
     assert [s.kind for s in cut.segments] == ["surface", "thing"]
-    assert np.bincount(cut.labels).argmin() == 0 and (cut.labels > 0).all()
+    assert set(np.unique(cut.labels)) <= {0, 1, 2} and (cut.labels[mug.ravel() | strip.ravel()] == 2).mean() > 0.9
