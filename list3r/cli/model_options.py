@@ -149,6 +149,7 @@ def build_settings(
     asked = parse_weights(words.weights)
     if selection.discovery == selection.reconstruction == "precomputed" and "reconstruction" in asked:
         asked.setdefault("discovery", asked["reconstruction"])
+    _check_used(asked, selection)
     chosen = check_allowed(selection, asked, words.licence)
     notes = [f"note: {selection.why}"] if selection.why else []
     notes += _terms(selection, chosen)
@@ -171,6 +172,19 @@ def build_settings(
     chunks = None if resumed is None or cut.chunk is not None else _recorded(resumed)
     chunks = chunks or _cut(settings, cut.chunk, cut.overlap)
     return replace(settings, chunks=chunks), notes
+
+
+def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
+    """Raises `OptionError` for weights of a part whose model has none, so that nobody waits for another result."""
+    from list3r.memory.errors import OptionError
+
+    taking = {option.removeprefix("--") for option, _ in selection.cards()}
+    for part, where in asked.items():
+        model = getattr(selection, part)
+        if not where:
+            raise OptionError(f"--weights {part}= names nothing; give a folder, a file or owner/name@revision")
+        if part not in taking and model != "precomputed":
+            raise OptionError(f"--weights {where}: the {part} {model} takes no weights; name its network with --{part}")
 
 
 def _local_features(words: str) -> tuple[str, str | None]:
@@ -249,11 +263,11 @@ def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> Ch
         from list3r.reconstruction.precomputed_files import read_manifest
 
         said = read_manifest(Path(settings.weights).expanduser())
-        length, overlap = said.length, overlap or said.overlap
+        length, overlap = said.length, said.overlap if overlap is None else overlap
     elif length is None and card is not None:
         length = _fitting(card, settings)
-    length = length or USUAL_CHUNK
-    return ChunkSettings(length, overlap or max(1, min(30, round(0.3 * length))))
+    length = USUAL_CHUNK if length is None else length
+    return ChunkSettings(length, max(1, min(30, round(0.3 * length))) if overlap is None else overlap)
 
 
 def _fitting(card: ModelCard, settings: BuildSettings) -> int:
