@@ -148,5 +148,11 @@ def _write(path: Path, made: Reconstruction, shown: dict[int, int]) -> None:
     indices, confidence = np.array(list(held), np.int64), made.confidence[rows].astype(np.float32)
     piece = Piece(indices, T, intrinsics, made.depth[rows], confidence, depth_noise=noise)
     part = path.with_suffix(".part")
-    write_piece(part, piece)
-    part.replace(path)
+    try:
+        write_piece(part, piece)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OptionError(
+            f"{path} cannot be written: {error.strerror or error}; finished files are kept: give the command again"
+        ) from error

@@ -41,6 +41,7 @@ def inspect(
 
     Example: list3r inspect walk.mp4 --json
     """
+    from list3r.exporters.output import replacing
     from list3r.frames.inspection import describe, draw_registration, lines
     from list3r.frames.source import open_source
 
@@ -54,7 +55,8 @@ def inspect(
 
         report["calibration"] = estimate(source, options).as_dict()
     if overlay is not None:
-        draw_registration(opened, overlay)
+        with replacing(overlay) as temporary:
+            draw_registration(opened, temporary)
         report["overlay"] = str(overlay)
     if json:
         print_json(report)
