@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
 import list3r
+from list3r.cli.app import app
 from list3r.memory.store import Store
 from tests.conftest import write_small_room
 
@@ -40,6 +42,7 @@ COMMANDS = (
     "inspect build demo info list show export verify doctor query.nearest query.within query.relations query.similar"
     " eval.trajectory eval.cloud eval.instances eval.revisits query.find query.seen query.path"
     " query.changes update merges undo merge split label delete repair"
+    " embed detect scale precompute models.list models.fetch"
 ).split()
 
 
@@ -54,6 +57,26 @@ def test_the_readme_names_every_command() -> None:
     assert [c for c in COMMANDS if not re.search(rf"`[^`]*\b{c.replace('.', ' ')}\b", text)] == []
 
 
+def test_the_page_of_commands_names_every_command_and_option_and_no_other() -> None:
+    page = (Path(__file__).resolve().parents[1] / "docs/commands.md").read_text(encoding="utf-8")
+    told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", " ".join(re.findall(r"`[^`]*`", page))))
+    assert told == options_of(typer.main.get_command(app)) | {"-h", "--help", "--version"}
+    assert [c for c in COMMANDS if not re.search(rf"`[^`]*\b{c.split('.')[-1]}\b", page)] == []
+
+
+def options_of(command: Any) -> set[str]:
+    """Options of a command and of those under it."""
+    own = {o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("-")}
+    return own.union(*(options_of(c) for c in getattr(command, "commands", {}).values()))
+
+
+def test_every_json_answer_names_things_alike(room: Path) -> None:
+    report = ask("info", room, "--loops")
+    assert report["memory"] == str(room) == ask("verify", room)["memory"]
+    assert report["components"] == len(report["parts"]) == 1
+    assert ask("verify", room)["sessions"] == [{"id": 1, "state": report["sessions"][0]["state"]}]
+
+
 def test_help_is_quick_and_loads_nothing_heavy() -> None:
     heavy = ("torch", "open3d", "cv2", "numpy")
     code = f"import sys; from list3r.cli.app import app; print([m for m in {heavy} if m in sys.modules])"
@@ -63,7 +86,7 @@ def test_help_is_quick_and_loads_nothing_heavy() -> None:
 
 def test_info_names_scale_gravity_and_frames(room: Path) -> None:
     report = ask("info", room)
-    assert (report["scale"], report["gravity"], report["frames"], report["things"]) == ("metric", "estimated", 20, 4)
+    assert (report["scale"], report["gravity"], report["frames"], report["instances"]) == ("metric", "estimated", 20, 4)
     assert "sensor depth" in run("info", room)
     assert ask("info", room, "--loops")["edges"] == []
 

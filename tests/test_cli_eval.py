@@ -301,7 +301,7 @@ def test_info_as_json_has_edges_components_and_uncertainty(place: Path) -> None:
     report = ask("info", place / "walk.l3r", "--loops")
     loops = [e for e in report["edges"] if e["kind"] == "loop"]
     assert [e["times_s"] for e in loops] == [[0.066667, 1.1], [0.4, 1.166667]]
-    assert report["components"][0]["chunks"] == [1, 2, 3, 4, 5]
+    assert report["parts"][0]["chunks"] == [1, 2, 3, 4, 5]
     assert report["chunk_poses"][1]["sigma"]["position"] == pytest.approx(0.01)
     assert "edges" not in ask("info", place / "walk.l3r")
 

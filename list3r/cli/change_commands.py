@@ -28,7 +28,7 @@ def changes(
     with open_memory(memory) as scene:
         found = find(scene.store, since, KINDS if seen_again else KINDS[:3], min_confidence)
         if json:
-            print_json([_entry(c) for c in found])
+            print_json([_entry(c, scene.units) for c in found])
             return
         rows = [
             [
@@ -51,7 +51,7 @@ def _place(box: Any) -> str:
     return "" if box is None else ", ".join(f"{v:.2f}" for v in box.center)
 
 
-def _entry(changed: Any) -> dict[str, Any]:
+def _entry(changed: Any, units: str) -> dict[str, Any]:
     from list3r.cli.memory_commands import instance_dict
 
     event = changed.event
@@ -61,7 +61,8 @@ def _entry(changed: Any) -> dict[str, Any]:
         "kind": event.kind,
         "from": _box(event.from_box),
         "to": _box(event.to_box),
-        "distance_m": changed.distance_m,
+        "distance": changed.distance_m,
+        "units": units,
         "confidence": event.confidence,
         "reason": event.reason,
         "frames": [{"session": s, "frame": f} for s, f in event.frames],

@@ -49,18 +49,21 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         with open_memory(memory) as scene:
             found = scene.store.verify()
             if not found:
-                state, chunks = [s.state for s in scene.store.sessions()], len(scene.store.chunks())
+                chunks = len(scene.store.chunks())
+                state = [{"id": s.session_id, "state": s.state} for s in scene.store.sessions()]
     except MemoryFileError as error:
         if not _is_broken(memory, error):
             raise
         found = [f"it cannot be opened: {error.__cause__}"]
     if json:
-        print_json({"sound": not found, "damage": found, "sessions": state, "chunks": chunks})
+        print_json({"memory": str(memory), "sound": not found, "damage": found, "sessions": state, "chunks": chunks})
     elif found:
         print("\n".join(found))
         print(f"`list3r repair {memory}` saves what is sound")
     else:
-        unfinished = "; the build is unfinished, go on with --resume" if "building" in state else ""
+        unfinished = (
+            "; the build is unfinished, go on with --resume" if any(s["state"] == "building" for s in state) else ""
+        )
         print(f"{memory} is sound: {chunks} chunks{unfinished}")
     if found:
         raise typer.Exit(1)

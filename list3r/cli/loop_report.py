@@ -21,7 +21,7 @@ def loop_report(store: Store) -> dict[str, Any]:
     sessions = {c.chunk_id: c.session_id for c in store.chunks()}
     return {
         "edges": [_edge(e, sessions, times) for e in store.edges()],
-        "components": _components(store.chunks()),
+        "parts": _components(store.chunks()),
         "chunk_poses": [_chunk(c) for c in store.chunks()],
     }
 
@@ -98,7 +98,7 @@ def print_loop_report(report: dict[str, Any], units: str) -> None:
 
 
 def _component_lines(report: dict[str, Any]) -> list[str]:
-    parts = report["components"]
+    parts = report["parts"]
     if not parts:
         return ["no chunk is stored yet"]
     if len(parts) == 1:

@@ -63,7 +63,7 @@ def memory_report(scene: SceneMemory) -> dict[str, Any]:
     frames, chunks, edges = store.frames(), store.chunks(), store.edges()
     states = {state: sum(f.state == state for f in frames) for state in ("posed", "lost", "bad")}
     return {
-        "path": str(scene.path),
+        "memory": str(scene.path),
         "size_mb": round(scene.path.stat().st_size / 1e6, 2),
         "created_by": store.get_value("created_by"),
         "scale": store.get_value("scale_kind"),
@@ -73,10 +73,10 @@ def memory_report(scene: SceneMemory) -> dict[str, Any]:
         "frames": len(frames),
         **states,
         "chunks": len(chunks),
-        "parts": len({c.component for c in chunks}),
-        "loops_accepted": sum(e.kind == "loop" and e.accepted for e in edges),
+        "components": len({c.component for c in chunks}),
+        "loops": sum(e.kind == "loop" and e.accepted for e in edges),
         "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
-        "things": len(store.instances(structure=False)),
+        "instances": len(store.instances(structure=False)),
         "structure": len(store.instances(structure=True)),
         "relations": len(store.relations()),
         "aliases": len(store.aliases()),

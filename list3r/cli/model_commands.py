@@ -121,7 +121,7 @@ def precompute(
             note(line)
     report = _write_all(source, out, options, settings, info, force=force, licence=geometry.licence, quiet=json)
     if json:
-        print_json(report)
+        print_json({"folder": str(out), **report})
         return
     print(
         f"{out}  {report['files']} files, {report['bytes'] / 1e6:.1f} MB, {report['posed']} of {report['frames']} posed"
