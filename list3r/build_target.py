@@ -116,3 +116,11 @@ def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None
                 f"{store.path} was begun with other settings ({', '.join(different)}); "
                 "give the same ones to --resume, or --force to begin anew"
             )
+
+
+def make_folder(path: Path) -> None:
+    """A folder to write to, with those above it. Raises `OptionError`."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"the folder {path} cannot be made: {error.strerror}; name another one") from error

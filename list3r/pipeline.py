@@ -15,13 +15,13 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r import __version__
-from list3r.build_target import open_target
+from list3r.build_target import make_folder, open_target
 from list3r.calibration_stage import camera_notes
 from list3r.chunk_stage import BuildSettings
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.mapping import finish_session
-from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.errors import TrackingError
 from list3r.memory.store import Store
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.reconstruction.registry import entry
@@ -80,7 +80,7 @@ def build(
     started = time.monotonic()
     job = prepare(source, options, settings, workers, licence)
     if debug_dir is not None:
-        _make_folder(Path(debug_dir))
+        make_folder(Path(debug_dir))
     with open_target(Path(memory), job.info, job.settings, resume=resume, force=force) as target:
         session = _session(target.store, job)
         plan = plan_session(target.store, session, job, look, debug_dir)
@@ -186,10 +186,3 @@ def _listed(store: Store, most: int = 5) -> str:
     rows = store.bad_frames()
     shown = ", ".join(f"{index} ({reason})" for _, index, reason in rows[:most])
     return shown + (f" and {len(rows) - most} more" if len(rows) > most else "")
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f"the folder {path} cannot be made: {error.strerror}") from error

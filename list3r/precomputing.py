@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from list3r.build_target import make_folder
 from list3r.calibration_stage import estimated_camera, told_camera
 from list3r.chunk_stage import BuildSettings, ChunkTask, reconstruct
 from list3r.frames.base import Frame, FrameSource, SourceInfo, guessed_camera
@@ -107,10 +108,7 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
     named = settings.reconstruction + (f" {settings.weights}" if settings.weights else "")
     chunks = settings.chunks
     manifest = Manifest("metric" if metric else "relative", named, chunks.length, chunks.overlap)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f"the folder {out} cannot be made: {error.strerror}; give another --out") from error
+    make_folder(out)
     if (out / MANIFEST).exists() and not force and read_manifest(out) != manifest:
         raise OptionError(f"{out} holds files of another model or other chunks; give another --out, or --force")
     write_manifest(out, manifest)

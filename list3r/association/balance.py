@@ -15,6 +15,7 @@ from list3r.association.support import (
     StaticSupport,
     SupportSettings,
     divide,
+    median,
     relative_to_frame,
 )
 from list3r.frames.base import Camera
@@ -134,7 +135,7 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
         mine, patches = told & (regions.of_pair == k), filled & (of_patch == k)
         n, m = int(mine.sum()), int(patches.sum())
         s[k] = (n * _variance(within[mine]) + 20 * s_all) / (n + 20)
-        own = max(_variance(whole[patches]) - s[k] / max(_median(number[patches]), 1.0), 0.05 * t_all) if m else 0.0
+        own = max(_variance(whole[patches]) - s[k] / max(median(number[patches]), 1.0), 0.05 * t_all) if m else 0.0
         t[k] = (m * own + settings.prior_patches * t_all) / (m + settings.prior_patches)
     pair_t, pair_s = np.maximum(t, floor)[regions.of_pair], np.maximum(s, floor)[regions.of_pair]
     return np.asarray(trust / (number[patch] * pair_t + pair_s))
@@ -142,8 +143,4 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
 
 def _variance(squares: Floats) -> float:
     """Robust variance from squared deviations, which lie mostly along the ray: their median over that of chi^2_1."""
-    return _median(squares) / 0.455 if len(squares) else 0.0
-
-
-def _median(values: Floats) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+    return median(squares) / 0.455 if len(squares) else 0.0

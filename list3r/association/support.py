@@ -260,7 +260,7 @@ def _best_hypothesis(
             failure = error if number == 0 else failure
             continue
         off = np.linalg.norm(S_v_u.apply(pairs.p_u) - pairs.p_v, axis=1) / depth
-        found.append((S_v_u, np.array([_median(off[(regions.of_pair == k) & sure]) for k in range(len(held))])))
+        found.append((S_v_u, np.array([median(off[(regions.of_pair == k) & sure]) for k in range(len(held))])))
     if not found:
         raise failure
     if not vote.any():
@@ -317,7 +317,8 @@ def _extent(points: Floats) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def _median(values: Floats) -> float:
+def median(values: Floats) -> float:
+    """The median, NaN of nothing."""
     return float(np.median(values)) if len(values) else float("nan")
 
 

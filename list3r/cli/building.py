@@ -28,9 +28,7 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
         def progress(done: int, total: int) -> None:
             nonlocal kept
             kept = kept or done > 0
-            bar.total = total
-            bar.update(done - bar.n)
-            bar.refresh()
+            show(bar, done, total)
 
         try:
             return build_memory(source, memory, progress=progress, look=looking(bar, "building"), **arguments)
@@ -43,14 +41,19 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
             raise typer.Exit(1) from None
 
 
+def show(bar: Any, done: int, total: int) -> None:
+    """Move a progress bar to where the work is."""
+    bar.total = total
+    bar.update(done - bar.n)
+    bar.refresh()
+
+
 def looking(bar: Any, then: str) -> Callable[[str, int, int], None]:
     """What moves a progress bar while a video is looked at before its chunks; afterwards it begins anew as `then`."""
 
     def look(what: str, done: int, total: int) -> None:
-        bar.total = total
         bar.set_description(f"looking for {what}", refresh=False)
-        bar.update(done - bar.n)
-        bar.refresh()
+        show(bar, done, total)
         if done == total:
             bar.set_description(then, refresh=False)
             bar.reset(total)

@@ -18,8 +18,10 @@ EXPORTS = (("json", "json"), ("usd", "usda"), ("plan", "png"), ("glb", "glb"), (
 
 def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, quiet: bool) -> dict[str, Any]:
     """Make `out/walk`, `out/rooms.l3r` and the exports beside it; what was found, for JSON."""
+    from list3r.build_target import make_folder
+
     _check_numbers(seed=seed, frames=frames, workers=workers)
-    _make_folder(out)
+    make_folder(out)
     walk, memory = out / "walk", out / "rooms.l3r"
     _say(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
     _render(walk, seed=seed, frames=frames, workers=workers, quiet=quiet)
@@ -117,13 +119,6 @@ def _check_numbers(*, seed: int, frames: int | None, workers: int | None) -> Non
     for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("workers", workers, 1)):
         if value is not None and value < least:
             raise OptionError(f"--{name} {value}: at least {least} is needed")
-
-
-def _make_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f"the folder {out} cannot be made: {error.strerror}") from error
 
 
 def _say(quiet: bool, text: str) -> None:

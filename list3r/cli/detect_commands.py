@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from list3r.cli import source_options as src
+from list3r.cli.building import show
 from list3r.cli.common import JsonOption, MemoryArgument, print_json, print_table, spread
 
 if TYPE_CHECKING:
@@ -113,12 +115,7 @@ def run_detector(
         Store.open(memory, writable=True) as store,
         tqdm(unit="chunk", desc="detecting", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar,
     ):
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-            bar.refresh()
-
+        progress = functools.partial(show, bar)
         opened = None if source is None else open_sources(store, source, options)
         chunks = None if opened is None else [c.chunk_id for c in store.chunks() if c.session_id in opened]
         return name_things(store, network, opened, chunks=chunks, progress=progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 
 from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
-from list3r.cli.building import looking
+from list3r.cli.building import looking, show
 from list3r.cli.common import JsonOption, note, print_json, print_table, spread
 
 if TYPE_CHECKING:
@@ -146,12 +147,7 @@ def _write_all(
     from list3r.precomputing import precompute as write
 
     with tqdm(unit="frame", desc="reconstructing", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-            bar.refresh()
-
+        progress = functools.partial(show, bar)
         run: dict[str, Any] = {"progress": progress, "look": looking(bar, "reconstructing")}
         return write(source, out, options, settings, info, force=force, licence=licence, **run).as_dict()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 
 from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
-from list3r.cli.building import looking
+from list3r.cli.building import looking, show
 from list3r.cli.change_commands import changes
 from list3r.cli.common import JsonOption, MemoryArgument, check_one_way, note, print_json, spread, with_at
 from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
@@ -105,12 +106,7 @@ def _run(memory: Path, source: str, *, quiet: bool, **arguments: Any) -> UpdateR
 
     tqdm.monitor_interval = 0
     with tqdm(unit="frame", desc="updating", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-            bar.refresh()
-
+        progress = functools.partial(show, bar)
         try:
             return update_memory(memory, source, progress=progress, look=looking(bar, "updating"), **arguments)
         except KeyboardInterrupt:

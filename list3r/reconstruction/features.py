@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.view import Floats, SensorNoise
+from list3r.reconstruction.vlad import root_sift
 
 SIFT_WIDTH = 128
 LEARNED_RATIO = 0.95
@@ -99,7 +100,7 @@ def match(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float) -> NDArray[n
         return np.zeros((0, 2), np.int64)
     if a.shape[1] != SIFT_WIDTH:
         ratio = max(ratio, LEARNED_RATIO)
-    return nearest_pairs(_root(a), _root(b), ratio)
+    return nearest_pairs(root_sift(a), root_sift(b), ratio)
 
 
 def nearest_pairs(a: Floats, b: Floats, ratio: float) -> NDArray[np.int64]:
@@ -159,9 +160,3 @@ def _kabsch(
     u[..., 2] *= sign[:, None]
     R = u @ vt
     return R, mean_t - np.einsum("bij,bj->bi", R, mean_s)
-
-
-def _root(descriptors: NDArray[np.uint8]) -> Floats:
-    """RootSIFT: Arandjelovic, Zisserman, "Three things everyone should know to improve object retrieval", 2012."""
-    x = descriptors.astype(np.float32)
-    return np.asarray(np.sqrt(x / np.maximum(x.sum(axis=1, keepdims=True), np.float32(1e-6))))

@@ -64,6 +64,9 @@ class VladDescriptor:
 
 
 def root_sift(descriptors: NDArray[np.uint8]) -> Floats:
-    """Square roots of SIFT descriptors of unit sum. Shape (N, 128)."""
+    """Square roots of SIFT descriptors of unit sum, shape (N, 128).
+
+    RootSIFT: Arandjelovic, Zisserman, "Three things everyone should know to improve object retrieval", 2012.
+    """
     x = descriptors.astype(np.float32)
     return np.asarray(np.sqrt(x / np.maximum(x.sum(axis=1, keepdims=True), np.float32(1e-6))))

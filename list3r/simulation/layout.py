@@ -267,3 +267,10 @@ def furnish_bedroom(p: Placer, room: Room, walls: dict[str, int], floor: int) ->
     _picture(p, room, 2.1, room.depth, 180, walls[back])
     _picture(p, room, 2.4, 0.0, 0, walls[front])
     _picture(p, room, wide, 2.3, 90, walls["east"])
+
+
+def wall_paint(p: Placer) -> Material:
+    """A pale plaster, each time another."""
+    tints = ((222, 210, 188), (196, 208, 214), (206, 214, 196), (224, 202, 192), (212, 206, 216))
+    r, g, b = tints[int(p.rng.integers(len(tints)))]
+    return Material("plaster", (r, g, b), (r - 46, g - 44, b - 40), 1.3, int(p.rng.integers(1 << 16)))

@@ -18,7 +18,7 @@ from list3r.simulation.furnisher import (
     RoomPlan,
     footprint,
 )
-from list3r.simulation.layout import WOODS, Placer
+from list3r.simulation.layout import WOODS, Placer, wall_paint
 from list3r.simulation.materials import Material
 from list3r.simulation.things import Thing
 
@@ -54,18 +54,12 @@ def _shell(p: Placer, plan: RoomPlan) -> dict[str, int]:
     p.add_structure("floor", f.flat(size, (w / 2, d / 2, -t), boards))
     roof = Material("plaster", (236, 234, 228), (222, 220, 214), 1.5, int(p.rng.integers(1 << 16)))
     p.add_structure("ceiling", f.flat(size, (w / 2, d / 2, HEIGHT_M + t), roof))
-    paint = _paint(p)
+    paint = wall_paint(p)
     walls = {}
     for side in SIDES:
         openings = [door.at for door in plan.doors if door.side == side and not door.closed]
         walls[side] = p.add_structure("wall", _wall(plan, side, openings, paint)).id
     return walls
-
-
-def _paint(p: Placer) -> Material:
-    tints = ((222, 210, 188), (196, 208, 214), (206, 214, 196), (224, 202, 192), (212, 206, 216))
-    r, g, b = tints[int(p.rng.integers(len(tints)))]
-    return Material("plaster", (r, g, b), (r - 46, g - 44, b - 40), 1.3, int(p.rng.integers(1 << 16)))
 
 
 def _wall(plan: RoomPlan, side: str, openings: list[float], paint: Material) -> f.Parts:

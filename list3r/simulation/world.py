@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from list3r.simulation import furniture as f
-from list3r.simulation.layout import WOODS, Placer, Room, furnish_bedroom, furnish_living_room
+from list3r.simulation.layout import WOODS, Placer, Room, furnish_bedroom, furnish_living_room, wall_paint
 from list3r.simulation.materials import Material
 from list3r.simulation.things import Thing, Vec3
 
@@ -59,7 +59,7 @@ def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[st
     walls: list[dict[str, int]] = []
     for room in rooms:
         floors.append(_floor(p, room))
-        paint = _paint(p)
+        paint = wall_paint(p)
         sides = {}
         middle, width = (room.x0 + room.x1) / 2, room.x1 - room.x0 + WALL_M
         for name, y in (("south", -WALL_M / 2), ("north", room.depth + WALL_M / 2)):
@@ -71,7 +71,7 @@ def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[st
         p.add_structure("ceiling", slab)
     for k, (name, x) in enumerate((("west", -WALL_M / 2), ("east", rooms[1].x1 + WALL_M / 2))):
         depth = rooms[k].depth
-        slab = f.flat((WALL_M, depth + 2 * WALL_M, HEIGHT_M), (x, depth / 2, HEIGHT_M / 2), _paint(p))
+        slab = f.flat((WALL_M, depth + 2 * WALL_M, HEIGHT_M), (x, depth / 2, HEIGHT_M / 2), wall_paint(p))
         walls[k][name] = p.add_structure("wall", slab).id
     p.add_structure("wall", _dividing_wall(p, rooms[0]))
     return floors, walls
@@ -84,15 +84,9 @@ def _floor(p: Placer, room: Room) -> int:
     return p.add_structure("floor", f.flat(size, ((room.x0 + room.x1) / 2, room.depth / 2, -WALL_M / 2), boards)).id
 
 
-def _paint(p: Placer) -> Material:
-    tints = ((222, 210, 188), (196, 208, 214), (206, 214, 196), (224, 202, 192), (212, 206, 216))
-    r, g, b = tints[int(p.rng.integers(len(tints)))]
-    return Material("plaster", (r, g, b), (r - 46, g - 44, b - 40), 1.3, int(p.rng.integers(1 << 16)))
-
-
 def _dividing_wall(p: Placer, room: Room) -> f.Parts:
     """The wall with the doorway in its middle and a wooden frame round it."""
-    paint, trim = _paint(p), p.wood(0.7)
+    paint, trim = wall_paint(p), p.wood(0.7)
     x, (wide, high) = room.x1 + WALL_M / 2, DOOR_M
     pier = (room.depth - wide) / 2
     posts = [
