@@ -61,7 +61,7 @@ def picture_flows(source: FrameSource, settings: PaceSettings) -> NDArray[np.flo
     for start in np.linspace(0, source.info.frame_count - 2, settings.spots).astype(int).tolist():
         pair = [f for f in source.read(start, start + 2) if isinstance(f, Frame)]
         if len(pair) == 2:
-            flow = _flow(*(_small(f, settings.width_px) for f in pair))
+            flow = _flow(_small(pair[0], settings.width_px), _small(pair[1], settings.width_px))
             flows += [] if flow is None else [flow / settings.width_px]
     return np.array(flows)
 
