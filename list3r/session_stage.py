@@ -173,7 +173,8 @@ def pace_notes(store: Store, session: int) -> tuple[str, ...]:
     step = store.get_value(_name(store, session, "depth step"), 1)
     if step == 1:
         return ()
-    return (f"the picture moves slowly: depth and things are from every {step}. frame (--depth-every 1 takes all)",)
+    nth = {2: "2nd", 3: "3rd"}.get(step, f"{step}th")
+    return (f"the picture moves slowly: depth and things are from every {nth} frame (--depth-every 1 takes all)",)
 
 
 def _depth_step(store: Store, session: int, job: Job) -> int:
