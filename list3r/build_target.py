@@ -49,6 +49,8 @@ def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume
     path = path.resolve() if path.is_symlink() else path
     if path.is_dir():
         raise MemoryFileError(f"{path} is a folder; name a file for the memory, such as {path / 'memory.l3r'}")
+    if path.exists() and not path.is_file():
+        raise MemoryFileError(f"{path} is a device or pipe, no ordinary file; name another file for the memory")
     if path.exists() and path.stat().st_size == 0:
         path.unlink()
     replaced = _left_aside(path)

@@ -143,7 +143,7 @@ def reconstruct(
     alone = len(_posed(parts))
     if task.shot is not None and (failed or (hasattr(model, "parts") and 2 * alone < len(frames))):
         more = borrow(source, (task.span.start, task.span.stop), task.shot, frames)
-        if failed or 2 * len(more.repeats) > len(frames) - alone:
+        if failed or 2 * more.followed > len(frames):
             found = _borrowed_parts(task, model, more, camera, deep)
             shown = _posed(found)
             if len(shown & {f.index for f in frames}) + sum(r.shown in shown for r in more.repeats) > alone:

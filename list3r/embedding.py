@@ -68,6 +68,7 @@ def embed_memory(
     from list3r.models.cache import locate
     from list3r.models.text_image import TextImageModel
 
+    Store.open(path).close()  # what is no memory is said before anything is fetched
     weights = _weights(model, weights, licence)
     with Store.open(path, writable=True) as store:
         views = _views(store)

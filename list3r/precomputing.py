@@ -107,7 +107,10 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
     named = settings.reconstruction + (f" {settings.weights}" if settings.weights else "")
     chunks = settings.chunks
     manifest = Manifest("metric" if metric else "relative", named, chunks.length, chunks.overlap)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"the folder {out} cannot be made: {error.strerror}; give another --out") from error
     if (out / MANIFEST).exists() and not force and read_manifest(out) != manifest:
         raise OptionError(f"{out} holds files of another model or other chunks; give another --out, or --force")
     write_manifest(out, manifest)
@@ -145,5 +148,11 @@ def _write(path: Path, made: Reconstruction, shown: dict[int, int]) -> None:
     indices, confidence = np.array(list(held), np.int64), made.confidence[rows].astype(np.float32)
     piece = Piece(indices, T, intrinsics, made.depth[rows], confidence, depth_noise=noise)
     part = path.with_suffix(".part")
-    write_piece(part, piece)
-    part.replace(path)
+    try:
+        write_piece(part, piece)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OptionError(
+            f"{path} cannot be written: {error.strerror or error}; finished files are kept: give the command again"
+        ) from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import resource
 import shutil
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from list3r.cli import app
 from list3r.memory.store import Store
 from tests.conftest import write_small_room
 
@@ -84,8 +87,21 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with sqlite3.connect(root / "other.db") as database:
         database.execute("CREATE TABLE t (x)")
     database.close()
+    shutil.copy(root / "room.l3r", root / "later.l3r")
+    with sqlite3.connect(root / "later.l3r") as database:
+        database.execute("PRAGMA user_version = 99")
+        database.execute("CREATE TABLE of_a_later_program (x)")
+    database.close()
+    for name, manifest in (
+        ("pre", '{"format": "list3r-precomputed", "version": 1, "scale": "relative"}'),
+        ("cut", "{"),
+    ):
+        (root / name).mkdir()
+        (root / name / "precomputed.json").write_text(manifest)
+    (root / "cut.npz").write_bytes(b"PK\x03\x04 and no more")
     whole = (root / "room.l3r").read_bytes()
     (root / "torn.l3r").write_bytes(whole[: len(whole) // 3])
+    (root / "memory.png").write_bytes(whole)
     return root
 
 
@@ -148,6 +164,67 @@ CASES = {
     "trajectory that is none": ("eval trajectory {p}/note.txt {p}/room.l3r", "note.txt"),
 }
 
+MORE_CASES = {
+    "go on and begin anew": ("build {p}/good -m {p}/new.l3r --resume --force", "--resume.*--force.*one of them"),
+    "update: go on and give up": ("update {p}/room.l3r {p}/good --resume --force", "--resume.*--force.*one of them"),
+    "chunks of no frames": ("build {p}/good -m {p}/new.l3r --chunk 0", "chunk length 0"),
+    "chunks that share nothing": ("build {p}/good -m {p}/new.l3r --overlap 0", "overlap 0"),
+    "weights of what has none": ("build {p}/good -m {p}/new.l3r --weights {p}/empty", "takes no weights.*--recon"),
+    "weights without a name": ("build {p}/good -m {p}/new.l3r --weights discovery=", "names nothing"),
+    "classes without a detector": ("build {p}/good -m {p}/new.l3r --detector-classes {p}/note.txt", "--detector FILE"),
+    "classes that are not there": (
+        "detect {p}/room.l3r --detector {p}/note.txt --detector-classes {p}/no",
+        r"no cannot be read \(No such file",
+    ),
+    "how to read which video": ("detect {p}/room.l3r --detector {p}/x.param --every 5", "--source SOURCE"),
+    "a manifest cut off": (
+        "build {p}/good -m {p}/new.l3r --reconstruction precomputed --weights {p}/cut",
+        "is no JSON",
+    ),
+    "a manifest without files": (
+        "build {p}/good -m {p}/new.l3r --reconstruction precomputed --weights {p}/pre",
+        ".npz",
+    ),
+    "a transform in no file": ("inspect {p}/good --depth-to-color {p}/no.txt", "no such file"),
+    "another layout": ("inspect {p}/good --kind replica", "not the replica layout"),
+    "overlay onto a memory": ("inspect {p}/good --overlay {p}/room.l3r", "png"),
+    "overlay that is named as a picture": ("inspect {p}/good --overlay {p}/memory.png", "memory file"),
+    "overlay onto the source": ("inspect {p}/good --overlay {p}/good/rgb/0.png", "picture of the source"),
+    "demo of one frame": ("demo --out {p}/demo --frames 1", "--frames 1: at least 2"),
+    "demo of a negative seed": ("demo --out {p}/demo --seed -1", "--seed -1: at least 0"),
+    "demo without workers": ("demo --out {p}/demo --workers 0", "--workers 0: at least 1"),
+    "precompute onto a file": ("precompute {p}/good --out {p}/note.txt", "note.txt cannot be made"),
+    "embed of nothing": ("embed {p}/nothing.l3r", "does not exist"),
+    "more sure than sure": ("list {p}/room.l3r --min-confidence 7", "--min-confidence 7"),
+    "a session of no camera": ("query seen {p}/room.l3r 3 --session 9", "--session 9 goes with a camera"),
+    "a session of a box": ("query within {p}/room.l3r --box 0,0,0,1,1,1 --session 9", "--session 9 goes with a camera"),
+    "who looks": ("query find {p}/room.l3r mug --from here", "viewpoint 'here'"),
+    "sizes that leave nothing": (
+        "query nearest {p}/room.l3r mug --min-size 3 --max-size 1",
+        "min_size 3 above max_size 1",
+    ),
+    "repair onto itself": ("repair {p}/torn.l3r --out {p}/torn.l3r", "the damaged file itself"),
+    "repair of a later memory": ("repair {p}/later.l3r", "update list3r"),
+    "repair of another database": ("repair {p}/other.db", "not a LIST3R memory"),
+    "covisibility that is none": ("eval revisits {p}/cut.npz {p}/room.l3r", "not a covisibility file"),
+    "every zero of a cloud": ("eval cloud {p}/good {p}/room.l3r --every 0", "--every 0"),
+    "every zero of revisits": ("eval revisits {p}/good {p}/room.l3r --every 0", "--every 0"),
+    "times that never meet": ("eval trajectory {p}/good {p}/room.l3r --tolerance nan", "--tolerance nan"),
+}
+
+
+@pytest.mark.parametrize("case", MORE_CASES)
+def test_more_bad_input_is_refused(case: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As below, without a process for each."""
+    command, pattern = MORE_CASES[case]
+    before = {p: p.stat().st_mtime_ns for p in place.iterdir() if p.is_file()}
+    words = [word.format(p=place) for word in command.split()]
+    status = app.run(words)
+    told = capsys.readouterr()
+    check_refused(subprocess.CompletedProcess(words, status, told.out, told.err), pattern)
+    assert {p: p.stat().st_mtime_ns for p in place.iterdir() if p.is_file()} == before
+    assert not (place / "new.l3r").exists()
+
 
 @pytest.mark.parametrize("case", CASES)
 def test_bad_input_is_refused_in_one_line_and_leaves_nothing(case: str, place: Path) -> None:
@@ -163,8 +240,28 @@ def test_a_full_disk_is_named_and_nothing_half_written_is_left(place: Path, tmp_
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
     result = run("build", place / "good", "-m", tmp_path / "new.l3r", "--workers", "1", before=small_files)
-    check_refused(result, "disk|space|written")
+    check_refused(result, "disk.*--resume")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["build {p}/good -m {pipe}", "build {p}/good -m {pipe} --force", "info {pipe}"])
+def test_what_is_no_ordinary_file_stays_what_it_is(command: str, place: Path, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    check_refused(run(*(word.format(p=place, pipe=pipe) for word in command.split())), "device or pipe")
+    assert pipe.is_fifo()
+
+
+def test_verify_says_of_a_torn_file_that_it_is_damaged(place: Path) -> None:
+    result = run("verify", place / "torn.l3r", "--json")
+    assert result.returncode == 1
+    assert json.loads(result.stdout)["sound"] is False
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize("command", ["verify {p}/note.txt", "verify {p}/other.db", "verify {p}/newer.l3r"])
+def test_verify_of_what_is_no_memory_is_wrong_input(command: str, place: Path) -> None:
+    check_refused(run(*(word.format(p=place) for word in command.split())), "not a|update list3r")
 
 
 def test_a_memory_that_cannot_be_read_is_named(place: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import typer
 from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import report_lines, run_build
-from list3r.cli.common import JsonOption, note, print_json, spread
+from list3r.cli.common import JsonOption, check_one_way, note, print_json, spread
 from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
 from list3r.cli.finishing import finish
 from list3r.cli.scale_commands import ScaleAnchor, check_anchor
@@ -41,10 +41,13 @@ def inspect(
 
     Example: list3r inspect walk.mp4 --json
     """
+    from list3r.exporters.output import replacing
     from list3r.frames.inspection import describe, draw_registration, lines
     from list3r.frames.source import open_source
 
     options = words.options()
+    if overlay is not None:
+        _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
     report = describe(opened.info)
     if calibrate:
@@ -52,12 +55,25 @@ def inspect(
 
         report["calibration"] = estimate(source, options).as_dict()
     if overlay is not None:
-        draw_registration(opened, overlay)
+        with replacing(overlay) as temporary:
+            draw_registration(opened, temporary)
         report["overlay"] = str(overlay)
     if json:
         print_json(report)
     else:
         print("\n".join(lines(report)))
+
+
+def _check_overlay(overlay: Path, source: Path) -> None:
+    """Raises `OptionError` or `ExportError` before any work where the picture cannot or must not be written."""
+    from list3r.exporters.output import check_target
+    from list3r.memory.errors import OptionError
+
+    if overlay.suffix.lower() != ".png":
+        raise OptionError(f"--overlay {overlay}: the picture must end in .png")
+    check_target(overlay)
+    if overlay.exists() and overlay.resolve().is_relative_to(source.resolve()):
+        raise OptionError(f"--overlay {overlay} is a picture of the source; name another file")
 
 
 @spread
@@ -92,10 +108,11 @@ def build(
     options = words.options()
     from list3r.frames.source import open_source
 
+    check_one_way(resume, force)
     check_anchor(scale_anchor)
     check_detector(detector, detector_classes)
     info = open_source(source, options).info
-    resumed = memory if resume and not force else None
+    resumed = memory if resume else None
     settings, told = mod.build_settings(info, models, cut, poses=poses, pictures=pictures, resumed=resumed)
     if not json:
         for line in (*(f"note: {n}" for n in info.notes), *told):

@@ -36,6 +36,14 @@ def parse_point(text: str, option: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+def check_one_way(resume: bool, force: bool) -> None:
+    """Raises `OptionError` where `--resume` and `--force`, which say opposite things, are both given."""
+    from list3r.memory.errors import OptionError
+
+    if resume and force:
+        raise OptionError("--resume goes on with what is there and --force gives it up; give one of them")
+
+
 _AT: ContextVar[int | None] = ContextVar("at", default=None)
 """The session after which the world is asked about, for the command that runs."""
 

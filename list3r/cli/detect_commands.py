@@ -66,6 +66,10 @@ def detect(
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
+    from list3r.memory.errors import OptionError
+
+    if source is None and words != src.SourceWords():
+        raise OptionError("options that say how a video is read, such as --every, need the video: --source SOURCE")
     report = run_detector(memory, detector, detector_classes, source, words.options(), quiet=json)
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
@@ -78,6 +82,10 @@ def check_detector(detector: Path | None, classes: Path | None) -> None:
     """Raises `OptionError` for a detector that cannot be used, before hours are spent."""
     if detector is not None:
         _load(detector, classes)
+    elif classes is not None:
+        from list3r.memory.errors import OptionError
+
+        raise OptionError(f"--detector-classes {classes} are those of a detector; give it with --detector FILE")
 
 
 def run_detector(

@@ -16,6 +16,7 @@ from list3r.cli.evaluation_options import (
     PlotOption,
     ScaleOption,
     Truth,
+    check_every,
     check_plot,
     check_scale,
     free_scale,
@@ -69,6 +70,7 @@ def cloud(
     from list3r.evaluation.point_clouds import thinned
 
     check_scale(scale)
+    check_every(every)
     check_plot(plot)
     _check_lengths(threshold=threshold, truncate=truncate)
     found, _ = read_points(estimate)

@@ -15,6 +15,7 @@ from list3r.cli.evaluation_options import (
     PlotOption,
     ScaleOption,
     Truth,
+    check_every,
     check_plot,
     check_scale,
     free_scale,
@@ -59,9 +60,12 @@ def trajectory(
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
     """
     from list3r.evaluation.trajectory import Delta, evaluate_trajectory
+    from list3r.memory.errors import OptionError
 
     check_scale(scale)
     check_plot(plot)
+    if not tolerance >= 0:
+        raise OptionError(f"--tolerance {tolerance:g}: seconds, 0 or more, are needed")
     apart = Delta.parse(delta)
     true, found = read_trajectory(truth), read_trajectory(estimate)
     errors = evaluate_trajectory(true, found, tolerance, delta=apart)
@@ -133,10 +137,11 @@ def instances(
     from list3r.evaluation.scene import evaluate_scene, read_scene
     from list3r.memory.errors import OptionError
 
+    if align not in (None, "none") and estimate.is_file() and not is_memory(estimate):
+        raise OptionError(f"--align {align} places a memory; {estimate} is none and knows no camera path")
     check_scale(scale)
     check_plot(plot)
-    if every < 1:
-        raise OptionError(f"--every {every}: take every n-th frame with n of at least 1")
+    check_every(every)
     true, found = read_scene(truth), read_scene_of(estimate)
     beside = truth.parent / "groundtruth.txt"
     if align is None and is_memory(estimate) and beside.is_file():

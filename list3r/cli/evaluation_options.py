@@ -40,6 +40,14 @@ def check_scale(scale: str) -> None:
         raise OptionError(f"--scale {scale}: choose auto, free or fixed")
 
 
+def check_every(every: int | None) -> None:
+    """Raises `OptionError` for an `--every` below 1."""
+    from list3r.memory.errors import OptionError
+
+    if every is not None and every < 1:
+        raise OptionError(f"--every {every}: take every n-th frame with n of at least 1")
+
+
 def check_plot(plot: Path | None) -> None:
     """Raises `OptionError` or `ExportError` before any work when the picture cannot be written."""
     if plot is None:

@@ -14,6 +14,7 @@ from list3r.cli.evaluation_options import (
     EveryOption,
     PlotOption,
     Truth,
+    check_every,
     check_plot,
     save_picture,
     share,
@@ -53,6 +54,7 @@ def revisits(
     from list3r.memory.errors import OptionError
 
     settings = RevisitTruthSettings(least, different, precision)
+    check_every(every)
     check_plot(plot)
     if save is not None:
         if save.suffix.lower() != ".npz":

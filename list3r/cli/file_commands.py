@@ -42,10 +42,18 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
 
     Example: list3r verify house.l3r
     """
-    with open_memory(memory) as scene:
-        found = scene.store.verify()
-        state = [] if found else [s.state for s in scene.store.sessions()]
-        chunks = None if found else len(scene.store.chunks())
+    from list3r.memory.errors import MemoryFileError
+
+    found, state, chunks = [], [], None
+    try:
+        with open_memory(memory) as scene:
+            found = scene.store.verify()
+            if not found:
+                state, chunks = [s.state for s in scene.store.sessions()], len(scene.store.chunks())
+    except MemoryFileError as error:
+        if not _is_broken(memory, error):
+            raise
+        found = [f"it cannot be opened: {error.__cause__}"]
     if json:
         print_json({"sound": not found, "damage": found, "sessions": state, "chunks": chunks})
     elif found:
@@ -56,6 +64,17 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         print(f"{memory} is sound: {chunks} chunks{unfinished}")
     if found:
         raise typer.Exit(1)
+
+
+def _is_broken(memory: Path, error: Exception) -> bool:
+    """Whether a file that cannot be opened is an SQLite file with broken pages, and not some other file."""
+    import sqlite3
+
+    cause = error.__cause__
+    if not isinstance(cause, sqlite3.DatabaseError) or isinstance(cause, sqlite3.OperationalError):
+        return False
+    with memory.open("rb") as file:
+        return file.read(16) == b"SQLite format 3\x00"
 
 
 def repair(

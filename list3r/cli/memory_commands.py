@@ -99,6 +99,10 @@ def list_instances(
 
     Example: list3r list house.l3r --min-confidence 0.5
     """
+    from list3r.memory.errors import OptionError
+
+    if not 0.0 <= min_confidence <= 1.0:
+        raise OptionError(f"--min-confidence {min_confidence:g} must lie between 0 and 1")
     with open_memory(memory) as scene:
         found = scene.instances(structure=None if structure else False)
         if at is not None:

@@ -173,6 +173,7 @@ def build_settings(
     asked = parse_weights(words.weights)
     if selection.discovery == selection.reconstruction == "precomputed" and "reconstruction" in asked:
         asked.setdefault("discovery", asked["reconstruction"])
+    _check_used(asked, selection)
     chosen = check_allowed(selection, asked, words.licence)
     notes = [f"note: {selection.why}"] if selection.why else []
     notes += _terms(selection, chosen)
@@ -197,6 +198,19 @@ def build_settings(
         chunks = _cut(settings, cut.chunk, cut.overlap)
     wanted = cut.depth_every if isinstance(cut, BuildCutWords) else None
     return replace(settings, chunks=chunks, depth_every=wanted or depth_every), notes
+
+
+def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
+    """Raises `OptionError` for weights of a part whose model has none, so that nobody waits for another result."""
+    from list3r.memory.errors import OptionError
+
+    taking = {option.removeprefix("--") for option, _ in selection.cards()}
+    for part, where in asked.items():
+        model = getattr(selection, part)
+        if not where:
+            raise OptionError(f"--weights {part}= names nothing; give a folder, a file or owner/name@revision")
+        if part not in taking and model != "precomputed":
+            raise OptionError(f"--weights {where}: the {part} {model} takes no weights; name its network with --{part}")
 
 
 def _local_features(words: str) -> tuple[str, str | None]:
@@ -277,11 +291,11 @@ def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> Ch
         from list3r.reconstruction.precomputed_files import read_manifest
 
         said = read_manifest(Path(settings.weights).expanduser())
-        length, overlap = said.length, overlap or said.overlap
+        length, overlap = said.length, said.overlap if overlap is None else overlap
     elif length is None and card is not None:
         length = _fitting(card, settings)
-    length = length or USUAL_CHUNK
-    return ChunkSettings(length, overlap or max(1, min(30, round(0.3 * length))))
+    length = USUAL_CHUNK if length is None else length
+    return ChunkSettings(length, max(1, min(30, round(0.3 * length))) if overlap is None else overlap)
 
 
 def _fitting(card: ModelCard, settings: BuildSettings) -> int:

@@ -49,6 +49,8 @@ def camera_from(
     if sum(option is not None for option in (view, time, pose)) > 1:
         raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
     if view is None and time is None and pose is None:
+        if session is not None:
+            raise OptionError(f"--session {session} goes with a camera: --view FRAME, --time S or --pose; leave it out")
         return None
     if pose is None:
         return scene.camera(frame=view, time_s=time, session=session)

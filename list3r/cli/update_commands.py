@@ -13,7 +13,7 @@ from list3r.cli import model_options as mod
 from list3r.cli import source_options as src
 from list3r.cli.building import looking
 from list3r.cli.change_commands import changes
-from list3r.cli.common import JsonOption, MemoryArgument, note, print_json, spread, with_at
+from list3r.cli.common import JsonOption, MemoryArgument, check_one_way, note, print_json, spread, with_at
 from list3r.cli.detect_commands import ClassFile, DetectorFile, check_detector
 from list3r.cli.finishing import finish
 from list3r.cli.scale_commands import ScaleAnchor, check_anchor
@@ -62,6 +62,7 @@ def update(
     options = words.options()
     from list3r.frames.source import open_source
 
+    check_one_way(resume, force)
     check_anchor(scale_anchor)
     check_detector(detector, detector_classes)
     info = open_source(source, options).info

@@ -128,8 +128,10 @@ def read_class_names(path: Path) -> tuple[str, ...]:
     """One class name a line, in the order of the network's outputs. Raises `OptionError`."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise OptionError(f"--detector-classes {path} cannot be read ({error})") from None
+    except OSError as error:
+        raise OptionError(f"--detector-classes {path} cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError:
+        raise OptionError(f"--detector-classes {path} is no text; one name a line is needed") from None
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
         raise OptionError(f"--detector-classes {path} is empty; one name a line is needed")

@@ -7,6 +7,7 @@ wide view of the room, while the wide view shares little with the close look.
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,7 +163,7 @@ def read_covisibility(path: str | Path) -> Covisibility:
             )
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or 'it is not an .npz file'}") from error
-    except (ValueError, AttributeError, TypeError, EOFError) as error:
+    except (ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise SourceError(f"{path} is not a covisibility file; write one with `eval revisits --save`") from error
     except OptionError as error:
         raise SourceError(f"{path}: {error}") from error

@@ -43,7 +43,7 @@ def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = Non
         try:
             saved = stage.GetRootLayer().Export(str(temporary))
         except Tf.ErrorException as error:
-            raise ExportError(f"{path} cannot be written: {str(error).splitlines()[0]}") from error
+            raise ExportError(f"{path} cannot be written; is the disk full?") from error
         if not saved:
             raise ExportError(f"{path} cannot be written; is the disk full?")
     return (path,)

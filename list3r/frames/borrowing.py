@@ -62,6 +62,9 @@ class Borrowed:
     """Frames of the stretch that are none of these."""
     own: frozenset[int]
     """Frame.index of what stands for the frames of the stretch."""
+    followed: int
+    """Frames of the stretch in which most corners of one before were found again: a camera that stands, trembles or
+    turns slowly, not one that shows a wall, darkness or blur."""
 
 
 def borrow(
@@ -79,12 +82,13 @@ def borrow(
     for frame in source.read(max(shot[0], span[0] - s.reach), span[0]):
         if not isinstance(frame, BadFrame) and sieve.is_new(frame):
             before.append(frame)
-    kept, repeats = [], []
+    kept, repeats, followed = [], [], 0
     for frame in frames:
         if sieve.is_new(frame):
             kept.append(frame)
         else:
             repeats.append(Repeat(frame.index, frame.time_s, sieve.last))
+        followed += sieve.followed
     own = frozenset([f.index for f in kept] + [r.shown for r in repeats])
     behind: list[Frame] = []
     for frame in source.read(span[1], min(shot[1], span[1] + s.reach)):
@@ -92,7 +96,7 @@ def borrow(
             behind.append(frame)
             if len(behind) == s.frames:
                 break
-    return Borrowed((*before, *kept, *behind), tuple(repeats), own)
+    return Borrowed((*before, *kept, *behind), tuple(repeats), own, followed)
 
 
 def frames_around(
@@ -122,6 +126,8 @@ class _Sieve:
     settings: BorrowSettings
     last: int = -1
     """Frame.index of the last new one."""
+    followed: bool = False
+    """Whether most corners of the last new one were found in the frame that was asked about."""
     _gray: Gray | None = None
     _corners: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 1, 2), np.float32))
 
@@ -142,11 +148,13 @@ class _Sieve:
 
     def _moved(self, before: Gray, gray: Gray) -> bool:
         s = self.settings
+        self.followed = False
         if len(self._corners) < 8:
             return bool(np.abs(before.astype(np.float32) - gray).mean() > s.most_difference)
         place, found, _ = cv2.calcOpticalFlowPyrLK(before, gray, self._corners, np.zeros_like(self._corners))
         good = found.ravel() > 0
-        if good.mean() < s.least_followed:
+        self.followed = bool(good.mean() >= s.least_followed)
+        if not self.followed:
             return True
         moved = np.linalg.norm((place - self._corners)[good, 0], axis=1)
         return bool(np.median(moved) > s.least_motion * max(gray.shape))

@@ -95,7 +95,8 @@ def _check_seconds(start: float | None, end: float | None) -> None:
     """Raises `OptionError` for seconds that leave nothing of any source."""
     given = [v for v in (start, end) if v is not None]
     if not all(math.isfinite(v) for v in given) or (start or 0.0) < 0 or (end is not None and end <= (start or 0.0)):
-        raise OptionError(f"seconds {start or 0:g} to {end}: start must be 0 or more and end greater than it")
+        last = "the end" if end is None else f"{end:g}"
+        raise OptionError(f"seconds {start or 0:g} to {last}: start must be 0 or more and end greater than it")
 
 
 def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intrinsics:
@@ -153,8 +154,10 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
     16 numbers are a 4x4 matrix row by row, 12 its upper three rows, 7 are `tx,ty,tz` in metres and a quaternion in
     the order that `quaternion` says, 3 a translation. Raises `OptionError`.
     """
-    words = _file_text(text) or text
-    v = np.array(parse_numbers(words, name))
+    words = _file_text(text)
+    if words is None and _names_a_file(text):
+        raise OptionError(f"{name} {text!r}: there is no such file, and it is no row of numbers such as tx,ty,tz")
+    v = np.array(parse_numbers(words or text, name))
     matrix = np.eye(4)
     if len(v) in (12, 16):
         matrix[: len(v) // 4] = v.reshape(-1, 4)
@@ -192,6 +195,15 @@ def _file_text(text: str) -> str | None:
         return path.read_text(encoding="utf-8") if path.is_file() else None
     except (OSError, ValueError):
         return None
+
+
+def _names_a_file(text: str) -> bool:
+    """Whether text that is no number can only be meant as a file: it has letters and no comma."""
+    try:
+        float(text)
+    except ValueError:
+        return not any(sign in text for sign in ",; \n") and bool(text.strip())
+    return False
 
 
 def _show(values: Sequence[float]) -> str:

@@ -80,7 +80,7 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
             f"{root} holds pictures like {pictures}, which cannot be read here; convert them to JPEG or PNG"
         )
     inside = next((p for p in sorted(root.iterdir()) if p.is_dir() and images.find(p, options)), None)
-    if inside is not None:
+    if inside is not None and options.kind in ("auto", "images"):
         raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
     said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
     raise SourceError(f"{root} has {said}; {_WANTED}")

@@ -92,6 +92,8 @@ class Connection:
             raise MemoryFileError(f"{path} does not exist; make it with `list3r build SOURCE -m {path}`")
         if path.is_dir():
             raise MemoryFileError(f"{path} is a folder, not a memory file")
+        if not path.is_file():
+            raise MemoryFileError(f"{path} is a device or pipe, not a memory file")
         if not writable:
             return cls._open_to_read(path)
         try:

@@ -36,7 +36,10 @@ def explained(path: Path, error: Exception) -> str:
     if "not a database" in text:
         return f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`"
     if "full" in text or "disk I/O" in text:
-        return f"{path} could not be written, the disk is full or failing ({text}); free some space and go on"
+        return (
+            f"{path} could not be written, the disk is full or failing ({text}); free some space and give the command "
+            "again, a build or an update with --resume"
+        )
     if "readonly" in text:
         return f"{path} is read-only; make it writable or copy it"
     if "locked" in text:

@@ -17,7 +17,7 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.memory_file import check_schema, protect
 from list3r.memory.read_checks import FAILURES, GEOMETRY_BYTES
-from list3r.memory.schema import SCHEMA_VERSION
+from list3r.memory.schema import APPLICATION_ID, SCHEMA_VERSION
 from list3r.memory.store import Store
 from list3r.memory.sums import OWN_CRC, SummedTable, row_crc, stored_sums, summed_tables
 from list3r.memory.writer_lock import WriterLock
@@ -66,6 +66,10 @@ def repair(path: str | Path, out: str | Path | None = None) -> RepairReport:
     """
     path = Path(path).resolve()
     target = path if out is None else Path(out)
+    if out is not None and target.resolve() == path:
+        raise MemoryFileError(
+            f"--out {out} is the damaged file itself; leave --out out, and it is kept as {out}.damaged"
+        )
     _check_target(path, target)
     lock = WriterLock(path)
     try:
@@ -129,11 +133,28 @@ def _connect(path: Path, copy: Path) -> sqlite3.Connection:
         database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         check_schema(path, database, SCHEMA_VERSION)
     except (*FAILURES, MemoryFileError) as error:
-        database.close()
+        with contextlib.closing(database):
+            _check_ours(path, database)
         raise MemoryFileError(
             f"{path} cannot be repaired: what says which tables it holds is damaged ({error}); use a backup"
         ) from error
     return database
+
+
+def _check_ours(path: Path, database: sqlite3.Connection) -> None:
+    """Raises `MemoryFileError` for a file that is whole, but of a later program or a stranger's."""
+    try:
+        application, version = (
+            int(database.execute(f"PRAGMA {n}").fetchone()[0]) for n in ("application_id", "user_version")
+        )
+    except FAILURES:
+        return
+    if application != APPLICATION_ID:
+        raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory")
+    if version > SCHEMA_VERSION:
+        raise MemoryFileError(
+            f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
+        )
 
 
 # ------------------------------------------------------------------------------------------- rows

@@ -16,7 +16,7 @@ from list3r.queries.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.gather import Gathered, gather
 from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
 from list3r.queries.match import Match, Matches, checked_count, checked_instance
-from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
+from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of, viewer_from
 from list3r.queries.surfaces import distance_between
 from list3r.queries.viewpoint import VIEWPOINT, between
 from list3r.queries.words import STRUCTURE, not_borne
@@ -86,6 +86,8 @@ def find(
     """
     k = checked_count(k)
     phrase = parse(text)
+    if viewpoint is not None:
+        viewer_from(store, viewpoint)
     gathered = gather(store, phrase)
     loaded = store.instances() if gathered is None else store.instances_of(sorted(gathered.ids))
     things = {i.id: i for i in loaded if i.state != "removed"}

@@ -99,6 +99,8 @@ class Filters:
         for name, length in (("min_size", self.min_size), ("max_size", self.max_size)):
             if length is not None:
                 checked_length(length, name)
+        if self.min_size is not None and self.max_size is not None and self.min_size > self.max_size:
+            raise OptionError(f"min_size {self.min_size:g} above max_size {self.max_size:g} leaves nothing; swap them")
 
     @property
     def stored_state(self) -> str | None:

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from list3r.memory.codec import from_json
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.errors import OptionError
 
 MANIFEST = "precomputed.json"
 FORMAT = "list3r-precomputed"
@@ -79,9 +78,9 @@ def read_manifest(folder: Path) -> Manifest:
     if path.stat().st_size > _MAX_MANIFEST:
         raise OptionError(f"{path} is {path.stat().st_size} bytes long and no manifest")
     try:
-        said = from_json(path.read_text(encoding="utf-8"), str(path))
-    except (MemoryFileError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path} is no JSON ({str(error).splitlines()[0][:120]})") from None
+        said = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise OptionError(f"{path} is no JSON ({str(error).splitlines()[0][:120]}); see docs/precomputed.md") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("version") != VERSION:
         raise OptionError(f'{path} must say "format": "{FORMAT}", "version": {VERSION}')
     if said.get("scale") not in ("metric", "relative"):

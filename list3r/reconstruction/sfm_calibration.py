@@ -18,7 +18,7 @@ from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
 from list3r.reconstruction.colmap import pycolmap
 from list3r.reconstruction.sfm_links import LinkSettings, keyframe_problem
 from list3r.reconstruction.sfm_mapping import MappingSettings, MapProblem, Poses, SparseMap, View, build_maps
-from list3r.reconstruction.sfm_tracks import TrackSettings, follow_corners
+from list3r.reconstruction.sfm_tracks import Tracks, TrackSettings, follow_corners
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,9 @@ class CalibrationSettings:
     """Stretches of the video that are looked at."""
     frames: int = 100
     """Frames in each."""
+    least_frames: int = 60
+    """... and in each of a video too short for so many: the windows of a short one overlap by half, so that where it
+    stands still, shows a wall or jumps in the middle there is one without that."""
     most_window_ratio: float = 1.3
     """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
     zoom_ratio: float = 1.5
@@ -204,11 +207,12 @@ def _focal_sigma(windows: _Windows, settings: CalibrationSettings) -> float:
 
 
 def _spans(count: int, settings: CalibrationSettings) -> list[tuple[int, int]]:
-    """Windows spread evenly over a source, apart from each other."""
-    windows = max(1, min(settings.windows, count // settings.frames))
-    last = max(0, count - settings.frames)
+    """Windows spread evenly over a source; those of a short one overlap."""
+    frames = int(np.clip(count // settings.windows, settings.least_frames, settings.frames))
+    last = max(0, count - frames)
+    windows = min(settings.windows, 1 + last // (frames // 2))
     starts = np.linspace(0, last, windows).astype(int).tolist() if windows > 1 else [last // 2]
-    return [(a, min(a + settings.frames, count)) for a in starts]
+    return [(a, min(a + frames, count)) for a in starts]
 
 
 def _window(
@@ -219,12 +223,22 @@ def _window(
     if len(frames) < 2:
         return None
     grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
-    tracks = follow_corners(grays, settings.tracks)
+    tracks = _longest_run(follow_corners(grays, settings.tracks))
     if len(tracks.keyframes) < 3:
         return None
     problem = keyframe_problem(tracks, grays, settings.links)
     maps = build_maps(problem, camera, free_camera="focal", settings=settings.mapping)
     return (problem, maps[0]) if maps and len(maps[0].T_map_cam) >= 3 else None
+
+
+def _longest_run(tracks: Tracks) -> Tracks:
+    """The tracks with the keyframes of their longest run alone, where it has half of the frames: what a jump or a wall
+    parts from it would be tied by features and says nothing more of the lens."""
+    followed = tracks.run[tracks.run >= 0]
+    longest = int(np.bincount(followed).argmax()) if len(followed) else -1
+    if 2 * int((tracks.run == longest).sum()) < len(tracks.run):
+        return tracks
+    return replace(tracks, keyframes=tuple(k for k in tracks.keyframes if tracks.run[k] == longest))
 
 
 def _adjust_together(
