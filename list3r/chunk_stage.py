@@ -6,12 +6,13 @@ A function of the chunk alone, so that chunks can be worked on side by side in a
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.association.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
@@ -27,7 +28,7 @@ from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.models.device import memory_said
-from list3r.reconstruction.base import Around, Reconstruction, Reconstructor
+from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor
 from list3r.reconstruction.detectors import make_detector
 from list3r.reconstruction.keyframe_record import KeyframeSettings, frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
@@ -59,6 +60,9 @@ class BuildSettings:
     feature_weights: str | None = None
     """File of the weights of learned local features."""
     chunks: ChunkSettings = field(default_factory=ChunkSettings)
+    """By frames that get depth."""
+    depth_every: int | None = None
+    """From every how many frames models that compute depth do so, the others get a pose; None: see `frames.pace`."""
     instances: InstanceSettings = field(default_factory=InstanceSettings)
     keep_pictures: bool = True
     """Keep a JPEG of each keyframe in the memory."""
@@ -76,6 +80,8 @@ class ChunkTask:
     """Folder for overlays, or None."""
     shot: tuple[int, int] | None = None
     """Positions [start, stop) of the shot that the chunk lies in, from which it may borrow frames; None for none."""
+    depth_every: int = 1
+    """Frames at multiples of this position in the source get depth."""
 
 
 def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
@@ -101,7 +107,7 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     try:
         if not frames:
             raise TrackingError("no frame of the chunk could be decoded")
-        used, parts, repeats = reconstruct(task, source, frames, camera)
+        used, parts, repeats = reconstruct(task, source, frames, camera, _deep(task, read))
     except TrackingError as error:
         return (replace(_without_geometry(task, frames, camera, bad, clock.seconds), lost_reason=str(error)),)
     clock.mark("reconstruction")
@@ -110,7 +116,7 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
         here = set(part.frame_indices.tolist())
         last = number == len(parts)
         made = _described(task, [f for f in used if f.index in here], part, bad if last else (), clock, discoverer)
-        made = _with_repeats(made, repeats)
+        made = _with_repeats(_with_between(made, part.between, used), repeats)
         results.append(made if last else replace(made, index=task.span.index + number * PART_STEP))
     return tuple(results)
 
@@ -120,25 +126,26 @@ PART_STEP = 1_000_000
 
 
 def reconstruct(
-    task: ChunkTask, source: FrameSource, frames: Sequence[Frame], camera: Camera
+    task: ChunkTask, source: FrameSource, frames: Sequence[Frame], camera: Camera, deep: Collection[int] | None = None
 ) -> tuple[Sequence[Frame], Sequence[Reconstruction], Sequence[Repeat]]:
     """The frames that were looked at, the parts that hang together, and frames that show what one of these shows.
 
-    Where the camera moves too little through the chunk frames from around it are borrowed. Raises `TrackingError`.
+    Frames of the numbers `deep` get depth, with None all. Where the camera moves too little through the chunk frames
+    from around it are borrowed. Raises `TrackingError`.
     """
     model = _model(task.settings, source.info.camera is not None)
     parts: Sequence[Reconstruction] = ()
     failed: BaselineError | None = None
     try:
-        parts = _parts(model, frames, camera, _around(task, source))
+        parts = _parts(model, frames, camera, _around(task, source), deep)
     except BaselineError as error:
         failed = error
-    alone = sum(int(part.posed.sum()) for part in parts)
+    alone = len(_posed(parts))
     if task.shot is not None and (failed or (hasattr(model, "parts") and 2 * alone < len(frames))):
         more = borrow(source, (task.span.start, task.span.stop), task.shot, frames)
         if failed or 2 * more.followed > len(frames):
-            found = _borrowed_parts(model, more, camera)
-            shown = {i for part in found for i in part.frame_indices[part.posed].tolist()}
+            found = _borrowed_parts(task, model, more, camera, deep)
+            shown = _posed(found)
             if len(shown & {f.index for f in frames}) + sum(r.shown in shown for r in more.repeats) > alone:
                 return more.frames, found, more.repeats
     if failed:
@@ -146,20 +153,38 @@ def reconstruct(
     return frames, parts, ()
 
 
-def _borrowed_parts(model: Reconstructor, more: Borrowed, camera: Camera) -> list[Reconstruction]:
+def _borrowed_parts(
+    task: ChunkTask, model: Reconstructor, more: Borrowed, camera: Camera, deep: Collection[int] | None
+) -> list[Reconstruction]:
     """Parts of a chunk with borrowed frames that hold a frame of its own, or what shows one."""
+    if len(more.frames) <= 2 * task.settings.chunks.length:
+        deep = None
+    elif deep is not None:
+        deep = {f.index for f in more.frames if f.index in deep or f.index not in more.own}
     try:
-        return [p for p in _parts(model, more.frames, camera) if more.own & set(p.frame_indices[p.posed].tolist())]
+        return [p for p in _parts(model, more.frames, camera, None, deep) if more.own & _posed([p])]
     except TrackingError:
         return []
 
 
 def _parts(
-    model: Reconstructor, frames: Sequence[Frame], camera: Camera, around: Around | None = None
+    model: Reconstructor, frames: Sequence[Frame], camera: Camera, around: Around | None, deep: Collection[int] | None
 ) -> Sequence[Reconstruction]:
     """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
     parts = getattr(model, "parts", None)
-    return [model(frames, camera)] if parts is None else parts(frames, camera, around)
+    return [model(frames, camera)] if parts is None else parts(frames, camera, around, deep)
+
+
+def _posed(parts: Sequence[Reconstruction]) -> set[int]:
+    """Numbers of the frames that have a pose."""
+    rows: list[Reconstruction | PosedOnly] = [*parts, *(p.between for p in parts if p.between is not None)]
+    return {index for row in rows for index in row.frame_indices[row.posed].tolist()}
+
+
+def _deep(task: ChunkTask, read: Sequence[Frame | BadFrame]) -> set[int] | None:
+    """Numbers of the frames that get depth; None for all, as where they would be few."""
+    found = {f.index for k, f in enumerate(read, task.span.start) if k % task.depth_every == 0}
+    return None if task.depth_every == 1 or 4 * len(found) < task.settings.chunks.length else found
 
 
 def _around(task: ChunkTask, source: FrameSource) -> Around | None:
@@ -173,18 +198,37 @@ def _with_repeats(result: ChunkResult, repeats: Sequence[Repeat]) -> ChunkResult
     """The result with further frames that show what one of its frames shows, where that one is."""
     place = {index: k for k, index in enumerate(result.frame_indices.tolist())}
     rows = [(r, place[r.shown]) for r in repeats if r.shown in place]
-    if not rows:
+    shown = np.array([k for _, k in rows], np.int64)
+    more = PosedOnly(np.array([r.index for r, _ in rows], np.int64), result.posed[shown], result.T_chunk_cam[shown])
+    return _with_frames(result, more, [r.time_s for r, _ in rows], np.full((len(rows), 4, 4), np.nan))
+
+
+def _with_between(result: ChunkResult, between: PosedOnly | None, frames: Sequence[Frame]) -> ChunkResult:
+    """The result with the frames of a chunk that have no depth."""
+    if between is None:
         return result
-    indices = np.concatenate([result.frame_indices, [r.index for r, _ in rows]])
-    times_s = np.concatenate([result.times_s, [r.time_s for r, _ in rows]])
-    order = np.argsort(indices)
-    shown = np.concatenate([np.arange(len(place)), [k for _, k in rows]])[order]
+    known = {f.index: f for f in frames}
+    own = [known[index] for index in between.frame_indices.tolist()]
+    given = _given_poses(own)
+    T_source_cam = np.full((len(own), 4, 4), np.nan) if given is None else given
+    return _with_frames(result, between, [f.time_s for f in own], T_source_cam)
+
+
+def _with_frames(
+    result: ChunkResult, more: PosedOnly, times_s: Sequence[float], T_source_cam: NDArray[np.float64]
+) -> ChunkResult:
+    """The result with frames of which only the pose is known; `T_source_cam` is NaN where the source says none."""
+    if not len(more.frame_indices):
+        return result
+    indices = np.concatenate([result.frame_indices, more.frame_indices])
+    order, given = np.argsort(indices), result.T_source_cam
     return replace(
         result,
         frame_indices=indices[order],
-        times_s=times_s[order],
-        posed=result.posed[shown],
-        T_chunk_cam=result.T_chunk_cam[shown],
+        times_s=np.concatenate([result.times_s, times_s])[order],
+        posed=np.concatenate([result.posed, more.posed])[order],
+        T_chunk_cam=np.concatenate([result.T_chunk_cam, more.T_chunk_cam])[order],
+        T_source_cam=None if given is None else np.concatenate([given, T_source_cam])[order],
     )
 
 

@@ -25,7 +25,18 @@ from list3r.memory.errors import TrackingError
 from list3r.memory.store import Store
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.reconstruction.registry import entry
-from list3r.session_stage import Job, Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare, shot_cuts
+from list3r.session_stage import (
+    Job,
+    Look,
+    Plan,
+    Progress,
+    add_chunks,
+    lost_reasons,
+    pace_notes,
+    plan_session,
+    prepare,
+    shot_cuts,
+)
 
 
 @dataclass(frozen=True)
@@ -151,7 +162,7 @@ def _finish(store: Store, info: SourceInfo, plan: Plan, started: float) -> Build
 
 
 def _notes(store: Store, session: int, lost: int, bad: int, components: int) -> tuple[str, ...]:
-    notes = list(camera_notes(store, session))
+    notes = [*camera_notes(store, session), *pace_notes(store, session)]
     cuts = shot_cuts(store, session)
     if cuts:
         notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")

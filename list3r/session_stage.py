@@ -14,6 +14,7 @@ from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.cuts import find_cuts
+from list3r.frames.pace import depth_step
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
 from list3r.mapping import AssociationSettings, add_chunk, place_chunks
@@ -87,14 +88,17 @@ def plan_session(
     """The chunks of a session, and of those the ones that are not in the memory yet."""
     count = job.info.frame_count
     cuts = _cuts(store, session, job, look)
-    spans = plan_chunks(count, job.settings.chunks, cuts)
+    step = _depth_step(store, session, job)
+    spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks(session)}
     options = with_camera(store, session, job.source, job.options, job.settings.reconstruction, job.info, look)
     tasks = []
     for span in spans:
         if span.index not in done:
             where = None if debug_dir is None else str(debug_dir)
-            tasks.append(ChunkTask(str(job.source), options, span, job.settings, where, shot_of(span, cuts, count)))
+            tasks.append(
+                ChunkTask(str(job.source), options, span, job.settings, where, shot_of(span, cuts, count), step)
+            )
     return Plan(session, spans, done, tasks)
 
 
@@ -147,7 +151,7 @@ def take_back(store: Store, session: int) -> None:
     """Leave the memory as it was before a session that is not in the library yet."""
     placed = any(f.state == "posed" for f in store.frames(session))
     with store.transaction():
-        for name in (_name(store, session, "lost"), _name(store, session, "cuts"), camera_key(session)):
+        for name in (*(_name(store, session, what) for what in ("lost", "cuts", "depth step")), camera_key(session)):
             store.drop_value(name)
         store.drop_session(session)
         if placed:
@@ -162,6 +166,29 @@ def lost_reasons(store: Store, session: int) -> list[str]:
 def shot_cuts(store: Store, session: int) -> list[int]:
     """Positions before which the video of a session jumps."""
     return list(store.get_value(_name(store, session, "cuts"), []))
+
+
+def pace_notes(store: Store, session: int) -> tuple[str, ...]:
+    """What the user should know of frames without depth."""
+    step = store.get_value(_name(store, session, "depth step"), 1)
+    if step == 1:
+        return ()
+    nth = {2: "2nd", 3: "3rd"}.get(step, f"{step}th")
+    return (f"the picture moves slowly: depth and things are from every {nth} frame (--depth-every 1 takes all)",)
+
+
+def _depth_step(store: Store, session: int, job: Job) -> int:
+    """From every how many frames depth is computed, settled once; 1 for models that take it from elsewhere."""
+    if not entry(job.settings.reconstruction).thins:
+        return 1
+    name = _name(store, session, "depth step")
+    known: int | None = store.get_value(name)
+    if known is None:
+        begun, asked = store.chunks(session), job.settings.depth_every
+        known = asked or (1 if begun else depth_step(open_source(job.source, job.options), job.settings.chunks.length))
+        with store.transaction():
+            store.set_value(name, known)
+    return known
 
 
 def _name(store: Store, session: int, what: str) -> str:

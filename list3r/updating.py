@@ -23,7 +23,17 @@ from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
 from list3r.memory.records import Edge
 from list3r.memory.store import Store
 from list3r.models.licences import DEFAULT_PROFILE
-from list3r.session_stage import Look, Plan, Progress, add_chunks, lost_reasons, plan_session, prepare, take_back
+from list3r.session_stage import (
+    Look,
+    Plan,
+    Progress,
+    add_chunks,
+    lost_reasons,
+    pace_notes,
+    plan_session,
+    prepare,
+    take_back,
+)
 
 
 @dataclass(frozen=True)
@@ -182,6 +192,7 @@ def _report(store: Store, info: SourceInfo, plan: Plan, started: float) -> Updat
         resumed_chunks=len(plan.done),
         notes=(
             *camera_notes(store, session),
+            *pace_notes(store, session),
             *_notes(info, len(own), placed, held(store, session), lost, len(frames)),
             *lost_reasons(store, session),
         ),

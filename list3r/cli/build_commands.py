@@ -86,7 +86,7 @@ def build(
         str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
     ] = "auto",
     words: src.SourceWords,
-    cut: mod.CutWords,
+    cut: mod.BuildCutWords,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")

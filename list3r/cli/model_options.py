@@ -87,6 +87,17 @@ Overlap = Annotated[
         "--overlap", metavar="N", help="Frames that neighbouring chunks share; default: 30 %.", show_default=False
     ),
 ]
+DepthEvery = Annotated[
+    int | None,
+    typer.Option(
+        "--depth-every",
+        metavar="N",
+        min=1,
+        help="With colour alone: depth and things from every n-th frame, the others get a pose; default: by how fast "
+        "the picture moves.",
+        show_default=False,
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -126,6 +137,13 @@ class CutWords:
     overlap: Overlap = None
 
 
+@dataclass(frozen=True)
+class BuildCutWords(CutWords):
+    """... and say which frames get depth."""
+
+    depth_every: DepthEvery = None
+
+
 USUAL_CHUNK, LONGEST_CHUNK, SHORTEST_CHUNK = 100, 240, 16
 """Frames: the paper's; the most that a GPU is filled with, from where passes grow slow and no figure shows a gain; the
 fewest that make a chunk."""
@@ -135,7 +153,13 @@ SAM 3, and what a picture takes."""
 
 
 def build_settings(
-    info: SourceInfo, words: ModelWords, cut: CutWords, *, poses: str, pictures: bool, resumed: Path | None = None
+    info: SourceInfo,
+    words: ModelWords,
+    cut: CutWords,
+    *,
+    poses: str,
+    pictures: bool,
+    resumed: Path | None = None,
 ) -> tuple[BuildSettings, list[str]]:
     """Settings of a build, and what the user should know of the models, one line each.
 
@@ -169,9 +193,11 @@ def build_settings(
         ),
         keep_pictures=pictures,
     )
-    chunks = None if resumed is None or cut.chunk is not None else _recorded(resumed)
-    chunks = chunks or _cut(settings, cut.chunk, cut.overlap)
-    return replace(settings, chunks=chunks), notes
+    chunks, depth_every = (None, None) if resumed is None else _recorded(resumed)
+    if cut.chunk is not None or chunks is None:
+        chunks = _cut(settings, cut.chunk, cut.overlap)
+    wanted = cut.depth_every if isinstance(cut, BuildCutWords) else None
+    return replace(settings, chunks=chunks, depth_every=wanted or depth_every), notes
 
 
 def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
@@ -240,17 +266,19 @@ def _terms(selection: Selection, chosen: Mapping[str, str]) -> list[str]:
     return told
 
 
-def _recorded(memory: Path) -> ChunkSettings | None:
-    """How the unfinished session of a memory was cut, None where there is none."""
+def _recorded(memory: Path) -> tuple[ChunkSettings | None, int | None]:
+    """How the unfinished session of a memory was cut, and which frames were to get depth; None where none says."""
     from list3r.frames.chunks import ChunkSettings
     from list3r.memory.store import Store
 
     if not memory.is_file():
-        return None
+        return None, None
     with Store.open(memory) as store:
         begun = [s for s in store.sessions() if s.state != "complete"]
-    said = begun[-1].settings.get("chunks") if begun else None
-    return ChunkSettings(int(said["length"]), int(said["overlap"])) if isinstance(said, dict) else None
+    settings = begun[-1].settings if begun else {}
+    said, every = settings.get("chunks"), settings.get("depth_every")
+    chunks = ChunkSettings(int(said["length"]), int(said["overlap"])) if isinstance(said, dict) else None
+    return chunks, every if isinstance(every, int) else None
 
 
 def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> ChunkSettings:

@@ -26,6 +26,10 @@ class ChunkSettings:
                 "overlap at least 1 and less than the length"
             )
 
+    def times(self, step: int) -> ChunkSettings:
+        """Chunks of so many times as many frames."""
+        return ChunkSettings(self.length * step, self.overlap * step)
+
 
 @dataclass(frozen=True)
 class ChunkSpan:

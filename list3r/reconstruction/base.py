@@ -42,6 +42,18 @@ class DepthNoise:
 
 
 @dataclass(frozen=True)
+class PosedOnly:
+    """Frames of a chunk that have a pose and no depth."""
+
+    frame_indices: NDArray[np.int64]
+    """Frame.index of each frame. Shape (M,)."""
+    posed: NDArray[np.bool_]
+    """False where the camera could not be followed. Shape (M,)."""
+    T_chunk_cam: NDArray[np.float64]
+    """Shape (M, 4, 4)."""
+
+
+@dataclass(frozen=True)
 class Reconstruction:
     """Geometry of one chunk, in the chunk's own frame and units."""
 
@@ -66,6 +78,8 @@ class Reconstruction:
     looks for none or nothing moves. Depth and confidence are 0 there. Shape (F, h, w)."""
     depth_noise: DepthNoise | None = None
     """Noise of depth that was computed; None for a sensor's readings, whose noise is known and new in each frame."""
+    between: PosedOnly | None = None
+    """Further frames of the chunk, none of the above."""
 
     def __post_init__(self) -> None:
         count = len(self.frame_indices)

@@ -41,11 +41,13 @@ class ModelEntry:
     """Must be told the intrinsics; the others find the focal length themselves."""
     calibration: str = ""
     """Module that estimates an unknown camera before the chunks, which has `calibrate(source) -> Calibration`."""
+    thins: bool = False
+    """Computes depth, so that frames which show the same from nearly the same place need not all have it."""
 
 
 MODELS: dict[str, ModelEntry] = {
     "rgbd": ModelEntry("rgbd", needs_depth=True, needs_camera=True),
-    "sfm": ModelEntry("sfm", calibration="sfm_calibration"),
+    "sfm": ModelEntry("sfm", calibration="sfm_calibration", thins=True),
     "pi3": ModelEntry("pi3"),
     "pi3x": ModelEntry("pi3x"),
     "vggt": ModelEntry("vggt"),

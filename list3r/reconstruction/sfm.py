@@ -13,7 +13,7 @@ as well 0.046 (with a focal length that the pictures tell 0.038), plain pycolmap
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
-from list3r.reconstruction.base import Around, Reconstruction
+from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
 from list3r.reconstruction.detectors import make_detector
 from list3r.reconstruction.learned import LearnedDetector
 from list3r.reconstruction.mvs import MvsSettings, dense_depth, stereo_noise
@@ -97,10 +97,17 @@ class SfmReconstructor:
         grays = [_gray(f) for f in frames]
         return self._finish(frames, self._segments(frames, grays, camera)[0])
 
-    def parts(self, frames: Sequence[Frame], camera: Camera, around: Around | None = None) -> list[Reconstruction]:
+    def parts(
+        self,
+        frames: Sequence[Frame],
+        camera: Camera,
+        around: Around | None = None,
+        deep: Collection[int] | None = None,
+    ) -> list[Reconstruction]:
         """All parts of a chunk that hang together, in order of time; what lies in none is among the largest's frames.
 
-        With `around` some frames before and behind the chunk are mapped with it. Raises `TrackingError` as above.
+        With `around` some frames before and behind the chunk are mapped with it. With `deep` only the frames of these
+        numbers get depth, and the others a pose. Raises `TrackingError` as above.
         """
         grays = [_gray(f) for f in frames]
         first, *others = self._segments(frames, grays, camera, around)
@@ -109,7 +116,7 @@ class SfmReconstructor:
         groups = [(first, [k for k in range(len(frames)) if k not in elsewhere])]
         groups += [(s, sorted(s.T_map_cam)) for s in others]
         groups.sort(key=lambda group: max(group[0].T_map_cam))
-        return [self._finish([frames[k] for k in kept], _renumbered(s, kept)) for s, kept in groups]
+        return [self._finish([frames[k] for k in kept], _renumbered(s, kept), deep) for s, kept in groups]
 
     def _segments(
         self, frames: Sequence[Frame], grays: Sequence[Gray], camera: Camera, around: Around | None = None
@@ -157,7 +164,7 @@ class SfmReconstructor:
         found = triangulate(problem, camera, poses, self.settings.mapping)
         return _with_given_poses(found or SparseMap({}, {}, camera), poses, tracks)
 
-    def _finish(self, frames: Sequence[Frame], segment: Segment) -> Reconstruction:
+    def _finish(self, frames: Sequence[Frame], segment: Segment, deep: Collection[int] | None = None) -> Reconstruction:
         """Dense depth, units, keyframes."""
         T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
         for position, pose in segment.T_map_cam.items():
@@ -169,11 +176,17 @@ class SfmReconstructor:
             T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
             T[:, :3, 3] *= scale
             sparse = [None if s is None else (s[0], s[1] * scale) for s in sparse]
-        camera = segment.found.camera
+        camera, indices, between = segment.found.camera, np.array([f.index for f in frames], np.int64), None
+        if deep is not None:
+            used = np.isin(indices, list(deep))
+            between = PosedOnly(indices[~used], posed[~used], T[~used])
+            kept = np.flatnonzero(used).tolist()
+            frames, sparse = [frames[k] for k in kept], [sparse[k] for k in kept]
+            indices, posed, T = indices[used], posed[used], T[used]
         depth, confidence = dense_depth(frames, posed, T, camera, sparse, self.settings.dense, self.device)
         keyframes = select_keyframes(T, posed, list(depth), OdometrySettings())
         return Reconstruction(
-            frame_indices=np.array([f.index for f in frames], np.int64),
+            frame_indices=indices,
             posed=posed,
             T_chunk_cam=T,
             camera=camera,
@@ -182,6 +195,7 @@ class SfmReconstructor:
             scale_kind="metric" if self.poses == "given" else "relative",
             keyframes=np.array(keyframes, np.int64),
             depth_noise=stereo_noise(depth, confidence),
+            between=between,
         )
 
 
