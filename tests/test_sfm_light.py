@@ -68,9 +68,10 @@ def test_windows_that_most_others_bear_out_are_believed() -> None:
 
 def test_a_zoom_is_told_of_and_windows_that_are_a_little_off_are_not() -> None:
     camera, settings = Camera(640, 480, 500.0, 500.0, 319.5, 239.5), CalibrationSettings()
-    assert _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (180, 890.0, 0.26))), 1.0, settings) == ()
-    (said,) = _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (210, 950.0, 0.0))), 2.0, settings)
+    assert _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (180, 890.0, 0.26)), 100), 1.0, settings) == ()
+    (said,) = _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (210, 950.0, 0.0)), 100), 2.0, settings)
     assert "1900 px from frame 210 on" in said and "690" not in said and "1380" not in said
+    assert _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (210, 950.0, 0.0)), 60), 2.0, settings) == ()
 
 
 def test_a_process_that_is_ended_says_nothing_of_its_own() -> None:

@@ -35,7 +35,8 @@ class CalibrationSettings:
     most_window_ratio: float = 1.3
     """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
     zoom_ratio: float = 1.5
-    """Windows whose focal length is farther off than this are told of: more than four deviations of one window."""
+    """Windows whose focal length is farther off than this are told of: more than four deviations of one window. Of
+    shorter windows, which say less, it is raised to the power of `frames` by theirs."""
     zoom_distortion: float = 0.2
     """... unless their k1 is farther off than this, see below."""
     most_error_px: float = 2.0
@@ -129,6 +130,8 @@ class _Estimate:
     k1: float
     others: tuple[tuple[int, float, float], ...]
     """Frame.index at which windows begin that can be believed and say something else; their focal length, px; k1."""
+    frames: int
+    """Length of a window."""
 
 
 def _estimated(
@@ -151,7 +154,7 @@ def _estimated(
     middle = float(np.exp(np.median(np.log(focals[agree]))))
     free, k1 = _adjust_together(kept, replace(start, fx=middle, fy=middle), True, settings)
     others = tuple((begins[k], float(focals[k]), windows[k][1].k1) for k in np.flatnonzero(~agree).tolist())
-    return _Estimate(kept, free, k1, others) if _believable(free, k1, settings) else None
+    return _Estimate(kept, free, k1, others, spans[0][1] - spans[0][0]) if _believable(free, k1, settings) else None
 
 
 def _believable(camera: Camera, k1: float, settings: CalibrationSettings) -> bool:
@@ -176,11 +179,11 @@ def _index_at(source: FrameSource, position: int) -> int:
 
 def _parted(found: _Estimate, stored_px: float, settings: CalibrationSettings) -> tuple[str, ...]:
     """What is said where windows that can be believed tell clearly different focal lengths."""
+    least = np.log(settings.zoom_ratio) * settings.frames / found.frames
     far = [
         (n, f)
         for n, f, k1 in found.others
-        if abs(np.log(f / found.camera.fx)) > np.log(settings.zoom_ratio)
-        and abs(k1 - found.k1) < settings.zoom_distortion
+        if abs(np.log(f / found.camera.fx)) > least and abs(k1 - found.k1) < settings.zoom_distortion
     ]
     if not far:
         return ()

@@ -15,7 +15,7 @@ Adjusting the whole at growth 1.1 instead of 1.4 costs 1.4 times the CPU and end
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
@@ -138,7 +138,7 @@ def build_maps(
     for angle in angles:
         maps = _grown(cache, problem, camera, free_camera, angle, chosen)
         grown.append(_without_beside(maps, problem))
-        if agreed(grown, chosen):
+        if agreed(grown, chosen) or (not maps and _turns(problem, problem.views, camera)):
             break
     return best_of(grown, chosen.alike)
 
@@ -155,8 +155,12 @@ def _grown(
     if problem.matched:
         maps = [_borne_out(m, problem, cache, camera) for m in maps]
     maps = [m for m in maps if len(m.points) >= settings.least_points and len(m.T_map_cam) >= 2]
-    places = {key: view.xy for key, view in problem.views.items()}
-    return [m for m in maps if not only_turns(places, problem.pairs, m.T_map_cam, camera)]
+    return [m for m in maps if not _turns(problem, m.T_map_cam, camera)]
+
+
+def _turns(problem: MapProblem, keys: Collection[int], camera: Camera) -> bool:
+    """Whether the camera only turns in some of the views."""
+    return only_turns({key: view.xy for key, view in problem.views.items()}, problem.pairs, keys, camera)
 
 
 def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[SparseMap]:
