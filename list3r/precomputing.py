@@ -13,11 +13,11 @@ import numpy as np
 from list3r.build_target import make_folder
 from list3r.calibration_stage import estimated_camera, told_camera
 from list3r.chunk_stage import BuildSettings, ChunkTask, reconstruct
-from list3r.frames.base import Frame, FrameSource, SourceInfo, guessed_camera
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, guessed_camera
 from list3r.frames.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.cuts import find_cuts
 from list3r.frames.options import SourceOptions
-from list3r.frames.source import open_source
+from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.reconstruction.base import Reconstruction
@@ -79,12 +79,13 @@ def precompute(
             options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
     opened = open_source(source, options)
     posed: set[int] = set()
+    bad: dict[int, str] = {}
     for span in spans:
         path = _file(out, span)
         if force or not path.exists():
             try:
                 shot = shot_of(span, cuts, info.frame_count)
-                _write(path, *_chunk(ChunkTask(str(source), options, span, settings, shot=shot), opened))
+                _write(path, *_chunk(ChunkTask(str(source), options, span, settings, shot=shot), opened, bad))
             except TrackingError as error:
                 notes.append(f"chunk {span.index} is left out: {error}")
                 continue
@@ -92,9 +93,13 @@ def precompute(
         posed.update(piece.frames[np.isfinite(piece.T_world_cam).all(axis=(1, 2))].tolist())
         if progress is not None:
             progress(span.stop, info.frame_count)
+    check_bad_share(len(bad), info.frame_count, next(iter(bad.values()), ""))
     files = sorted(out.glob("chunk-*.npz"))
     if not files:
-        raise TrackingError(f"no chunk of {info.path} could be reconstructed: {'; '.join(notes)}")
+        why = [note for note in notes if note.startswith("chunk ")]
+        raise TrackingError(f"no chunk of {info.path} could be reconstructed: {'; '.join(why)}")
+    if bad:
+        notes.append(f"{len(bad)} frames could not be used: {next(iter(bad.values()))}")
     alone = [a for a, b in pairwise(spans) if b.start >= a.stop]
     if alone:
         notes.append(f"the video jumps after {len(alone)} chunks; their files share no frames")
@@ -116,7 +121,7 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
 
 def _said(camera: dict[str, Any]) -> str:
     """What the build that reads the files has to be told, so that its pictures are those that were looked at."""
-    words = [f"--{name} {','.join(f'{v:.5g}' for v in camera[name])}" for name in ("intrinsics", "distortion")]
+    words = [f"--{name} {','.join(f'{v:.5g}' for v in camera[name]) or 0}" for name in ("intrinsics", "distortion")]
     return f"the camera was estimated; give the build the same: {' '.join(words)}"
 
 
@@ -124,10 +129,12 @@ def _file(out: Path, span: ChunkSpan) -> Path:
     return out / f"chunk-{span.index:04d}.npz"
 
 
-def _chunk(task: ChunkTask, source: FrameSource) -> tuple[Reconstruction, dict[int, int]]:
+def _chunk(task: ChunkTask, source: FrameSource, bad: dict[int, str]) -> tuple[Reconstruction, dict[int, int]]:
     """The largest part of a chunk that hangs together, and of its frames the numbers, each with that of the frame that
-    shows what it shows. Raises `TrackingError`."""
-    frames = [f for f in source.read(task.span.start, task.span.stop) if isinstance(f, Frame)]
+    shows what it shows; why frames cannot be used goes into `bad`. Raises `TrackingError`."""
+    found = list(source.read(task.span.start, task.span.stop))
+    bad.update((f.index, f.reason) for f in found if isinstance(f, BadFrame))
+    frames = [f for f in found if isinstance(f, Frame)]
     if not frames:
         raise TrackingError("no frame of it could be decoded")
     _, parts, repeats = reconstruct(task, source, frames, source.info.camera or guessed_camera(source.info))

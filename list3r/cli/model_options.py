@@ -210,7 +210,7 @@ def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
         if not where:
             raise OptionError(f"--weights {part}= names nothing; give a folder, a file or owner/name@revision")
         if part not in taking and model != "precomputed":
-            raise OptionError(f"--weights {where}: the {part} {model} takes no weights; name its network with --{part}")
+            raise OptionError(f"--weights {where}: no network does the {part} ({model}); name one with --{part}")
 
 
 def _local_features(words: str) -> tuple[str, str | None]:

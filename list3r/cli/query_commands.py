@@ -278,6 +278,8 @@ def seen(
         camera = camera_from(scene, view, time, pose, session)
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
+        if camera is None and max_depth is not None:
+            raise OptionError("--max-depth is how far a camera sees; leave it out where an instance is named")
         if camera is not None:
             found = scene.visible(camera, max_depth=max_depth, structure=structure)
             if camera.frame is not None and not json:

@@ -37,6 +37,8 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
     Raises `SourceError` for what is not a source, `OptionError` for options that do not fit it.
     """
     options = options or SourceOptions()
+    if str(path) == "":
+        raise SourceError(f"the name of the source is empty; {_WANTED}")
     root = Path(path).expanduser()
     try:
         if not root.exists():
