@@ -189,6 +189,10 @@ MORE_CASES = {
         ".npz",
     ),
     "a transform in no file": ("inspect {p}/good --depth-to-color {p}/no.txt", "no such file"),
+    "depth that is not there": (
+        "inspect {p}/pictures --depth-scale 5 --registered",
+        "leave out --depth-scale and --reg",
+    ),
     "another layout": ("inspect {p}/good --kind replica", "not the replica layout"),
     "overlay onto a memory": ("inspect {p}/good --overlay {p}/room.l3r", "png"),
     "overlay that is named as a picture": ("inspect {p}/good --overlay {p}/memory.png", "memory file"),

@@ -49,6 +49,7 @@ def inspect(
     if overlay is not None:
         _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
+    words.check_fits(opened.info)
     report = describe(opened.info)
     if calibrate:
         from list3r.frames.calibrate import calibrate as estimate
@@ -112,6 +113,7 @@ def build(
     check_anchor(scale_anchor)
     check_detector(detector, detector_classes)
     info = open_source(source, options).info
+    words.check_fits(info)
     resumed = memory if resume else None
     settings, told = mod.build_settings(info, models, cut, poses=poses, pictures=pictures, resumed=resumed)
     if not json:

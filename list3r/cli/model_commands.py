@@ -116,6 +116,7 @@ def precompute(
     from list3r.frames.source import open_source
 
     info = open_source(source, options).info
+    words.check_fits(info)
     settings, told = mod.build_settings(info, geometry.models(), cut, poses=poses, pictures=False)
     if not json:
         for line in told:

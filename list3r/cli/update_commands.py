@@ -67,6 +67,7 @@ def update(
     check_anchor(scale_anchor)
     check_detector(detector, detector_classes)
     info = open_source(source, options).info
+    words.check_fits(info)
     resumed = memory if resume else None
     settings, told = mod.build_settings(info, models, cut, poses=poses, pictures=pictures, resumed=resumed)
     if not json:
