@@ -55,7 +55,7 @@ def test_the_flow_of_a_sliding_picture_is_how_far_it_slides(step_px: float) -> N
     assert np.median(flows) == pytest.approx(step_px / 320, rel=0.05)
 
 
-@pytest.mark.parametrize(("step_px", "expected"), [(0.5, 4), (3.0, 3), (4.0, 2), (9.0, 1), (13.0, 1)])
+@pytest.mark.parametrize(("step_px", "expected"), [(0.5, 4), (3.0, 3), (4.5, 2), (9.0, 1), (13.0, 1)])
 def test_the_slower_the_picture_the_fewer_frames_get_depth(step_px: float, expected: int) -> None:
     assert depth_step(Sliding(step_px), 100) == expected  # type: ignore[arg-type]
 

@@ -24,8 +24,8 @@ class PaceSettings:
     """From how many frames depth is computed."""
 
     flow: float = 0.03
-    """How far the picture moves, by its longer side, between frames that get depth: less than the 0.04 of the simulated
-    walks on which depth and discovery were made."""
+    """About how far the picture moves, by its longer side, between frames that get depth: less than the 0.04 of the
+    simulated walks on which depth and discovery were made."""
     quantile: float = 0.75
     """Of the places that are looked at, this share moves no faster."""
     spots: int = 16
@@ -51,7 +51,7 @@ def depth_step(source: FrameSource, length: int, settings: PaceSettings | None =
     flows = picture_flows(source, s)
     if len(flows) < s.least_spots:
         return 1
-    return int(np.clip(s.flow / max(float(np.quantile(flows, s.quantile)), 1e-6), 1, most))
+    return int(np.clip(np.rint(s.flow / max(float(np.quantile(flows, s.quantile)), 1e-6)), 1, most))
 
 
 def picture_flows(source: FrameSource, settings: PaceSettings) -> NDArray[np.float64]:
