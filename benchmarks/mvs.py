@@ -5,7 +5,8 @@
 
 The sensor's depth is used for comparing only, after one scale for each run of frames; `--poses rgbd` takes the camera's
 poses from it too, which leaves the stereo as the only source of error. Prints the share of pixels with depth, the
-median relative error, the error by tenths of confidence and CPU seconds for each frame. `--device cuda` runs the same
+median relative error, the error by tenths of confidence and CPU seconds: of all with `--poses sfm`, which maps a chunk
+and chooses the frames that get depth as a build does, of the stereo alone otherwise. `--device cuda` runs the same
 frames on the CPU and on the GPU and compares.
 """
 
@@ -27,7 +28,9 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame, FrameSource
 from list3r.frames.borrowing import frames_around
 from list3r.frames.options import SourceOptions, parse_intrinsics
+from list3r.frames.pace import depth_step
 from list3r.frames.source import open_source
+from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.mvs import dense_depth
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm import SfmReconstructor
@@ -35,27 +38,30 @@ from list3r.reconstruction.sfm import SfmReconstructor
 Poses = NDArray[np.float64]
 
 
-def poses_of(
-    source: FrameSource, frames: list[Frame], span: tuple[int, int], camera: Camera, kind: str
-) -> tuple[NDArray[np.bool_], Poses, Camera]:
-    """Which frames have a pose, the poses, and the camera; `sfm` with frames around, as in a build."""
+def reconstructed(
+    source: FrameSource, frames: list[Frame], span: tuple[int, int], camera: Camera, every: int
+) -> tuple[list[Frame], Reconstruction]:
+    """The largest part of a chunk by `sfm`, as a build makes it: with frames around, and depth of every n-th frame."""
+    model = make_reconstructor("sfm", ModelOptions())
+    assert isinstance(model, SfmReconstructor)
+    around = partial(frames_around, source, span, (0, source.info.frame_count))
+    deep = {f.index for k, f in enumerate(frames, span[0]) if k % every == 0}
+    found = max(model.parts(frames, camera, around, deep), key=lambda part: int(part.posed.sum()))
+    held = set(found.frame_indices.tolist())
+    return [f for f in frames if f.index in held], found
+
+
+def poses_of(frames: list[Frame], camera: Camera, kind: str) -> tuple[NDArray[np.bool_], Poses]:
+    """Which frames have a pose, and the poses, from the source or from its depth."""
     if kind == "given":
         known = [f.T_source_cam is not None and bool(np.isfinite(f.T_source_cam).all()) for f in frames]
         T = [
             f.T_source_cam if ok and f.T_source_cam is not None else np.eye(4)
             for f, ok in zip(frames, known, strict=True)
         ]
-        return np.array(known), np.stack(T), camera
-    model = make_reconstructor(kind, ModelOptions())
-    if isinstance(model, SfmReconstructor):
-        parts = model.parts(frames, camera, partial(frames_around, source, span, (0, source.info.frame_count)))
-        found = max(parts, key=lambda part: int(part.posed.sum()))
-        at = np.searchsorted([f.index for f in frames], found.frame_indices)
-        posed, T = np.zeros(len(frames), bool), np.tile(np.eye(4), (len(frames), 1, 1))
-        posed[at], T[at] = found.posed, found.T_chunk_cam
-        return posed, T, found.camera
-    found = model(frames, camera)
-    return found.posed, found.T_chunk_cam, found.camera
+        return np.array(known), np.stack(T)
+    found = make_reconstructor(kind, ModelOptions())(frames, camera)
+    return found.posed, found.T_chunk_cam
 
 
 def against_sensor(depth: NDArray[np.float32], confidence: NDArray[np.float16], frames: list[Frame]) -> dict[str, Any]:
@@ -104,32 +110,39 @@ def compare_devices(frames: list[Frame], posed: NDArray[np.bool_], T: Poses, cam
     }
 
 
-def run(path: str, options: SourceOptions, starts: list[int], count: int, kind: str, device: str) -> dict[str, Any]:
+def run(path: str, options: SourceOptions, words: argparse.Namespace) -> dict[str, Any]:
     """Measure each run of frames."""
     source = open_source(path, options)
     camera = source.info.camera
     if camera is None:
         raise SystemExit("the intrinsics of the source are unknown; give --intrinsics fx,fy,cx,cy")
+    every = words.depth_every or depth_step(source, words.frames)
     rows = []
-    for start in starts:
-        span = start, min(start + count, source.info.frame_count)
+    for start in words.start:
+        span = start, min(start + words.frames * every, source.info.frame_count)
         frames = [f for f in source.read(*span) if isinstance(f, Frame)]
-        posed, T, found = poses_of(source, frames, span, camera, kind)
         begin = time.process_time()
-        depth, confidence = dense_depth(frames, posed, T, found)
+        if words.poses == "sfm":
+            deep, made = reconstructed(source, frames, span, camera, every)
+            posed, T, used, depth, confidence = made.posed, made.T_chunk_cam, made.camera, made.depth, made.confidence
+        else:
+            deep, used = frames[::every], camera
+            posed, T = poses_of(deep, camera, words.poses)
+            begin = time.process_time()
+            depth, confidence = dense_depth(deep, posed, T, camera)
         spent = time.process_time() - begin
-        row = {"start": start, "frames": len(frames), "posed": int(posed.sum())}
-        row |= {"cpu_s_per_frame": round(spent / len(frames), 3), **against_sensor(depth, confidence, frames)}
-        if device == "cuda":
-            row["devices"] = compare_devices(frames, posed, T, found)
-        print(json.dumps(row))
+        row = {"start": start, "frames": len(frames), "with_depth": len(deep), "posed": int(posed.sum())}
+        row |= {"cpu_s": round(spent, 1), **against_sensor(depth, confidence, deep)}
+        if words.device == "cuda":
+            row["devices"] = compare_devices(deep, posed, T, used)
+        print(json.dumps(row), flush=True)
         rows.append(row)
     mean = {
         name: round(float(np.mean([row[name] for row in rows])), 4)
-        for name in ("coverage", "median_error", "cpu_s_per_frame")
+        for name in ("coverage", "median_error", "cpu_s")
         if all(name in row for row in rows)
     }
-    return {"source": path, "poses": kind, "mean": mean, "runs": rows}
+    return {"source": path, "poses": words.poses, "depth_every": every, "mean": mean, "runs": rows}
 
 
 def main() -> None:
@@ -137,7 +150,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", required=True, help="folder of RGB-D frames that `list3r inspect` recognises")
     parser.add_argument("--start", type=int, nargs="+", default=[0], help="first frame of each run")
-    parser.add_argument("--frames", type=int, default=100, help="frames of a run")
+    parser.add_argument("--frames", type=int, default=100, help="frames of a run that get depth")
+    parser.add_argument("--depth-every", type=int, help="depth of every n-th frame; default: as a build does")
     parser.add_argument("--poses", choices=("sfm", "rgbd", "given"), default="sfm", help="where the poses come from")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cuda compares CPU and GPU")
     parser.add_argument("--intrinsics", help="fx,fy,cx,cy of the colour camera where the source does not tell")
@@ -147,7 +161,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     options = SourceOptions(intrinsics=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
     print(machine())
-    figures = run(given.source, options, given.start, given.frames, given.poses, given.device)
+    figures = run(given.source, options, given)
     print(json.dumps(figures["mean"]))
     write_json(given.json, figures)
 
