@@ -35,6 +35,8 @@ TRUTH: dict[str, tuple[str, int, tuple[int, int, int, int]]] = {
     "purple magazine": ("book", 300, (186, 304, 328, 410)),
 }
 """What it is called, the number of a picture, and the box of what the depth camera sees of it there, px."""
+NEAR = 2
+"""Frames from that picture within which a mask counts: not every frame of colour video has masks."""
 LEAST_OVERLAP = 0.3
 """IoU of a box with that of a mask."""
 
@@ -47,8 +49,9 @@ def instances_of(store: Store) -> dict[str, int | None]:
         boxes: dict[tuple[int, int], np.ndarray] = {}
         for (chunk_id, local_id), instance in home.items():
             track = store.mask_track(chunk_id, local_id)
-            at = np.flatnonzero((track.frames == frame) & (track.areas_px > 0))
-            if len(at):
+            away = np.where(track.areas_px > 0, np.abs(track.frames - frame), NEAR + 1)
+            at = np.flatnonzero(away == away.min(initial=NEAR + 1))
+            if len(at) and away[at[0]] <= NEAR:
                 one = track.boxes_xyxy[at[0]]
                 other = boxes.get((chunk_id, instance), one)
                 whole = np.concatenate([np.minimum(one[:2], other[:2]), np.maximum(one[2:], other[2:])])
