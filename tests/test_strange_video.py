@@ -85,14 +85,16 @@ def test_what_is_followed_through_a_stop_is_told_from_a_wall() -> None:
     assert borrow(source, (STOP.stop, 56), (0, 56), list(source.read(STOP.stop, 56))).followed == 0
 
 
-def test_windows_of_a_short_video_leave_some_without_a_third_of_it() -> None:
-    for count in range(180, 500, 7):
+def test_of_a_short_video_some_window_is_half_without_any_third_of_it() -> None:
+    for count in range(120, 500, 7):
         spans = _spans(count, CalibrationSettings())
         assert spans[0][0] == 0 and spans[-1][1] == count
         for first in range(0, count - count // 3, 5):
-            assert any(b <= first + 1 or a >= first + count // 3 for a, b in spans), (count, first)
+            behind = first + count // 3
+            assert any(2 * max(first - a, b - behind) >= b - a - 2 for a, b in spans), (count, first)
     assert _spans(40, CalibrationSettings()) == [(0, 40)]
-    assert all(b - a == 100 for a, b in _spans(1000, CalibrationSettings()))
+    assert _spans(300, CalibrationSettings()) == [(0, 100), (100, 200), (200, 300)]
+    assert [a for a, _ in _spans(1000, CalibrationSettings())] == [0, 225, 450, 675, 900]
 
 
 def test_a_window_that_jumps_is_its_longer_part() -> None:
