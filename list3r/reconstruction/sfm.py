@@ -5,10 +5,9 @@ between the posed frames (`mvs`).
 The chunk's frame is the camera of its first posed frame, its unit such that the middle of all depths is 2, which is
 about metres indoors; it is relative all the same. With given poses the structure is triangulated in the source's world.
 
-Measured on the colour of redkitchen, 100 frames a chunk: 2 to 5 CPU seconds for the poses of a chunk, which differ from
-plain pycolmap of every 8th frame of the whole sequence (53 CPU seconds) by 1 to 6 mm. All 1,000 frames are posed. ATE
-after Sim(3): chunks joined by their points 0.062 m, adjacent ones by their cameras 0.059, loops refined by reprojection
-as well 0.046 (with a focal length that the pictures tell 0.038), plain pycolmap 0.049 with the same lens.
+Measured on the colour of redkitchen: 12 CPU seconds for the poses of 100 frames with the 16 around them, as many for
+their depth. ATE after Sim(3), when it was made: chunks joined by their points 0.062 m, adjacent ones by their cameras
+0.059, loops refined by reprojection as well 0.046, plain pycolmap 0.049 with the same lens.
 """
 
 from __future__ import annotations
