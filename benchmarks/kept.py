@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from list3r import chunk_stage, session_stage
 from list3r.cli import main
 from list3r.frames.base import Camera, Frame
 from list3r.memory.records import ChunkResult
-from list3r.reconstruction.base import DepthNoise, Reconstruction, Reconstructor
+from list3r.reconstruction.base import Around, DepthNoise, PosedOnly, Reconstruction, Reconstructor
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 
 _PLAIN = ("frame_indices", "posed", "T_chunk_cam", "depth", "confidence", "keyframes")
@@ -39,10 +39,19 @@ class Kept:
         """As the model does."""
         return self._kept("one", frames, lambda: [self._model(frames, camera)])[0]
 
-    def parts(self, frames: Sequence[Frame], camera: Camera) -> Sequence[Reconstruction]:
+    def parts(
+        self,
+        frames: Sequence[Frame],
+        camera: Camera,
+        around: Around | None = None,
+        deep: Collection[int] | None = None,
+    ) -> Sequence[Reconstruction]:
         """As the model does, where it tells parts apart."""
         parts = getattr(self._model, "parts", None)
-        return [self(frames, camera)] if parts is None else self._kept("parts", frames, lambda: parts(frames, camera))
+        if parts is None:
+            return [self(frames, camera)]
+        kind = "parts" if deep is None else f"parts-{len(deep)}"
+        return self._kept(kind, frames, lambda: parts(frames, camera, around, deep))
 
     def _kept(self, kind: str, frames: Sequence[Frame], make: Any) -> Sequence[Reconstruction]:
         path = self._folder / f"{kind}-{frames[0].index:06d}-{frames[-1].index:06d}-{len(frames)}.npz"
@@ -61,6 +70,8 @@ def _write(path: Path, parts: Sequence[Reconstruction]) -> None:
             arrays[f"depth_noise.{k}"] = np.array(astuple(part.depth_noise))
         if part.moving is not None:
             arrays[f"moving.{k}"] = part.moving
+        if part.between is not None:
+            arrays |= {f"between_{name}.{k}": value for name, value in vars(part.between).items()}
     unfinished = path.with_suffix(f".{os.getpid()}")
     with unfinished.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
@@ -79,6 +90,9 @@ def read_kept(path: Path) -> Iterator[Reconstruction]:
             )
             if f"depth_noise.{k}" in held:
                 made = replace(made, depth_noise=DepthNoise(*held[f"depth_noise.{k}"].tolist()))
+            if f"between_posed.{k}" in held:
+                names = ("frame_indices", "posed", "T_chunk_cam")
+                made = replace(made, between=PosedOnly(*(held[f"between_{name}.{k}"] for name in names)))
             yield replace(made, moving=held[f"moving.{k}"]) if f"moving.{k}" in held else made
 
 

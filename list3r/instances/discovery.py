@@ -12,6 +12,7 @@ from list3r.instances.base import Proposals
 from list3r.instances.cloud import Cloud, build_cloud
 from list3r.instances.features import object_feature
 from list3r.instances.fusion import View
+from list3r.instances.necks import part_necks
 from list3r.instances.segments import Segmentation, segment_cloud
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.instances.snapping import snap_things, without_segments
@@ -50,7 +51,8 @@ class GeometricDiscoverer:
         cut = segment_cloud(cloud, poses, views.unit, settings)
         if views.reconstruction.depth_noise is not None:
             least = least_size(settings.thing_size_m * views.unit, cloud.voxel)
-            cut = above_noise(views, cloud, snap_things(views, cloud, cut, least), settings.least_spread)
+            cut = part_necks(views, cloud, snap_things(views, cloud, cut, least), least)
+            cut = above_noise(views, cloud, cut, settings.least_spread)
         features = np.zeros((len(cut.segments), 64), np.float32)
         rgb = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8)
         for number in range(len(cut.segments)):

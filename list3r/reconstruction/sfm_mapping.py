@@ -175,8 +175,11 @@ def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[Spar
 
 
 def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
-    """Whether two of the largest maps hold as many keyframes and explain the pictures alike."""
-    largest = [(len(maps[0].T_map_cam), maps[0].error_px) for maps in grown if maps]
+    """Whether two maps that fell into no pieces hold as many keyframes and explain the pictures alike.
+
+    Bent rooms may agree too, but where a room bends something is often left that does not fit.
+    """
+    largest = [(len(maps[0].T_map_cam), maps[0].error_px) for maps in grown if len(maps) == 1]
     return any(a == b and max(e, f) <= settings.same_error * min(e, f) for (a, e), (b, f) in combinations(largest, 2))
 
 
