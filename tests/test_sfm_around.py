@@ -110,6 +110,7 @@ def sized(keyframes: int, error_px: float) -> list[SparseMap]:
         ([sized(10, 0.4), sized(9, 0.4)], False),
         ([sized(10, 0.4), [], sized(10, 0.4)], True),
         ([[], []], False),
+        ([sized(10, 0.4) + sized(4, 0.4), sized(10, 0.4) + sized(4, 0.4)], False),
     ],
 )
 def test_two_maps_agree_in_their_keyframes_and_their_error(grown: list[list[SparseMap]], same: bool) -> None:
