@@ -203,7 +203,10 @@ def build_settings(
 def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
     """Raises `OptionError` for weights of a part whose model has none, so that nobody waits for another result."""
     from list3r.memory.errors import OptionError
+    from list3r.reconstruction.registry import entry
 
+    if selection.reconstruction != "auto":
+        entry(selection.reconstruction)
     taking = {option.removeprefix("--") for option, _ in selection.cards()}
     for part, where in asked.items():
         model = getattr(selection, part)
