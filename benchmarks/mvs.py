@@ -142,7 +142,7 @@ def run(path: str, options: SourceOptions, words: argparse.Namespace) -> dict[st
         for name in ("coverage", "median_error", "cpu_s")
         if all(name in row for row in rows)
     }
-    return {"source": path, "poses": words.poses, "depth_every": every, "mean": mean, "runs": rows}
+    return {"source": Path(path).name, "poses": words.poses, "depth_every": every, "mean": mean, "runs": rows}
 
 
 def main() -> None:
