@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 
 from list3r import __version__
 from list3r.build_target import make_folder, open_target
-from list3r.calibration_stage import camera_notes
 from list3r.chunk_stage import BuildSettings
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
@@ -32,9 +31,9 @@ from list3r.session_stage import (
     Progress,
     add_chunks,
     lost_reasons,
-    pace_notes,
     plan_session,
     prepare,
+    settled_notes,
     shot_cuts,
 )
 
@@ -162,7 +161,7 @@ def _finish(store: Store, info: SourceInfo, plan: Plan, started: float) -> Build
 
 
 def _notes(store: Store, session: int, lost: int, bad: int, components: int) -> tuple[str, ...]:
-    notes = [*camera_notes(store, session), *pace_notes(store, session)]
+    notes = list(settled_notes(store, session))
     cuts = shot_cuts(store, session)
     if cuts:
         notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")

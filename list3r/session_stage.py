@@ -9,7 +9,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from list3r.calibration_stage import camera_key, with_camera
+from list3r.calibration_stage import camera_key, camera_notes, with_camera
 from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunks import ChunkSpan, plan_chunks, shot_of
@@ -88,7 +88,7 @@ def plan_session(
     """The chunks of a session, and of those the ones that are not in the memory yet."""
     count = job.info.frame_count
     cuts = _cuts(store, session, job, look)
-    step = _depth_step(store, session, job)
+    step = _depth_step(store, session, job, look)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks(session)}
     options = with_camera(store, session, job.source, job.options, job.settings.reconstruction, job.info, look)
@@ -143,6 +143,8 @@ def add_chunks(
         pool.stop()
 
 
+MOST_DEPTH_EVERY = 8
+"""Chunks are so many times as long, and their pictures are held in memory."""
 _MOST_REASONS = 5
 """Chunks that were lost of which is said why."""
 
@@ -168,24 +170,31 @@ def shot_cuts(store: Store, session: int) -> list[int]:
     return list(store.get_value(_name(store, session, "cuts"), []))
 
 
-def pace_notes(store: Store, session: int) -> tuple[str, ...]:
-    """What the user should know of frames without depth."""
+def settled_notes(store: Store, session: int) -> tuple[str, ...]:
+    """What the user should know of what was settled before the chunks: the camera, and which frames get depth."""
+    notes = camera_notes(store, session)
     step = store.get_value(_name(store, session, "depth step"), 1)
     if step == 1:
-        return ()
+        return notes
     nth = {2: "2nd", 3: "3rd"}.get(step, f"{step}th")
-    return (f"the picture moves slowly: depth and things are from every {nth} frame (--depth-every 1 takes all)",)
+    asked = any(s.session_id == session and s.settings.get("depth_every") for s in store.sessions())
+    why = "as asked" if asked else "the picture moves slowly"
+    return (*notes, f"{why}: depth and things are from every {nth} frame (--depth-every 1 takes all)")
 
 
-def _depth_step(store: Store, session: int, job: Job) -> int:
+def _depth_step(store: Store, session: int, job: Job, look: Look | None) -> int:
     """From every how many frames depth is computed, settled once; 1 for models that take it from elsewhere."""
     if not entry(job.settings.reconstruction).thins:
         return 1
     name = _name(store, session, "depth step")
     known: int | None = store.get_value(name)
     if known is None:
-        begun, asked = store.chunks(session), job.settings.depth_every
-        known = asked or (1 if begun else depth_step(open_source(job.source, job.options), job.settings.chunks.length))
+        known = job.settings.depth_every
+        if known is None:
+            scan = None if look is None else (lambda done, total: look("pace", done, total))
+            begun = store.chunks(session)  # by a version that took all frames
+            source, length = open_source(job.source, job.options), job.settings.chunks.length
+            known = 1 if begun else depth_step(source, length, progress=scan)
         with store.transaction():
             store.set_value(name, known)
     return known
@@ -234,7 +243,14 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
     """Raise an error that names the fix when the source cannot be built with the settings."""
     if settings.poses not in ("given", "estimate"):
         raise OptionError(f"--poses {settings.poses} is not known; choose estimate, given or auto")
-    model = entry(settings.reconstruction)
+    model, every = entry(settings.reconstruction), settings.depth_every
+    if every is not None and not 1 <= every <= MOST_DEPTH_EVERY:
+        raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; --every takes fewer frames at all")
+    if every is not None and every > 1 and not model.thins:
+        raise OptionError(
+            f"--depth-every is of models that compute depth from colour (sfm), not of {settings.reconstruction}; leave "
+            "it out, or thin the frames with --every"
+        )
     if model.needs_depth and not info.has_depth:
         raise OptionError(
             f"{info.path} has no depth, and {settings.reconstruction} reconstructs from RGB-D only; "

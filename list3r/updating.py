@@ -14,7 +14,6 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r.association.session_ties import HELD
-from list3r.calibration_stage import camera_notes
 from list3r.chunk_stage import BuildSettings
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
@@ -29,9 +28,9 @@ from list3r.session_stage import (
     Progress,
     add_chunks,
     lost_reasons,
-    pace_notes,
     plan_session,
     prepare,
+    settled_notes,
     take_back,
 )
 
@@ -191,8 +190,7 @@ def _report(store: Store, info: SourceInfo, plan: Plan, started: float) -> Updat
         frames_per_second=round(plan.fresh_frames() / seconds, 2),
         resumed_chunks=len(plan.done),
         notes=(
-            *camera_notes(store, session),
-            *pace_notes(store, session),
+            *settled_notes(store, session),
             *_notes(info, len(own), placed, held(store, session), lost, len(frames)),
             *lost_reasons(store, session),
         ),

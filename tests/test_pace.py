@@ -68,6 +68,12 @@ def test_a_short_video_a_dark_one_and_large_pictures_keep_more_frames() -> None:
     assert depth_step(large, 100) == 1 and depth_step(large, 30) == 2  # type: ignore[arg-type]
 
 
+def test_progress_is_told_of_every_place_that_is_looked_at() -> None:
+    told: list[tuple[int, int]] = []
+    depth_step(Sliding(0.5), 100, progress=lambda done, total: told.append((done, total)))  # type: ignore[arg-type]
+    assert told == [(k, 16) for k in range(1, 17)]
+
+
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pace") / "walk"
@@ -96,9 +102,29 @@ def test_a_build_says_it_and_goes_on_as_it_began(
     memory = str(tmp_path / "m.l3r")
     words = ["build", str(pictures), "-m", memory, "--intrinsics", ",".join(map(str, OPTIONS.intrinsics or ()))]
     assert run([*words, "--chunk", "10", "--overlap", "4", "--workers", "1", "--depth-every", "2"]) == 0
-    assert "depth and things are from every 2nd frame" in capsys.readouterr().out
+    assert "as asked: depth and things are from every 2nd frame" in capsys.readouterr().out
     with Store.open(Path(memory)) as store:
         assert len(store.chunks()) == 2 and sum(f.state == "posed" for f in store.frames(1)) == 30
         assert store.sessions()[0].settings["depth_every"] == 2
     assert run([*words, "--chunk", "10", "--overlap", "4", "--resume", "--depth-every", "3"]) == 2
     assert "depth_every" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--depth-every", "0"], "--depth-every 0: choose 1 to 8"),
+        (["--depth-every", "9"], "--depth-every 9: choose 1 to 8"),
+        (["--depth-every", "2", "--reconstruction", "precomputed"], "--depth-every is of models that compute depth"),
+    ],
+)
+def test_a_step_that_makes_no_sense_is_refused(
+    more: list[str], said: str, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "precomputed.json").write_text(
+        '{"format": "list3r-precomputed", "version": 1, "scale": "metric"}'
+    )
+    weights = ["--weights", str(tmp_path / "files")] if "precomputed" in more else []
+    assert run(["build", str(pictures), "-m", str(tmp_path / "m.l3r"), *more, *weights]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "m.l3r").exists()

@@ -16,7 +16,15 @@ from list3r.memory.geometry import umeyama
 from list3r.reconstruction.sfm import SfmReconstructor
 from list3r.reconstruction.sfm_consistency import contradicted
 from list3r.reconstruction.sfm_links import LinkSettings, step_beside
-from list3r.reconstruction.sfm_mapping import MappingSettings, MapProblem, SparseMap, View, agreed, build_maps
+from list3r.reconstruction.sfm_mapping import (
+    MappingSettings,
+    MapProblem,
+    SparseMap,
+    View,
+    agreed,
+    build_maps,
+    first_pairs,
+)
 from list3r.reconstruction.sfm_tracks import Tracks
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import FRAMES, Held, centres, walk
@@ -115,6 +123,17 @@ def sized(keyframes: int, error_px: float) -> list[SparseMap]:
 )
 def test_two_maps_agree_in_their_keyframes_and_their_error(grown: list[list[SparseMap]], same: bool) -> None:
     assert agreed(grown, MappingSettings()) is same
+
+
+def test_maps_are_also_grown_from_what_shares_most_in_the_second_and_the_last_third() -> None:
+    none = View(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    keys = range(0, 60, 2)
+    steps = {(a, b): np.zeros((200 - (b - a), 2), np.int64) for a in keys for b in keys if a < b <= a + 20}
+    steps[24, 34] = steps[50, 58] = np.zeros((500, 2), np.int64)  # five and four keyframes on
+    steps[30, 32] = steps[4, 14] = steps[52, 100] = np.zeros((900, 2), np.int64)  # next, first third, not its own
+    problem = MapProblem({**dict.fromkeys(keys, none), 100: none}, steps, beside=frozenset([100]))
+    assert first_pairs(problem, MappingSettings()) == [(24, 34), (50, 58)]
+    assert first_pairs(MapProblem(dict.fromkeys(range(3), none), {}), MappingSettings()) == []
 
 
 def test_pairs_of_which_nothing_was_verified_contradict_nothing() -> None:

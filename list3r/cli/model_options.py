@@ -92,7 +92,6 @@ DepthEvery = Annotated[
     typer.Option(
         "--depth-every",
         metavar="N",
-        min=1,
         help="With colour alone: depth and things from every n-th frame, the others get a pose; default: by how fast "
         "the picture moves.",
         show_default=False,
@@ -168,11 +167,14 @@ def build_settings(
     """
     from list3r.chunk_stage import BuildSettings
     from list3r.models.choice import check_allowed, parse_weights
+    from list3r.reconstruction.registry import entry
 
     selection = _selection(info, words)
     asked = parse_weights(words.weights)
     if selection.discovery == selection.reconstruction == "precomputed" and "reconstruction" in asked:
         asked.setdefault("discovery", asked["reconstruction"])
+    if selection.reconstruction != "auto":
+        entry(selection.reconstruction)  # a name that is not known is said before what goes with it
     _check_used(asked, selection)
     chosen = check_allowed(selection, asked, words.licence)
     notes = [f"note: {selection.why}"] if selection.why else []
@@ -197,16 +199,13 @@ def build_settings(
     if cut.chunk is not None or chunks is None:
         chunks = _cut(settings, cut.chunk, cut.overlap)
     wanted = cut.depth_every if isinstance(cut, BuildCutWords) else None
-    return replace(settings, chunks=chunks, depth_every=wanted or depth_every), notes
+    return replace(settings, chunks=chunks, depth_every=depth_every if wanted is None else wanted), notes
 
 
 def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
     """Raises `OptionError` for weights of a part whose model has none, so that nobody waits for another result."""
     from list3r.memory.errors import OptionError
-    from list3r.reconstruction.registry import entry
 
-    if selection.reconstruction != "auto":
-        entry(selection.reconstruction)
     taking = {option.removeprefix("--") for option, _ in selection.cards()}
     for part, where in asked.items():
         model = getattr(selection, part)

@@ -8,6 +8,7 @@ to be things is right by area; in chunks of 300 with depth of every third, 17 am
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Frame, FrameSource
 
 Gray = NDArray[np.uint8]
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -33,36 +35,44 @@ class PaceSettings:
     least_spots: int = 4
     """Fewest of them that must show something."""
     most: int = 4
-    """Depth is computed of every so manieth frame at least."""
+    """Largest step."""
     most_mb: float = 400.0
     """Pictures of a chunk take no more than this."""
     width_px: int = 320
     """Size of the pictures that are compared."""
 
 
-def depth_step(source: FrameSource, length: int, settings: PaceSettings | None = None) -> int:
-    """From every how many frames depth is computed in chunks that hold `length` frames with depth; 1 is from all."""
+def depth_step(
+    source: FrameSource, length: int, settings: PaceSettings | None = None, *, progress: Progress | None = None
+) -> int:
+    """From every how many frames depth is computed in chunks that hold `length` frames with depth; 1 is from all.
+
+    `progress` hears of the places looked at, done and in all.
+    """
     s = settings or PaceSettings()
     height, width = source.info.image_size or (480, 640)
     room = int(s.most_mb * 2**20 / (3.0 * height * width * length))
     most = min(s.most, source.info.frame_count // length, room)
     if most < 2:
         return 1
-    flows = picture_flows(source, s)
+    flows = picture_flows(source, s, progress)
     if len(flows) < s.least_spots:
         return 1
     return int(np.clip(np.rint(s.flow / max(float(np.quantile(flows, s.quantile)), 1e-6)), 1, most))
 
 
-def picture_flows(source: FrameSource, settings: PaceSettings) -> NDArray[np.float64]:
+def picture_flows(source: FrameSource, settings: PaceSettings, progress: Progress | None = None) -> NDArray[np.float64]:
     """How far corners move from a frame to the next, median by the picture's longer side, at places spread over a video
     at which corners are found again. Shape (N,)."""
     flows = []
-    for start in np.linspace(0, source.info.frame_count - 2, settings.spots).astype(int).tolist():
+    starts = np.linspace(0, source.info.frame_count - 2, settings.spots).astype(int).tolist()
+    for done, start in enumerate(starts, start=1):
         pair = [f for f in source.read(start, start + 2) if isinstance(f, Frame)]
         if len(pair) == 2:
             flow = _flow(_small(pair[0], settings.width_px), _small(pair[1], settings.width_px))
             flows += [] if flow is None else [flow / settings.width_px]
+        if progress is not None:
+            progress(done, len(starts))
     return np.array(flows)
 
 
