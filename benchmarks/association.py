@@ -3,10 +3,10 @@
 python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FILE [--plot FILE]
 
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
-model and the instance tracker are simulated (`list3r.simulation.feedforward`). `baseline` is the split-and-fuse way of
-VGGT-Long: support by confidence alone, adjacent edges, loops by frame similarity of 0.85 without verification, plain
-least squares. Each variant adds to the one before, CWGO the nodes within chunks too; `iasm-only` is the baseline with
-instance-aware support alone.
+model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). `baseline` is the
+split-and-fuse way of VGGT-Long: support by confidence alone, adjacent edges, loops by frame similarity of 0.85 without
+verification, plain least squares. Each variant adds to the one before, CWGO the nodes within chunks too; `iasm-only` is
+the baseline with instance-aware support alone.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def _one_thread() -> None:
 
 def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
     """All variants on one simulated video."""
-    from list3r.frames.chunks import ChunkSettings, plan_chunks
-    from list3r.frames.cuts import cuts_by_descriptor
-    from list3r.simulation.feedforward import FeedForwardModel
+    from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+    from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+    from list3r.frames.chunking.cuts import cuts_by_descriptor
     from list3r.simulation.presets import make_video
 
     preset, seed, variants = job
@@ -105,7 +105,7 @@ def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
 
 def variant_settings(variant: str) -> Any:
     """The product's settings with the parts that a variant lacks switched to the baseline's way."""
-    from list3r.mapping import AssociationSettings
+    from list3r.pipeline.mapping import AssociationSettings
 
     full = AssociationSettings()
     plain_edges = replace(full.edges, instance_aware=False)
@@ -125,10 +125,10 @@ def variant_settings(variant: str) -> Any:
 
 def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth) -> dict[str, Any]:
     """Build a memory of the chunks (placed only) and measure it."""
-    from list3r.association.motion import flag_moving
+    from list3r.association.overlap.motion import flag_moving
     from list3r.frames.base import Camera
-    from list3r.mapping import add_chunk, finish_session
-    from list3r.memory.store import Store
+    from list3r.memory.store.store import Store
+    from list3r.pipeline.mapping import add_chunk, finish_session
 
     settings = variant_settings(variant)
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:

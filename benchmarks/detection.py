@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from machine import run_list3r, write_json
 
-from list3r.detection.nanodet import overlaps
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
+from list3r.semantics.nanodet import overlaps
 
 TRUTH: dict[str, tuple[str, int, tuple[int, int, int, int]]] = {
     "white mug": ("cup", 300, (56, 212, 106, 266)),

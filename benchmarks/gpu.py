@@ -28,8 +28,8 @@ from list3r.instances.base import Proposals
 from list3r.models.cards import find_card
 from list3r.models.device import MemoryBudget, find_gpu, pictures_that_fit
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.feedforward import half_precision
-from list3r.reconstruction.pi3 import NETWORK as PI3
+from list3r.reconstruction.networks.feedforward import half_precision
+from list3r.reconstruction.networks.pi3 import NETWORK as PI3
 
 SIZE = (364, 504)
 PUBLISHED = {"pictures": 1024, "peak_mb": 43667, "frames_per_s": 2.4, "on": "A800-80GB, its authors"}
@@ -170,7 +170,7 @@ def _pass(network: nn.Module, pictures: torch.Tensor, device: torch.device) -> d
 
 def measure_tracker(name: str, objects: list[int], tiny: bool, device: torch.device) -> dict[str, Any]:
     """Seconds for each frame with several numbers of things, and what one more thing costs."""
-    from list3r.instances.video_tracker import VideoTracker
+    from list3r.instances.tracking.video_tracker import VideoTracker
 
     frames, reconstruction = _still_chunk(6 if tiny else 24)
     with tempfile.TemporaryDirectory() as folder:

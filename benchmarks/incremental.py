@@ -30,11 +30,11 @@ from typing import Any
 import numpy as np
 from machine import machine, write_json
 
-from list3r import mapping
-from list3r.memory import edits
-from list3r.memory.consolidation import consolidate
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.maintenance import edits
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalInstance, LocalLibrary, MaskTrack, Support
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
+from list3r.pipeline import mapping
 
 SEEN, STEP = 12, 6
 """Things in a chunk, and how many further the next one has gone."""

@@ -20,11 +20,11 @@ from typing import Any
 from machine import descendants
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.connection import remove_memory
-from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import MemoryFileError
+from list3r.memory.library.consolidation import consolidate
 from list3r.memory.records import MergeDecision, Relation
-from list3r.memory.store import Store
+from list3r.memory.store.connection import remove_memory
+from list3r.memory.store.store import Store
 
 Result = dict[str, Any]
 CHUNKING = ("--poses", "given", "--chunk", "12", "--overlap", "4", "--workers", "1")
@@ -271,8 +271,8 @@ def _say(number: int) -> None:
 
 def edit_for_ever(path: str, seed: int) -> None:
     """Edit as an operator does, and say the number of each entry once it is committed."""
-    from list3r.memory import edits
     from list3r.memory.errors import List3rError
+    from list3r.memory.maintenance import edits
 
     rng = random.Random(seed)
     with Store.open(path, writable=True) as store:

@@ -23,10 +23,10 @@ from list3r.frames.base import Frame, guessed_camera
 from list3r.frames.options import parse_distortion, parse_intrinsics
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
-from list3r.reconstruction.detectors import make_detector
-from list3r.reconstruction.learned import LearnedDetector
-from list3r.reconstruction.sfm import SfmReconstructor
-from list3r.reconstruction.sfm_fill import Segment
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import LearnedDetector
+from list3r.reconstruction.sfm.fill import Segment
+from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 
 FILES = {"aliked": "aliked/aliked-t16.pth", "xfeat": "xfeat/xfeat_640x640.onnx"}
 LEAST = 8

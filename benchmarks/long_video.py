@@ -20,9 +20,9 @@ import av
 import cv2
 from machine import _resident, descendants, write_json
 
-from list3r.chunk_stage import BuildSettings
 from list3r.frames.source import SourceOptions, open_source
-from list3r.pipeline import build
+from list3r.pipeline.build import build
+from list3r.pipeline.chunk import BuildSettings
 
 
 class _EnoughError(Exception):

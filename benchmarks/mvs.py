@@ -26,14 +26,14 @@ from machine import machine, write_json
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame, FrameSource
-from list3r.frames.borrowing import frames_around
+from list3r.frames.chunking.borrowing import frames_around
+from list3r.frames.chunking.pace import depth_step
 from list3r.frames.options import SourceOptions, parse_intrinsics
-from list3r.frames.pace import depth_step
 from list3r.frames.source import open_source
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.mvs import dense_depth
+from list3r.reconstruction.mvs.stereo import dense_depth
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
-from list3r.reconstruction.sfm import SfmReconstructor
+from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 
 Poses = NDArray[np.float64]
 

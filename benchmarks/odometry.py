@@ -23,18 +23,18 @@ import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
 
-from list3r.association.alignment import align_overlap
-from list3r.association.pose_graph import optimize
-from list3r.association.revisits import find_loops
+from list3r.association.graph.pose_graph import optimize
+from list3r.association.overlap.alignment import align_overlap
+from list3r.association.revisits.search import find_loops
 from list3r.frames.base import Frame
-from list3r.frames.chunks import ChunkSettings, ChunkSpan, plan_chunks
+from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, plan_chunks
 from list3r.frames.options import SourceOptions, parse_intrinsics
 from list3r.frames.source import open_source
 from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.local_verbs import LocalNode
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
+from list3r.memory.store.tables.local_instances import LocalNode
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
-from list3r.reconstruction.rgbd import RgbdReconstructor
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
 Poses = NDArray[np.float64]
 

@@ -22,10 +22,10 @@ from machine import machine, write_json
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from list3r.association.graph_growth import extend
-from list3r.association.graph_solver import GraphProblem, stack, take
-from list3r.association.marginals import marginals
-from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.growth import extend
+from list3r.association.graph.marginals import marginals
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.solver import GraphProblem, stack, take
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.records import Edge
 

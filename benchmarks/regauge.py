@@ -20,16 +20,16 @@ import numpy as np
 from machine import machine, write_json
 from threadpoolctl import threadpool_limits
 
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory
 from list3r.frames.base import Frame
-from list3r.frames.chunks import plan_chunks
+from list3r.frames.chunking.chunks import plan_chunks
 from list3r.frames.source import SourceOptions, open_source
-from list3r.mapping import add_chunk, finish_session
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalInstance
-from list3r.memory.store import Store
-from list3r.workers import OrderedPool, default_workers
+from list3r.memory.store.store import Store
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_chunk
+from list3r.pipeline.mapping import add_chunk, finish_session
+from list3r.pipeline.workers import OrderedPool, default_workers
 
 
 def main() -> None:
@@ -63,7 +63,7 @@ def measure(
     name: str, results: Sequence[ChunkResult], truth: Trajectory, path: Path, seed: int | None
 ) -> dict[str, Any]:
     """Associate the chunks, in gauges drawn from the seed, and compare the trajectory with the truth."""
-    from list3r.association.joint_rgbd import RgbdJointReconstructor
+    from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
 
     rng = None if seed is None else np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:

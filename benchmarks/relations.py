@@ -28,22 +28,22 @@ from machine import machine, write_json
 from relations_asked import asked
 from threadpoolctl import threadpool_limits
 
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_chunk
 from list3r.evaluation.relations import Triple, evaluate_relations
 from list3r.evaluation.scene import scene_relations
-from list3r.frames.chunks import plan_chunks
+from list3r.frames.chunking.chunks import plan_chunks
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Proposals
-from list3r.instances.candidates import plane_of_mask, without_spill
-from list3r.instances.features import object_feature
+from list3r.instances.geometric.features import object_feature
+from list3r.instances.geometric.views import chunk_views
+from list3r.instances.neural.candidates import plane_of_mask, without_spill
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
-from list3r.instances.views import chunk_views
-from list3r.mapping import add_chunk, finish_session
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_chunk
+from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.queries.relations import VERTICAL
 from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
-from list3r.simulation.gaps import surface_gap
-from list3r.simulation.truth import NEXT_TO_M
+from list3r.simulation.worlds.gaps import surface_gap
+from list3r.simulation.worlds.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
 PREDICATES = ("on", "in", "next_to", "near")
@@ -260,7 +260,7 @@ def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
 
 def _vertical_without_gravity(store: Store) -> int:
     """Vertical relations that a consolidation without gravity leaves; a relation query must call them unknown."""
-    from list3r.memory.consolidation import consolidate
+    from list3r.memory.library.consolidation import consolidate
 
     with store.transaction():
         consolidate(store)

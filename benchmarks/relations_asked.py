@@ -12,11 +12,11 @@ from itertools import combinations
 import numpy as np
 
 from list3r.memory.records import Instance, Relation
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from list3r.queries.relations import noise_of, viewer_from
-from list3r.queries.viewpoint import Viewer, between, viewed
+from list3r.queries.views.viewpoint import Viewer, between, viewed
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.things import Thing
+from list3r.simulation.worlds.things import Thing
 
 EVERY = 30
 """Frames from one asked viewpoint to the next."""

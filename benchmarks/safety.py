@@ -29,11 +29,11 @@ from kills import build_command, kill_builds, kill_commands, kill_edits, kill_up
 from machine import machine, write_json
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.connection import remove_memory
 from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.maintenance.repair import repair
 from list3r.memory.records import Observation, Relation
-from list3r.memory.repair import repair
-from list3r.memory.store import Store
+from list3r.memory.store.connection import remove_memory
+from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 Result = dict[str, Any]

@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Instance, Relation
-from list3r.memory.store import Store
-from list3r.memory.vector_cells import cache_file
-from list3r.queries.camera import Camera
+from list3r.memory.search.vector_cells import cache_file
+from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.nearest import nearest
 from list3r.queries.seen import visible
 from list3r.queries.similar import similar
+from list3r.queries.views.camera import Camera
 from list3r.queries.within import within
 
 SPACE = "synthetic@1/256"

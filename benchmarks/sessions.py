@@ -30,10 +30,10 @@ from list3r.evaluation.scene import evaluate_scene, read_scene
 from list3r.evaluation.trajectory import Trajectory, align, associate, read_tum
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import ChangeEvent
-from list3r.memory.store import Store
-from list3r.simulation.changes import random_changes
+from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.walk import camera_path
+from list3r.simulation.worlds.changes import random_changes
 
 MIN_PX = 150
 KINDS = ("moved", "removed", "added")

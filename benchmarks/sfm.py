@@ -26,7 +26,7 @@ from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory
 from list3r.frames.base import Camera, Frame
 from list3r.frames.options import parse_intrinsics
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 
 def main() -> None:

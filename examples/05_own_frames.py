@@ -14,7 +14,7 @@ from PIL import Image
 
 import list3r
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.render import Renderer
+from list3r.simulation.rendering.render import Renderer
 
 
 def main() -> None:

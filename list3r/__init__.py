@@ -15,22 +15,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from list3r.chunk_stage import BuildSettings
+    from list3r.api import SceneMemory, build, open, update
     from list3r.frames.options import SourceOptions
     from list3r.memory.errors import List3rError
-    from list3r.scene_memory import SceneMemory, build, open, update
+    from list3r.pipeline.chunk import BuildSettings
 
 __version__ = "0.1.0"
 __all__ = ["BuildSettings", "List3rError", "SceneMemory", "SourceOptions", "__version__", "build", "open", "update"]
 
 _HOMES = {
-    "BuildSettings": "list3r.chunk_stage",
+    "BuildSettings": "list3r.pipeline.chunk",
     "SourceOptions": "list3r.frames.options",
     "List3rError": "list3r.memory.errors",
-    "SceneMemory": "list3r.scene_memory",
-    "build": "list3r.scene_memory",
-    "open": "list3r.scene_memory",
-    "update": "list3r.scene_memory",
+    "SceneMemory": "list3r.api",
+    "build": "list3r.api",
+    "open": "list3r.api",
+    "update": "list3r.api",
 }
 
 

@@ -22,7 +22,7 @@ from list3r.memory.records import (
     Relation,
     Support,
 )
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

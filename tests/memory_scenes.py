@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from list3r.memory.chunk_verbs import LocalNode
 from list3r.memory.geometry import Sim3
+from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes
 from list3r.memory.records import Support
-from list3r.memory.shapes import ChunkShapes, chunk_shapes
+from list3r.memory.store.tables.chunks import LocalNode
 
 IMAGE = (480, 640)
 

@@ -18,7 +18,7 @@ from list3r.memory.records import (
     MaskTrack,
     Support,
 )
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 SIZE = (120, 160)
 FOCAL = 140.0

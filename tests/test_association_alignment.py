@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from list3r.association.alignment import Alignment, align, align_overlap
-from list3r.association.point_maps import align_point_maps
+from list3r.association.overlap.alignment import Alignment, align, align_overlap
+from list3r.association.overlap.point_maps import align_point_maps
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.chain import ChainSettings, predict
-from list3r.association.cross_check import Side, cross_check, shared_view
-from list3r.association.instance_cues import CueSettings, InstanceSet, compare_instances, instance_set, loop_score
-from list3r.association.joint_window import Place, composed_covariance, joint_edge
+from list3r.association.revisits.chain import ChainSettings, predict
+from list3r.association.revisits.cross_check import Side, cross_check, shared_view
+from list3r.association.revisits.cues import CueSettings, InstanceSet, compare_instances, instance_set, loop_score
+from list3r.association.revisits.joint_window import Place, composed_covariance, joint_edge
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, JointWindow
 from tests.association_scenes import CAMERA, film

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.association.edges import EdgeEnd, EdgeSettings, MeasuredEdge, measure_edge
+from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, MeasuredEdge, measure_edge
 from list3r.instances.overlays import draw_support, write_support
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.edge_information import WeightSettings, edge_weights
-from list3r.association.pose_graph import optimize
+from list3r.association.graph.edge_information import WeightSettings, edge_weights
+from list3r.association.graph.pose_graph import optimize
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.association.motion import flag_moving, motion_track, seen_through
+from list3r.association.overlap.motion import flag_moving, motion_track, seen_through
 from list3r.frames.base import Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.library import build_library
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples, LocalLibrary
 from list3r.reconstruction.keyframe_record import frame_samples
-from list3r.reconstruction.rgbd import RgbdReconstructor
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from tests.association_scenes import BOX, BOXES, CAMERA, MOVER, Thing, film, library_of
 
 GAUGE = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.4])

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.association.chunk_nodes import ChunkNodes, NodeSettings, measured_walk, relate_frames
-from list3r.association.edges import EdgeEnd, measure_edge
-from list3r.association.node_graph import bend_chunks
-from list3r.association.pose_graph import GraphResult, optimize
+from list3r.association.graph.chunk_nodes import ChunkNodes, NodeSettings, measured_walk, relate_frames
+from list3r.association.graph.node_graph import bend_chunks
+from list3r.association.graph.pose_graph import GraphResult, optimize
+from list3r.association.overlap.edges import EdgeEnd, measure_edge
 from list3r.memory.bends import Bend
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.association_scenes import CAMERA, film, walk
 
 LENGTH, STEP, COUNT = 60, 40, 4

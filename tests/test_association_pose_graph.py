@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from list3r.association.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
-from list3r.association.edge_information import WeightSettings, support_of
-from list3r.association.graph_growth import extend
-from list3r.association.graph_solver import GraphProblem, adjoint, stack, take
-from list3r.association.loop_trust import Tree, chain_squares
-from list3r.association.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
+from list3r.association.graph.edge_information import WeightSettings, support_of
+from list3r.association.graph.growth import extend
+from list3r.association.graph.loop_trust import Tree, chain_squares
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.solver import GraphProblem, adjoint, stack, take
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3, skew
 from list3r.memory.records import Edge

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from list3r.association.frame_search import TRAINED, SearchSettings, choose
-from list3r.association.revisits import find_loops
-from list3r.association.scaled_verification import verify_scaled
-from list3r.association.verification import verify
-from list3r.memory.chunk_verbs import LocalNode
+from list3r.association.revisits.frame_search import TRAINED, SearchSettings, choose
+from list3r.association.revisits.scaled_verification import verify_scaled
+from list3r.association.revisits.search import find_loops
+from list3r.association.revisits.verification import verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
-from list3r.reconstruction.features import FeatureSettings, match, relative_pose
+from list3r.memory.store.tables.chunks import LocalNode
+from list3r.reconstruction.features.local import FeatureSettings, match, relative_pose
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
-from list3r.reconstruction.rgbd import RgbdReconstructor
-from list3r.reconstruction.view import SensorNoise
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
+from list3r.reconstruction.rgbd.view import SensorNoise
 from tests.rgbd_scenes import CAMERA, frames_along, pose_errors, walk
 
 GAUGE = Sim3.exp([0.3, -0.2, 0.5, 0.2, 0.4, -0.1, 0.0]).as_matrix()

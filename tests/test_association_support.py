@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.association.alignment import align
-from list3r.association.balance import balanced_support
-from list3r.association.shared_points import Pairs, shared_pairs, shared_samples
-from list3r.association.support import (
+from list3r.association.overlap.alignment import align
+from list3r.association.overlap.balance import balanced_support
+from list3r.association.overlap.shared_points import Pairs, shared_pairs, shared_samples
+from list3r.association.overlap.support import (
     Mask,
     SupportSettings,
     confident,

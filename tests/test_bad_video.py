@@ -15,21 +15,21 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.calibration_stage import camera_notes
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
-from list3r.frames.borrowing import BorrowSettings, borrow
-from list3r.frames.chunks import ChunkSpan
+from list3r.frames.chunking.borrowing import BorrowSettings, borrow
+from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.frames.picture import small_gray
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
-from list3r.memory.store import Store
-from list3r.pipeline import _runs, build
-from list3r.reconstruction.sfm import SfmReconstructor
-from list3r.reconstruction.sfm_calibration import CalibrationSettings, _focal_sigma
-from list3r.reconstruction.sfm_mapping import MapProblem, SparseMap
-from list3r.session_stage import Job, plan_session
+from list3r.memory.store.store import Store
+from list3r.pipeline.build import _runs, build
+from list3r.pipeline.calibration import camera_notes
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
+from list3r.pipeline.session import Job, plan_session
+from list3r.reconstruction.sfm.calibration import CalibrationSettings, _focal_sigma
+from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap
+from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 from tests.conftest import write_small_room
 from tests.rgbd_scenes import CAMERA, render
 

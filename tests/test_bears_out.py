@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from list3r.memory.missed import bears_out, frames_beside
-from list3r.memory.shapes import PIXEL_BITS, ChunkShapes, chunk_shapes
+from list3r.memory.overlap.missed import bears_out, frames_beside
+from list3r.memory.overlap.voxels import PIXEL_BITS, ChunkShapes, chunk_shapes
 
 FRAMES = range(0, 30, 3)
 

@@ -15,9 +15,9 @@ import pytest
 
 import list3r
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
-from list3r.frames.chunks import ChunkSettings, plan_chunks
+from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import OptionError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 OPTIONS = ("--chunk", "40", "--overlap", "12")

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.consolidation import consolidate
+from list3r.memory.change.free_space import SeenThrough
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging import pair_scores
-from list3r.memory.seen_through import SeenThrough
-from list3r.memory.store import Store
-from list3r.memory.summaries import chunk_summaries
-from list3r.memory.visibility import View, VisibilitySettings, seen_through_share, tally
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.merging.edges import pair_scores
+from list3r.memory.overlap.summaries import chunk_summaries
+from list3r.memory.overlap.visibility import View, VisibilitySettings, seen_through_share, tally
+from list3r.memory.store.store import Store
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
 
 TABLE = (0.0, 0.0, 0.75)

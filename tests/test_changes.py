@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Array, Sim3
-from list3r.memory.history import world_at
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.maintenance.history import world_at
+from list3r.memory.overlap.visibility import View, look
 from list3r.memory.records import ChangeEvent
-from list3r.memory.store import Store
-from list3r.memory.visibility import View, look
+from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 
 CAMERA = (130.0, 130.0, 79.5, 59.5)

@@ -14,7 +14,7 @@ import typer
 
 import list3r
 from list3r.cli.app import app
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 
 

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from list3r.cli import app
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 
 

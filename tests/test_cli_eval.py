@@ -23,7 +23,7 @@ from list3r.frames.folder import FolderSource
 from list3r.frames.source import open_source
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import chunk_result, write_small_room
 from tests.test_cli_errors import check_refused, write_frames
 

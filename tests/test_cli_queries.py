@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from list3r.cli.app import run
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)

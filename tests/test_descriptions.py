@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.memory.colors import (
+from list3r.memory.description.colors import (
     Reference,
     color_name,
     color_words,
@@ -14,7 +14,7 @@ from list3r.memory.colors import (
     main_color,
     scene_reference,
 )
-from list3r.memory.describe import describe, shape_word
+from list3r.memory.description.describe import describe, shape_word
 
 NAMED = {
     (245, 245, 245): "white",

@@ -15,15 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from list3r.cli.app import run
-from list3r.detecting import detect
-from list3r.detection.base import Detections
-from list3r.detection.coco import COCO_80, SIZES_M, plausible
-from list3r.detection.nanodet import DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
-from list3r.detection.voting import Seen, summed, vote
-from list3r.memory import edits
-from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import OptionError
-from list3r.memory.labels import (
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.labels import (
     LabelSettings,
     Votes,
     apply_labels,
@@ -33,7 +27,13 @@ from list3r.memory.labels import (
     votes_of,
     votes_of_names,
 )
-from list3r.memory.store import Store
+from list3r.memory.maintenance import edits
+from list3r.memory.store.store import Store
+from list3r.semantics.coco import COCO_80, SIZES_M, plausible
+from list3r.semantics.detection import detect
+from list3r.semantics.detector import Detections
+from list3r.semantics.nanodet import DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
+from list3r.semantics.voting import Seen, summed, vote
 from tests.session_scenes import ROOM, add_session, cameras, place_together
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

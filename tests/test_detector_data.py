@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from list3r.cli.app import run
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 WEIGHTS = SHARED / "weights" / "nanodet"

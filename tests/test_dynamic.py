@@ -14,10 +14,10 @@ import pytest
 import list3r
 from list3r.cli.app import app
 from list3r.exporters.scene_json import scene_dict, scene_schema
-from list3r.memory.consolidation import consolidate
+from list3r.memory.library.consolidation import consolidate
 from list3r.memory.records import Instance, LocalInstance, LocalLibrary, MotionTrack
-from list3r.memory.schema import SCHEMA_VERSION
-from list3r.memory.store import Store
+from list3r.memory.store.schema import SCHEMA_VERSION
+from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, local_instance
 
 FRAMES, STEP = 20, 14
@@ -251,7 +251,7 @@ def test_exports_and_commands_show_it(tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_the_stage_moves_it(tmp_path: Path) -> None:
     pytest.importorskip("pxr")
-    from list3r.exporters.usd import usd_stage
+    from list3r.exporters.usd.stage import usd_stage
 
     store = memory(tmp_path / "m.l3r", [chunk(k, [walker(2, STEP * k, across, seed=k)]) for k in range(2)])
     (person,) = moving(store)

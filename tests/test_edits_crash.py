@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.memory.consolidation import consolidate
-from list3r.memory.store import Store
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.store.store import Store
 from tests.test_consolidation import content
 from tests.test_edits import built
 
@@ -18,7 +18,7 @@ EDITOR = """
 import sys
 from list3r.memory import edits
 from list3r.memory.constraints import standing
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 store = Store.open(sys.argv[1], writable=True)
 while any(e.kind != "undo" for e in standing(store.edits())):

@@ -16,11 +16,12 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from list3r.memory import consolidation, edits
 from list3r.memory.constraints import Key
 from list3r.memory.errors import UnknownIdError
-from list3r.memory.library_rules import ConsolidationSettings
-from list3r.memory.store import Store
+from list3r.memory.library import consolidation
+from list3r.memory.library.rules import ConsolidationSettings
+from list3r.memory.maintenance import edits
+from list3r.memory.store.store import Store
 from tests.memory_scenes import BOX, MUG, TWIN
 from tests.test_consolidation import add, chunk, create
 

@@ -17,7 +17,7 @@ from list3r.exporters.registry import FORMATS, export, find_writer
 from list3r.memory.errors import ExportError, MemoryFileError, OptionError
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import Instance, Observation, Relation
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, instance, local_instance
 
 TILTED = Sim3.exp([0.5, -0.2, 0.1, 0.1, 0.2, 0.7, 0.4])
@@ -153,7 +153,7 @@ import resource, sys
 from pathlib import Path
 from list3r.exporters.registry import FORMATS, export
 from list3r.memory.errors import ExportError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 with Store.open(sys.argv[1]) as store:
     for name in FORMATS:
         path = Path(sys.argv[2]) / f"out{FORMATS[name].suffixes[0]}"

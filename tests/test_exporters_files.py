@@ -18,7 +18,7 @@ from list3r.exporters.ply import PlySettings, write_ply
 from list3r.exporters.tum import write_tum
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.test_exporters import write_split_memory
 
 

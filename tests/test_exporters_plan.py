@@ -13,12 +13,12 @@ from PIL import Image
 
 from list3r.exporters.components import read_components
 from list3r.exporters.palette import instance_color
-from list3r.exporters.plan import _plain, _round_length, plan_image, write_plan
-from list3r.exporters.plan_frame import PlanFrame, choose_rotation
-from list3r.exporters.plan_labels import Anchor, place_tags
-from list3r.exporters.plan_layout import PlanSettings, choose_layout
+from list3r.exporters.plan.frame import PlanFrame, choose_rotation
+from list3r.exporters.plan.labels import Anchor, place_tags
+from list3r.exporters.plan.layout import PlanSettings, choose_layout
+from list3r.exporters.plan.picture import _plain, _round_length, plan_image, write_plan
 from list3r.memory.errors import OptionError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.test_exporters import write_split_memory
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from list3r.exporters.scene_json import scene_dict, scene_schema, write_scene_json
 from list3r.memory.geometry import OrientedBox, rotation_from_quat_wxyz
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import SMALL_ROOM, instance
 from tests.test_exporters import TILTED, write_split_memory
 

@@ -13,10 +13,10 @@ pytest.importorskip("pxr")
 from pxr import Gf, Usd, UsdGeom, UsdUtils
 
 from list3r.exporters.palette import linear_from_srgb
-from list3r.exporters.usd import UsdSettings, class_token, usd_stage, write_usd
-from list3r.exporters.usd_camera import camera_matrix
+from list3r.exporters.usd.camera import camera_matrix
+from list3r.exporters.usd.stage import UsdSettings, class_token, usd_stage, write_usd
 from list3r.memory.errors import OptionError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import instance
 from tests.test_exporters import write_split_memory
 

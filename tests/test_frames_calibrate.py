@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Camera
-from list3r.frames.calibrate import CalibrateSettings, calibrate
-from list3r.frames.edges import depth_edges
 from list3r.frames.inspection import describe, lines
+from list3r.frames.registration.calibrate import CalibrateSettings, calibrate
+from list3r.frames.registration.edges import depth_edges
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError
 from tests.frames_scenes import cards, moved, paint, write_png

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r.frames.chunks import ChunkSettings, plan_chunks
-from list3r.frames.cuts import cuts_by_descriptor, find_cuts
+from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+from list3r.frames.chunking.cuts import cuts_by_descriptor, find_cuts
 from list3r.frames.source import open_source
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

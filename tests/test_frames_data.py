@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame
-from list3r.frames.calibrate import CalibrateSettings, calibrate
+from list3r.frames.registration.calibrate import CalibrateSettings, calibrate
 from list3r.frames.source import SourceOptions, open_source, require_camera
 
 pytestmark = pytest.mark.data

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.options import SourceOptions, parse_distortion, parse_intrinsics, parse_range, parse_transform
 from list3r.memory.errors import OptionError
-from list3r.workers import OrderedPool
+from list3r.pipeline.workers import OrderedPool
 
 
 def test_intrinsics_are_four_numbers() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import BadFrame, Frame
-from list3r.frames.cuts import find_cuts
+from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError, SourceError
 

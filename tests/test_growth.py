@@ -11,13 +11,15 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from list3r.memory import edits, library_things, summaries
-from list3r.memory.consolidation import consolidate
 from list3r.memory.geometry import Sim3
-from list3r.memory.labels import Votes, apply_labels, detected_labels, put_votes
-from list3r.memory.library_rules import ConsolidationSettings
+from list3r.memory.library import instances as library_things
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.labels import Votes, apply_labels, detected_labels, put_votes
+from list3r.memory.library.rules import ConsolidationSettings
+from list3r.memory.maintenance import edits
+from list3r.memory.overlap import summaries
 from list3r.memory.records import ChunkResult, FrameSamples
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 GROW = ConsolidationSettings(whole_chunks=0)
 ORDERS = {

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory import consolidation, edits
-from list3r.memory.consolidation import consolidate
 from list3r.memory.geometry import Sim3
-from list3r.memory.library_rules import ConsolidationSettings
-from list3r.memory.store import Store
+from list3r.memory.library import consolidation
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.rules import ConsolidationSettings
+from list3r.memory.maintenance import edits
+from list3r.memory.store.store import Store
 from tests.session_scenes import FRAMES, Box, cameras, simulated_chunk
 from tests.test_growth import tables
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory import vectors
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Instance
-from list3r.memory.store import Store
-from list3r.memory.vectors import VectorIndex
+from list3r.memory.search import vectors
+from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.store.store import Store
 from list3r.queries.match import Filters
 from list3r.queries.nearest import nearest
 from list3r.queries.similar import similar
-from list3r.queries.surfaces import distance_between, distance_to_point, surface_points
+from list3r.queries.views.surfaces import distance_between, distance_to_point, surface_points
 from list3r.queries.within import within
 from tests.conftest import instance
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame
-from list3r.instances.furniture import _rename
+from list3r.instances.geometric.rules.furniture import _rename
 from list3r.instances.library import build_library
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary

@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from list3r.instances.cloud import neighbour_pairs, pack, unpack
-from list3r.instances.features import mean_feature, object_feature
+from list3r.instances.geometric.cloud import neighbour_pairs, pack, unpack
+from list3r.instances.geometric.features import mean_feature, object_feature
+from list3r.instances.geometric.rules.sheets import merge_regions
+from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings
-from list3r.instances.sheets import merge_regions
-from list3r.instances.tracking import encode_labels
-from list3r.instances.views import ChunkViews
+from list3r.instances.tracking.reprojection import encode_labels
 from list3r.memory.masks import decode_mask, encode_mask
 from list3r.reconstruction.base import Reconstruction
 from tests.test_instances_library import SCENE, walk

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from list3r.instances.cloud import Cloud, pack
+from list3r.instances.geometric.cloud import Cloud, pack
+from list3r.instances.geometric.rules.vessels import fit_circle, join_vessels
+from list3r.instances.geometric.surfaces import Scene
 from list3r.instances.settings import SegmentSettings
-from list3r.instances.surfaces import Scene
-from list3r.instances.vessels import fit_circle, join_vessels
 
 
 def _arc(start_deg: float, stop_deg: float, radius: float) -> NDArray[np.float64]:

@@ -10,11 +10,11 @@ import pytest
 
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
-from list3r.reconstruction.detectors import make_detector
-from list3r.reconstruction.features import match
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import WIDTHS, as_bytes, match_unit
+from list3r.reconstruction.features.local import match
 from list3r.reconstruction.keyframe_record import KeyframeSettings, make_keyframes
-from list3r.reconstruction.learned import WIDTHS, as_bytes, match_unit
-from list3r.reconstruction.rgbd import RgbdReconstructor
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
 FILES = {"aliked": "aliked/aliked-t16.pth", "xfeat": "xfeat/xfeat_640x640.onnx"}
 

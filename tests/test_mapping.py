@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r import mapping
-from list3r.frames.chunks import ChunkSettings, plan_chunks
+from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult
-from list3r.memory.store import Store
-from list3r.simulation.feedforward import FeedForwardModel
+from list3r.memory.store.store import Store
+from list3r.pipeline import mapping
 from list3r.simulation.presets import make_video
 
 

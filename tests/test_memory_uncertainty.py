@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from list3r.memory.geometry import Sim3
+from list3r.memory.library.uncertainty import position_covariance, position_sigma
 from list3r.memory.records import ChunkRow
-from list3r.memory.uncertainty import position_covariance, position_sigma
 
 
 def chunk(S: Sim3, covariance: np.ndarray | None, chunk_id: int = 0) -> ChunkRow:

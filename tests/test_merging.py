@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging import Key, merge_nodes
-from list3r.memory.shapes import chunk_shapes, coverage
+from list3r.memory.merging.edges import Key, merge_nodes
+from list3r.memory.overlap.voxels import chunk_shapes, coverage
 from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, ROOM, TABLE, Piece, Walk, node, surface, walk
 
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from list3r.memory.constraints import Constraints, Edit, Key, standing
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging import merge_nodes
-from list3r.memory.shapes import chunk_shapes
+from list3r.memory.merging.edges import merge_nodes
+from list3r.memory.overlap.voxels import chunk_shapes
 from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, TWIN, node, surface, walk
 
 WALK = walk([MUG, TWIN, BOX], 3, linked=False)

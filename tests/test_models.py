@@ -17,8 +17,6 @@ import torch
 from safetensors.torch import save_file
 
 import list3r
-from list3r.chunk_stage import BuildSettings
-from list3r.embedding import embed_memory
 from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
 from list3r.memory.errors import OptionError
 from list3r.models.cache import (
@@ -49,8 +47,10 @@ from list3r.models.device import Gpu
 from list3r.models.licences import PROFILES, choose_weights, objection, terms
 from list3r.models.presets import Selection, obstacle, select
 from list3r.models.upstream import load_upstream, upstream_class
+from list3r.pipeline.chunk import BuildSettings
+from list3r.pipeline.session import prepare, with_weights
 from list3r.reconstruction.registry import MODELS
-from list3r.session_stage import prepare, with_weights
+from list3r.semantics.embedding import embed_memory
 from tests import neural_scenes
 
 GPU = Gpu("a GPU", 24_000.0, 23_000.0)

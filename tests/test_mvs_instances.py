@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from list3r.frames.base import Frame
+from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.library import build_library
 from list3r.instances.settings import InstanceSettings
-from list3r.instances.views import chunk_views, forget_views
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary
 from list3r.reconstruction.base import DepthNoise, Reconstruction
-from list3r.reconstruction.mvs import dense_depth, stereo_noise
+from list3r.reconstruction.mvs.stereo import dense_depth, stereo_noise
 from tests.rgbd_scenes import BOXES, CAMERA, frames_along, walk
 
 COUNT = 24

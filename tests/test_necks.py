@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from list3r.instances.cloud import Cloud
-from list3r.instances.necks import part_necks
-from list3r.instances.segments import Segment, Segmentation
-from list3r.instances.views import ChunkViews
+from list3r.instances.geometric.cloud import Cloud
+from list3r.instances.geometric.rules.necks import part_necks
+from list3r.instances.geometric.segments import Segment, Segmentation
+from list3r.instances.geometric.views import ChunkViews
 
 RED, GREY, WOOD = (170, 30, 35), (150, 155, 160), (190, 150, 100)
 BOX, PAD, GAP = (slice(60, 150), slice(60, 150)), (slice(80, 130), slice(170, 230)), slice(150, 170)

@@ -16,17 +16,17 @@ from list3r.memory.geometry import Sim3
 from list3r.models.cards import MemoryFigures
 from list3r.models.device import MemoryBudget, is_out_of_memory, pictures_that_fit
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.feedforward import PictureSize, inverted, shrink, sigmoid_of_expp1
-from list3r.reconstruction.feedforward_output import (
+from list3r.reconstruction.networks.feedforward import PictureSize, inverted, shrink, sigmoid_of_expp1
+from list3r.reconstruction.networks.output import (
     WindowOutput,
     focal_from_points,
     to_reconstruction,
     with_given_poses,
 )
-from list3r.reconstruction.feedforward_windows import between, join, regauged, run_windows
-from list3r.reconstruction.pi3 import read
+from list3r.reconstruction.networks.pi3 import read
+from list3r.reconstruction.networks.vggt import decode_poses
+from list3r.reconstruction.networks.windows import between, join, regauged, run_windows
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
-from list3r.reconstruction.vggt import decode_poses
 from tests import neural_scenes
 from tests.rgbd_scenes import CAMERA, pose_errors
 

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 import list3r
-from list3r.association.joint_rgbd import RgbdJointReconstructor
-from list3r.chunk_stage import BuildSettings, ChunkTask, joint_model, process_chunk, process_parts
-from list3r.cli import model_options
+from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
 from list3r.cli.app import run
+from list3r.cli.build import model_options
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
-from list3r.frames.chunks import ChunkSettings, ChunkSpan
+from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.records import Session
 from list3r.models.device import Gpu
-from list3r.window_stage import joint_windows
-from list3r.workers import OrderedPool
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, joint_model, process_chunk, process_parts
+from list3r.pipeline.joint_windows import joint_windows
+from list3r.pipeline.workers import OrderedPool
 from tests import neural_models, neural_scenes
 
 

@@ -11,17 +11,17 @@ import torch
 
 pytest.importorskip("transformers")
 
-from list3r.instances.appearance import Appearance, WithAppearance, label_shares
 from list3r.instances.base import Proposals
-from list3r.instances.candidates import CandidateSettings, SoftMasks, bounds_the_room, choose_candidates
-from list3r.instances.discovery import GeometricDiscoverer
+from list3r.instances.geometric.discovery import GeometricDiscoverer
+from list3r.instances.geometric.views import chunk_views
 from list3r.instances.library import build_library
-from list3r.instances.query_segmenter import QuerySegmenter
+from list3r.instances.neural.appearance import Appearance, WithAppearance, label_shares
+from list3r.instances.neural.candidates import CandidateSettings, SoftMasks, bounds_the_room, choose_candidates
+from list3r.instances.neural.query_segmenter import QuerySegmenter
+from list3r.instances.neural.sam_masks import SamMasks, SamMaskSettings
 from list3r.instances.registry import check_choice, make_discoverer, make_tracker
-from list3r.instances.sam_masks import SamMasks, SamMaskSettings
 from list3r.instances.settings import InstanceSettings
-from list3r.instances.video_tracker import VideoTracker, VideoTrackerSettings, _Things
-from list3r.instances.views import chunk_views
+from list3r.instances.tracking.video_tracker import VideoTracker, VideoTrackerSettings, _Things
 from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
 from list3r.models import pretrained
@@ -307,8 +307,8 @@ def test_the_surest_thing_takes_the_pixel(chunk) -> None:
 
 
 def test_names_of_a_discoverer_become_labels(tmp_path: Path) -> None:
-    from list3r.mapping import add_chunk
-    from list3r.memory.store import Store
+    from list3r.memory.store.store import Store
+    from list3r.pipeline.mapping import add_chunk
     from tests.conftest import box_points, chunk_result, local_instance
 
     mug = local_instance(0, box_points((0, 0, 2), (0.1, 0.1, 0.1), 300, 1), (200, 200, 200), np.arange(20))

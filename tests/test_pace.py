@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.cli.app import run
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.chunks import ChunkSettings, ChunkSpan
-from list3r.frames.pace import PaceSettings, depth_step, picture_flows
+from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
+from list3r.frames.chunking.pace import PaceSettings, depth_step, picture_flows
 from list3r.frames.source import SourceOptions
 from list3r.memory.geometry import umeyama
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
 from tests.rgbd_scenes import CAMERA, render
 from tests.test_sfm_build import pose
 

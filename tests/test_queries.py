@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError
-from list3r.memory.store import Store
-from list3r.memory.vectors import VectorIndex
+from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.store.store import Store
 from list3r.queries.nearest import nearest
 from list3r.queries.relations import relations
 from list3r.queries.seen import seen

@@ -10,10 +10,10 @@ import pytest
 
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Observation
-from list3r.memory.store import Store
-from list3r.queries.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame, last_camera
+from list3r.memory.store.store import Store
 from list3r.queries.match import Match
 from list3r.queries.seen import seen, visible
+from list3r.queries.views.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame, last_camera
 from list3r.queries.within import within
 from tests.conftest import box_points, chunk_result, instance, local_instance, write_small_room
 

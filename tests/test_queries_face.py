@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import list3r
+from list3r.api import SceneMemory
 from list3r.memory.errors import MemoryFileError, OptionError, UnknownIdError
-from list3r.memory.store import Store
-from list3r.scene_memory import SceneMemory
+from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)

@@ -11,7 +11,7 @@ import pytest
 
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Relation
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from list3r.queries.find import Found, find
 from list3r.queries.grammar import parse
 from tests.conftest import write_small_room

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from list3r.memory.records import Instance, Relation
-from list3r.memory.store import Store
-from list3r.queries import gather, visibility
-from list3r.queries.camera import Camera
+from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.match import Match
 from list3r.queries.nearest import nearest
 from list3r.queries.relations import relations
 from list3r.queries.seen import visible
+from list3r.queries.views import gather, visibility
+from list3r.queries.views.camera import Camera
 from tests.conftest import instance
 
 COUNT = 400

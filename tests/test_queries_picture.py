@@ -11,10 +11,10 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.instances.features import COLOR_PART, color_feature, object_feature
+from list3r.instances.geometric.features import COLOR_PART, color_feature, object_feature
 from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 Make = Callable[..., Path]
 COLORS = {2: (150, 110, 70), 3: (200, 30, 30), 4: (30, 40, 200), 5: (240, 240, 240)}

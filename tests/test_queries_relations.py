@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Relation
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from list3r.queries.path import path
 from list3r.queries.relations import Relations, relations
-from list3r.queries.viewpoint import Viewer, between, viewed
+from list3r.queries.views.viewpoint import Viewer, between, viewed
 from tests.conftest import instance, write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.association.frame_search import CLASSICAL
-from list3r.reconstruction.descriptor import FrameDescriptor, WordsDescriptor
-from list3r.reconstruction.features import FeatureSettings, detect
-from list3r.reconstruction.vlad import VladDescriptor, Vocabulary
+from list3r.association.revisits.frame_search import CLASSICAL
+from list3r.reconstruction.features.descriptor import FrameDescriptor, WordsDescriptor
+from list3r.reconstruction.features.local import FeatureSettings, detect
+from list3r.reconstruction.features.vlad import VladDescriptor, Vocabulary
 from tests.rgbd_scenes import CAMERA, frames_along, walk
 
 KINDS: tuple[FrameDescriptor, ...] = (VladDescriptor(), WordsDescriptor())

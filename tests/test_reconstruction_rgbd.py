@@ -14,10 +14,10 @@ from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.reconstruction.base import backproject
-from list3r.reconstruction.rgbd import RgbdReconstructor
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.render import Renderer
-from list3r.simulation.sensor import sense
+from list3r.simulation.rendering.render import Renderer
+from list3r.simulation.rendering.sensor import sense
 from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, render, walk
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from list3r.simulation import furniture as f
-from list3r.simulation.gaps import surface_gap
-from list3r.simulation.materials import Material
-from list3r.simulation.things import BOX, SPHERE, Thing
-from list3r.simulation.truth import true_relations
-from list3r.simulation.world import make_world
+from list3r.simulation.worlds import furniture as f
+from list3r.simulation.worlds.gaps import surface_gap
+from list3r.simulation.worlds.materials import Material
+from list3r.simulation.worlds.things import BOX, SPHERE, Thing
+from list3r.simulation.worlds.truth import true_relations
+from list3r.simulation.worlds.world import make_world
 
 GREY = Material("plain", (120, 120, 120), (130, 130, 130), 0.3)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import list3r
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 from tests.test_cli_errors import write_frames
 
@@ -23,11 +23,11 @@ def build_ended(walk: Path, memory: Path, end: str, *more: str) -> subprocess.Co
     """A build of the real program that is ended, by the statement `end`, as its first chunk is to be added."""
     program = f"""
 import os, signal, sys
-import list3r.session_stage
+import list3r.pipeline.session
 from list3r.cli import main
 def add_chunk(*_, **__):
     {end}
-list3r.session_stage.add_chunk = add_chunk
+list3r.pipeline.session.add_chunk = add_chunk
 sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given", "--workers", "1", *{more!r}]
 main()
 """
@@ -118,8 +118,8 @@ def test_output_that_nobody_reads_is_no_failure(command: str, tmp_path: Path) ->
 def test_ctrl_c_in_any_command_is_said_and_is_a_failure(tmp_path: Path) -> None:
     program = """
 import os, signal, sys
-import list3r.scene_memory
-list3r.scene_memory.SceneMemory.export = lambda *_: os.kill(os.getpid(), signal.SIGINT) or signal.pause()
+import list3r.api
+list3r.api.SceneMemory.export = lambda *_: os.kill(os.getpid(), signal.SIGINT) or signal.pause()
 from list3r.cli import main
 main()
 """

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.codec import pack, unpack
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.schema import SCHEMA_VERSION
-from list3r.memory.store import Store
+from list3r.memory.store.codec import pack, unpack
+from list3r.memory.store.schema import SCHEMA_VERSION
+from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 Make = Callable[..., Path]
@@ -210,7 +210,7 @@ def test_an_old_memory_that_may_not_be_written_is_read_from_a_copy(name: str, tm
 def test_an_old_memory_that_another_process_holds_is_read_from_a_copy(tmp_path: Path) -> None:
     path = tmp_path / "old.l3r"
     shutil.copy(FIXTURES / "schema2.l3r", path)
-    holder = program(f"from list3r.memory.writer_lock import *; held = WriterLock(Path({str(path)!r}))")
+    holder = program(f"from list3r.memory.store.lock import *; held = WriterLock(Path({str(path)!r}))")
     with Store.open(path) as store:
         assert store.verify() == []
     with sqlite3.connect(path) as database:
@@ -223,7 +223,7 @@ def test_an_old_memory_that_another_process_holds_is_read_from_a_copy(tmp_path: 
 
 def test_the_lock_names_its_holder_and_ends_with_it(make_memory: Make, tmp_path: Path) -> None:
     path = make_memory()
-    text = f"from list3r.memory.store import Store; store = Store.open({str(path)!r}, writable=True)"
+    text = f"from list3r.memory.store.store import Store; store = Store.open({str(path)!r}, writable=True)"
     holder = program(text)
     with pytest.raises(MemoryFileError, match=rf"process {holder.pid} on .*, since 20.*wait for it to end"):
         Store.open(path, writable=True)

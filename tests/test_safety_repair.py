@@ -13,10 +13,10 @@ import pytest
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.memory_file import PAGE_BYTES
+from list3r.memory.maintenance.repair import repair
 from list3r.memory.records import Instance
-from list3r.memory.repair import repair
-from list3r.memory.store import Store
+from list3r.memory.store.file import PAGE_BYTES
+from list3r.memory.store.store import Store
 from tests.conftest import SMALL_ROOM
 
 Make = Callable[..., Path]
@@ -68,7 +68,7 @@ def test_what_is_not_as_it_was_written_is_not_answered_with(
 ) -> None:
     path = make_memory()
     spoil(path, "UPDATE instances SET confidence = 0.123 WHERE id = 3")
-    monkeypatch.setattr("list3r.memory.connection.WHOLE_BYTES", 2**40 if whole else 0)
+    monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 2**40 if whole else 0)
     for ask in (
         lambda store: store.instances(),
         lambda store: store.instance(3),
@@ -84,7 +84,7 @@ def test_large_memories_check_the_relations_and_surfaces_that_they_read(
     make_memory: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = make_memory()
-    monkeypatch.setattr("list3r.memory.connection.WHOLE_BYTES", 0)
+    monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
     with Store.open(path) as store:
         assert len(store.relations(3)) == 1 and len(store.surface_points(5)) == len(store.support(5).points) == 400
     spoil(path, "UPDATE relations SET margin = 0.5 WHERE subject = 3")

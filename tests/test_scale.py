@@ -12,18 +12,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r import mapping
+from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+from list3r.api import open as open_scene
 from list3r.cli.app import run
 from list3r.exporters.scene_json import write_scene_json
-from list3r.frames.chunks import ChunkSettings, plan_chunks
-from list3r.memory import edits
+from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.geometry import Sim3
+from list3r.memory.maintenance import edits
 from list3r.memory.records import ChunkResult, Instance
-from list3r.memory.scale import parse_anchor
-from list3r.memory.store import Store
-from list3r.scene_memory import open as open_scene
-from list3r.simulation.feedforward import FeedForwardModel
+from list3r.memory.store.store import Store
+from list3r.memory.world.scale import parse_anchor
+from list3r.pipeline import mapping
 from list3r.simulation.presets import make_video
 
 

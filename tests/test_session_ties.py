@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.session_ties import hold_back
+from list3r.association.revisits.session_ties import hold_back
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.consolidation import consolidate
-from list3r.memory.history import world_at
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import Instance
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
 

@@ -10,10 +10,10 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.consolidation import consolidate
 from list3r.memory.errors import OptionError
-from list3r.memory.past import store_at
-from list3r.memory.store import Store
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.maintenance.as_of import store_at
+from list3r.memory.store.store import Store
 from list3r.queries.nearest import nearest
 from list3r.queries.within import within
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together

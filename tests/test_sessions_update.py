@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import list3r
-from list3r.chunk_stage import BuildSettings
 from list3r.cli.app import run
-from list3r.frames.chunks import ChunkSettings
+from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError, TrackingError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
+from list3r.pipeline.chunk import BuildSettings
+from list3r.pipeline.update import ties, update
 from list3r.simulation.dataset import WalkSettings, write_walk
-from list3r.updating import ties, update
 
 SETTINGS = BuildSettings(poses="estimate", chunks=ChunkSettings(length=40, overlap=12))
 

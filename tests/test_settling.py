@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.consolidation import consolidate
 from list3r.memory.geometry import Sim3
-from list3r.memory.settling import settle
-from list3r.memory.store import Store
-from list3r.memory.summaries import chunk_summaries
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.settling import settle
+from list3r.memory.overlap.summaries import chunk_summaries
+from list3r.memory.store.store import Store
 from tests.test_consolidation import add, chunk, create
 
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import BadFrame, Frame
-from list3r.frames.borrowing import frames_around
+from list3r.frames.chunking.borrowing import frames_around
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import umeyama
-from list3r.reconstruction.sfm import SfmReconstructor
-from list3r.reconstruction.sfm_consistency import contradicted
-from list3r.reconstruction.sfm_links import LinkSettings, step_beside
-from list3r.reconstruction.sfm_mapping import (
+from list3r.reconstruction.sfm.consistency import contradicted
+from list3r.reconstruction.sfm.links import LinkSettings, step_beside
+from list3r.reconstruction.sfm.mapping import (
     MappingSettings,
     MapProblem,
     SparseMap,
@@ -25,7 +24,8 @@ from list3r.reconstruction.sfm_mapping import (
     build_maps,
     first_pairs,
 )
-from list3r.reconstruction.sfm_tracks import Tracks
+from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
+from list3r.reconstruction.sfm.tracks import Tracks
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import FRAMES, Held, centres, walk
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import list3r
-from list3r.chunk_stage import PART_STEP, BuildSettings, ChunkTask, process_parts
-from list3r.frames.chunks import ChunkSettings, ChunkSpan
+from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
-from list3r.memory.store import Store
-from list3r.pipeline import build
-from list3r.precomputing import precompute
+from list3r.memory.store.store import Store
+from list3r.pipeline.build import build
+from list3r.pipeline.chunk import PART_STEP, BuildSettings, ChunkTask, process_parts
+from list3r.pipeline.precompute import precompute
 from list3r.reconstruction.precomputed_files import read_piece
 from tests.rgbd_scenes import CAMERA, render
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.camera_edge import better_edge, camera_edge
-from list3r.association.reprojection_edge import refine_loop
+from list3r.association.overlap.camera_edge import better_edge, camera_edge
+from list3r.association.revisits.reprojection_edge import refine_loop
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3, rotation_exp, rotation_log
 from list3r.memory.records import Edge, FrameSamples, Keyframe

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.sfm_calibration import CalibrationSettings, _agreeing, _Estimate, _parted
-from list3r.reconstruction.sfm_tracks import TrackSettings, as_bright, follow_corners
+from list3r.reconstruction.sfm.calibration import CalibrationSettings, _agreeing, _Estimate, _parted
+from list3r.reconstruction.sfm.tracks import TrackSettings, as_bright, follow_corners
 
 
 def wall(count: int = 24) -> list[np.ndarray]:
@@ -79,7 +79,7 @@ def test_a_process_that_is_ended_says_nothing_of_its_own() -> None:
         "import os, signal, time\n"
         "def told(*_):\n    raise KeyboardInterrupt\n"
         "signal.signal(signal.SIGTERM, told)\n"
-        "import list3r.reconstruction.sfm_calibration\n"
+        "import list3r.reconstruction.sfm.calibration\n"
         "try:\n    os.kill(os.getpid(), signal.SIGTERM)\n    time.sleep(5)\n"
         "except KeyboardInterrupt:\n    print('told')\n"
     )

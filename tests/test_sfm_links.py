@@ -14,16 +14,22 @@ from list3r.frames.base import Camera, Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import umeyama
-from list3r.reconstruction.detectors import make_detector
-from list3r.reconstruction.learned import LearnedDetector
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
-from list3r.reconstruction.sfm import SfmReconstructor, SfmSettings
-from list3r.reconstruction.sfm_consistency import contradicted, epipolar_errors
-from list3r.reconstruction.sfm_features import FinderSettings, LocalFeatures, likely_pairs, make_finder, match_features
-from list3r.reconstruction.sfm_fill import Segment, fill_segments
-from list3r.reconstruction.sfm_links import keyframe_problem
-from list3r.reconstruction.sfm_mapping import build_maps
-from list3r.reconstruction.sfm_tracks import follow_corners
+from list3r.reconstruction.sfm.consistency import contradicted, epipolar_errors
+from list3r.reconstruction.sfm.fill import Segment, fill_segments
+from list3r.reconstruction.sfm.keyframe_features import (
+    FinderSettings,
+    LocalFeatures,
+    likely_pairs,
+    make_finder,
+    match_features,
+)
+from list3r.reconstruction.sfm.links import keyframe_problem
+from list3r.reconstruction.sfm.mapping import build_maps
+from list3r.reconstruction.sfm.reconstructor import SfmReconstructor, SfmSettings
+from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import pose
 

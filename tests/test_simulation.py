@@ -7,14 +7,14 @@ import pytest
 
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
-from list3r.simulation.changes import Change, apply_changes, random_changes
-from list3r.simulation.materials import Material, bake
-from list3r.simulation.render import RenderedFrame, Renderer
-from list3r.simulation.sensor import SensorSettings, sense
-from list3r.simulation.things import BOX, CYLINDER, SPHERE, Part, Thing
-from list3r.simulation.truth import footprint_gap, true_relations, world_truth
+from list3r.simulation.rendering.render import RenderedFrame, Renderer
+from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path, look_poses
-from list3r.simulation.world import World, make_world
+from list3r.simulation.worlds.changes import Change, apply_changes, random_changes
+from list3r.simulation.worlds.materials import Material, bake
+from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, Thing
+from list3r.simulation.worlds.truth import footprint_gap, true_relations, world_truth
+from list3r.simulation.worlds.world import World, make_world
 
 CAMERA = Camera(160, 120, 131.25, 131.25, 79.5, 59.5)
 SEEDS = [0, 1, 2, 3]

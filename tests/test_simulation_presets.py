@@ -12,14 +12,14 @@ import pytest
 
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
-from list3r.simulation.casting import Caster
 from list3r.simulation.covisibility import covisibility, seen_share
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.presets import Shot, make_shot, make_video, preset_camera, preset_names
-from list3r.simulation.render import Renderer
+from list3r.simulation.rendering.casting import Caster
+from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.video import SimulatedVideo
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.world import make_world
+from list3r.simulation.worlds.world import make_world
 
 PRESETS = preset_names()
 

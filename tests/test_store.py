@@ -13,7 +13,7 @@ import pytest
 from list3r.memory.errors import MemoryFileError, UnknownIdError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, MergeDecision, Observation
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from tests.conftest import SMALL_ROOM, chunk_result, local_instance
 
 Make = Callable[..., Path]

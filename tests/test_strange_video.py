@@ -9,14 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from list3r.chunk_stage import BuildSettings, ChunkTask, process_parts
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.borrowing import borrow
-from list3r.frames.chunks import ChunkSpan
+from list3r.frames.chunking.borrowing import borrow
+from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.frames.source import SourceOptions
 from list3r.memory.geometry import rotation_exp, umeyama
-from list3r.reconstruction.sfm_calibration import CalibrationSettings, _longest_run, _spans
-from list3r.reconstruction.sfm_tracks import follow_corners
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
+from list3r.reconstruction.sfm.calibration import CalibrationSettings, _longest_run, _spans
+from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import render
 
 STOP = range(12, 36)

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.association.camera_edge import camera_edge
-from list3r.association.node_graph import bend_chunks
-from list3r.association.pose_graph import GraphResult, optimize
-from list3r.association.surface_graph import place_by_surfaces
+from list3r.association.graph.node_graph import bend_chunks
+from list3r.association.graph.pose_graph import GraphResult, optimize
+from list3r.association.graph.surface_graph import place_by_surfaces
+from list3r.association.overlap.camera_edge import camera_edge
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples

@@ -13,19 +13,17 @@ from types import FrameType
 
 import typer
 
-from list3r.cli import (
-    build_commands,
-    detect_commands,
-    edit_commands,
-    embed_commands,
-    evaluation_commands,
-    file_commands,
-    memory_commands,
-    model_commands,
-    query_commands,
-    scale_commands,
-    update_commands,
-)
+from list3r.cli.ask import memory as memory_commands
+from list3r.cli.ask import query as query_commands
+from list3r.cli.build import commands as build_commands
+from list3r.cli.build import update as update_commands
+from list3r.cli.edit import commands as edit_commands
+from list3r.cli.edit import files as file_commands
+from list3r.cli.edit import scale as scale_commands
+from list3r.cli.measure import commands as evaluation_commands
+from list3r.cli.models import commands as model_commands
+from list3r.cli.models import detect as detect_commands
+from list3r.cli.models import embed as embed_commands
 from list3r.memory.errors import List3rError
 
 app = typer.Typer(

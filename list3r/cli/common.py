@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 if TYPE_CHECKING:
-    from list3r.scene_memory import SceneMemory
+    from list3r.api import SceneMemory
 
 MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memory file.", show_default=False)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
@@ -54,7 +54,7 @@ def open_memory(path: Path) -> Iterator[SceneMemory]:
 
     All that is read belongs to one state, whatever a build or an update commits meanwhile.
     """
-    from list3r.scene_memory import open as open_scene
+    from list3r.api import open as open_scene
 
     with open_scene(path, at=_AT.get()) as scene, scene.store.snapshot():
         yield scene

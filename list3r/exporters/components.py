@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, FrameRow, Instance, Support
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from list3r.exporters.components import Component, has_box, read_components, thi
 from list3r.exporters.output import part_path, replacing, units
 from list3r.exporters.palette import Color, instance_color, linear_from_srgb, structure_color
 from list3r.memory.records import Instance
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """glTF has y up: its x, y, z are the world's x, z, -y."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from list3r.memory.errors import ExportError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 
 @contextlib.contextmanager

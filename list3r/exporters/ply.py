@@ -14,7 +14,7 @@ from list3r.exporters.components import Component, read_components, thinned_supp
 from list3r.exporters.output import part_path, replacing, units
 from list3r.exporters.palette import instance_color, structure_color
 from list3r.memory.errors import OptionError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 _VERTEX = np.dtype(
     [

@@ -10,7 +10,7 @@ from typing import cast
 
 from list3r.exporters.output import check_target
 from list3r.memory.errors import OptionError
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 Writer = Callable[[Store, Path], tuple[Path, ...]]
 
@@ -31,11 +31,11 @@ class Format:
 
 FORMATS: dict[str, Format] = {
     "json": Format("scene_json", "write_scene_json", (".json",), True, "instances and relations, fixed schema"),
-    "usd": Format("usd", "write_usd", (".usda", ".usdc", ".usd"), False, "OpenUSD stage with points, boxes, camera"),
+    "usd": Format("usd.stage", "write_usd", (".usda", ".usdc", ".usd"), False, "OpenUSD stage: points, boxes, camera"),
     "ply": Format("ply", "write_ply", (".ply",), False, "points coloured by instance"),
     "glb": Format("glb", "write_glb", (".glb",), False, "boxes and points for any glTF viewer"),
     "tum": Format("tum", "write_tum", (".txt", ".tum"), True, "camera trajectory, one line a frame"),
-    "plan": Format("plan", "write_plan", (".png",), False, "plan view of the rooms as a picture"),
+    "plan": Format("plan.picture", "write_plan", (".png",), False, "plan view of the rooms as a picture"),
 }
 
 

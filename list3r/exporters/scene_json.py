@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from list3r.exporters.components import Component, frames_per_second, has_box, read_components
 from list3r.exporters.output import replacing, units
 from list3r.memory.geometry import quat_wxyz_from_rotation
-from list3r.memory.labels import detected_labels, label_source
+from list3r.memory.library.labels import detected_labels, label_source
 from list3r.memory.records import Instance, Relation
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 FORMAT = "list3r-scene-graph"
 VERSION = 1

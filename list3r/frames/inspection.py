@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from list3r.frames.base import Camera, SourceInfo
-from list3r.frames.overlay import draw_registration
+from list3r.frames.registration.overlay import draw_registration
 
 __all__ = ["describe", "draw_registration", "lines"]
 

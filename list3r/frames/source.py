@@ -6,11 +6,11 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from list3r.frames import images, replica, seven_scenes, tum
 from list3r.frames.base import Camera, FrameSource, SourceInfo
 from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, Layout
 from list3r.frames.options import SourceOptions
+from list3r.frames.readers import images, replica, seven_scenes, tum
 from list3r.memory.errors import SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
@@ -102,6 +102,6 @@ def _open_file(path: Path, options: SourceOptions) -> FrameSource:
         raise SourceError(f"{path} is one image; name the folder of images or a video")
     if not path.is_file() or path.stat().st_size == 0:
         raise SourceError(f"{path} is empty or no ordinary file; {_WANTED}")
-    from list3r.frames.video import VideoSource
+    from list3r.frames.readers.video import VideoSource
 
     return VideoSource(path, options)

@@ -9,11 +9,11 @@ import numpy as np
 
 from list3r.frames.base import Frame
 from list3r.instances.base import Discoverer, Proposals, Tracker
-from list3r.instances.discovery import GeometricDiscoverer
-from list3r.instances.movers import with_movers
+from list3r.instances.geometric.discovery import GeometricDiscoverer
+from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.settings import InstanceSettings
-from list3r.instances.tracking import ReprojectionTracker
-from list3r.instances.views import chunk_views, forget_views
+from list3r.instances.tracking.movers import with_movers
+from list3r.instances.tracking.reprojection import ReprojectionTracker
 from list3r.memory.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 

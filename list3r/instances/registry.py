@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from list3r.instances.base import Discoverer, Tracker
-from list3r.instances.discovery import GeometricDiscoverer
+from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings
-from list3r.instances.tracking import ReprojectionTracker
+from list3r.instances.tracking.reprojection import ReprojectionTracker
 from list3r.memory.errors import OptionError
 
 if TYPE_CHECKING:
-    from list3r.instances.appearance import Appearance
+    from list3r.instances.neural.appearance import Appearance
 
 DISCOVERERS = ("geometric", "eomt", "mask2former", "sam2", "sam3", "precomputed")
 TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
@@ -48,7 +48,7 @@ def make_discoverer(
     if discovery == "geometric":
         found = GeometricDiscoverer(settings)
     elif discovery == "precomputed":
-        from list3r.instances.precomputed_masks import PrecomputedMasks
+        from list3r.instances.neural.precomputed_masks import PrecomputedMasks
 
         if "discovery/precomputed" not in where:
             raise OptionError("--discovery precomputed needs a folder: --weights discovery=DIR (docs/precomputed.md)")
@@ -57,7 +57,7 @@ def make_discoverer(
         found = _network(discovery, where[f"discovery/{discovery}"], device, settings)
     if features in ("geometric", "own"):
         return found
-    from list3r.instances.appearance import WithAppearance
+    from list3r.instances.neural.appearance import WithAppearance
 
     return WithAppearance(found, _appearance(features, where[f"features/{features}"], device))
 
@@ -65,17 +65,17 @@ def make_discoverer(
 @lru_cache(maxsize=1)
 def _network(discovery: str, folder: str, device: str, settings: InstanceSettings) -> Discoverer:
     if discovery in ("eomt", "mask2former"):
-        from list3r.instances.query_segmenter import QuerySegmenter
+        from list3r.instances.neural.query_segmenter import QuerySegmenter
 
         return QuerySegmenter(discovery, Path(folder), device, settings)
-    from list3r.instances.sam_masks import SamMasks
+    from list3r.instances.neural.sam_masks import SamMasks
 
     return SamMasks(discovery, Path(folder), device, settings)
 
 
 @lru_cache(maxsize=1)
 def _appearance(features: str, folder: str, device: str) -> Appearance:
-    from list3r.instances.appearance import Appearance
+    from list3r.instances.neural.appearance import Appearance
 
     return Appearance(features, Path(folder), device)
 
@@ -87,6 +87,6 @@ def make_tracker(
     """The tracker of that name; see `make_discoverer`. Raises `OptionError`."""
     if tracking == "reprojection":
         return ReprojectionTracker(settings)
-    from list3r.instances.video_tracker import VideoTracker
+    from list3r.instances.tracking.video_tracker import VideoTracker
 
     return VideoTracker(tracking, Path(dict(folders)[f"tracking/{tracking}"]), device, settings)

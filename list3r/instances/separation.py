@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from list3r.instances.features import lab_of
+from list3r.instances.geometric.features import lab_of
 from list3r.memory.records import LocalInstance
 
 WELL_VISIBLE = 0.3

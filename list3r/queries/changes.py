@@ -8,7 +8,7 @@ import numpy as np
 
 from list3r.memory.errors import OptionError
 from list3r.memory.records import ChangeEvent, Instance
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 KINDS = ("moved", "removed", "added", "seen_again")
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
-from list3r.memory.store import Store
-from list3r.memory.words import vocabulary
-from list3r.queries.camera import camera_of_frame
+from list3r.memory.store.store import Store
 from list3r.queries.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.gather import Gathered, gather
 from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
 from list3r.queries.match import Match, Matches, checked_count, checked_instance
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of, viewer_from
-from list3r.queries.surfaces import distance_between
-from list3r.queries.viewpoint import VIEWPOINT, between
+from list3r.queries.views.camera import camera_of_frame
+from list3r.queries.views.gather import Gathered, gather
+from list3r.queries.views.surfaces import distance_between
+from list3r.queries.views.viewpoint import VIEWPOINT, between
 from list3r.queries.words import STRUCTURE, not_borne
 
 _BY_STRUCTURE_M = 0.4

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 
 class WordEncoder(Protocol):

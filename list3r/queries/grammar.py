@@ -13,8 +13,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from list3r.memory.description.words import split_words
 from list3r.memory.errors import OptionError
-from list3r.memory.words import split_words
 
 RELATIONS: dict[str, tuple[str, ...]] = {
     "on top of": ("on",),

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import BestView, Instance
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 from list3r.queries.words import is_colored, is_named, wanted_words
 
 STATES = ("present", "moved", "removed", "added", "unseen", "any")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 
 from list3r.memory.records import Relation
-from list3r.memory.relations import INVERSE, PREDICATES
-from list3r.memory.store import Store
+from list3r.memory.relations.predicates import INVERSE, PREDICATES
+from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance
 from list3r.queries.relations import Relations
 

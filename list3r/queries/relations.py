@@ -9,13 +9,13 @@ import numpy as np
 
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance, Relation
-from list3r.memory.relation_scene import RelationSettings
-from list3r.memory.relations import PREDICATES
-from list3r.memory.store import Store
-from list3r.queries.camera import Camera, camera_of_frame, last_camera
-from list3r.queries.gather import is_large, sample
+from list3r.memory.relations.predicates import PREDICATES
+from list3r.memory.relations.scene import RelationSettings
+from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance, checked_point
-from list3r.queries.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
+from list3r.queries.views.camera import Camera, camera_of_frame, last_camera
+from list3r.queries.views.gather import is_large, sample
+from list3r.queries.views.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
 from list3r.queries.words import not_borne, wanted_words, words_of
 
 VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "under", "attached_to"))

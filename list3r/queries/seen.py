@@ -7,10 +7,10 @@ from typing import Unpack
 
 from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.records import BestView
-from list3r.memory.store import Store
-from list3r.queries.camera import Camera
+from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
-from list3r.queries.visibility import Seen, in_front, look
+from list3r.queries.views.camera import Camera
+from list3r.queries.views.visibility import Seen, in_front, look
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.records import Instance
-from list3r.memory.store import Store
-from list3r.memory.vectors import VectorIndex
+from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_count, checked_instance
 
 _BATCH = 500

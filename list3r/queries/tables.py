@@ -6,7 +6,7 @@ from typing import Literal
 
 from list3r.memory.geometry import quat_wxyz_from_rotation
 from list3r.memory.records import Instance
-from list3r.memory.store import Store
+from list3r.memory.store.store import Store
 
 Table = Literal["instances", "relations", "frames"]
 Value = int | float | str | bool | None

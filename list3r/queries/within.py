@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError
-from list3r.memory.store import Store
-from list3r.queries.camera import Camera
+from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point
 from list3r.queries.seen import visible
-from list3r.queries.surfaces import distance_to_point, surface_of
+from list3r.queries.views.camera import Camera
+from list3r.queries.views.surfaces import distance_to_point, surface_of
 
 
 def within(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
+from list3r.memory.description.words import split_words
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
-from list3r.memory.words import split_words
 
 _IGNORED = frozenset("a an the of in on at with and or some any my thing things object objects".split())
 STRUCTURE = frozenset(("floor", "ceiling", "wall"))

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.descriptor import FrameDescriptor
-from list3r.reconstruction.features import Features, FeatureSettings, detect, points_at
-from list3r.reconstruction.learned import LearnedDetector, as_bytes
-from list3r.reconstruction.view import SensorNoise, shrink_camera, shrink_depth
-from list3r.reconstruction.vlad import VladDescriptor
+from list3r.reconstruction.features.descriptor import FrameDescriptor
+from list3r.reconstruction.features.learned import LearnedDetector, as_bytes
+from list3r.reconstruction.features.local import Features, FeatureSettings, detect, points_at
+from list3r.reconstruction.features.vlad import VladDescriptor
+from list3r.reconstruction.rgbd.view import SensorNoise, shrink_camera, shrink_depth
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import DegenerateError, OptionError, TrackingError
 from list3r.memory.geometry import Sim3
 from list3r.reconstruction.base import DepthNoise, Reconstruction
-from list3r.reconstruction.feedforward_output import WindowOutput, to_reconstruction, with_given_poses
-from list3r.reconstruction.feedforward_windows import between, regauged
+from list3r.reconstruction.networks.output import WindowOutput, to_reconstruction, with_given_poses
+from list3r.reconstruction.networks.windows import between, regauged
 from list3r.reconstruction.precomputed_files import Manifest, read_frames, read_manifest, read_piece
 from list3r.reconstruction.registry import ModelOptions
 

@@ -46,13 +46,13 @@ class ModelEntry:
 
 
 MODELS: dict[str, ModelEntry] = {
-    "rgbd": ModelEntry("rgbd", needs_depth=True, needs_camera=True),
-    "sfm": ModelEntry("sfm", calibration="sfm_calibration", thins=True),
-    "pi3": ModelEntry("pi3"),
-    "pi3x": ModelEntry("pi3x"),
-    "vggt": ModelEntry("vggt"),
-    "mapanything": ModelEntry("mapanything"),
-    "da3": ModelEntry("da3"),
+    "rgbd": ModelEntry("rgbd.reconstructor", needs_depth=True, needs_camera=True),
+    "sfm": ModelEntry("sfm.reconstructor", calibration="sfm.calibration", thins=True),
+    "pi3": ModelEntry("networks.pi3"),
+    "pi3x": ModelEntry("networks.pi3x"),
+    "vggt": ModelEntry("networks.vggt"),
+    "mapanything": ModelEntry("networks.mapanything"),
+    "da3": ModelEntry("networks.da3"),
     "precomputed": ModelEntry("precomputed"),
 }
 """All that `--reconstruction` knows."""

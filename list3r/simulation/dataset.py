@@ -19,14 +19,14 @@ from threadpoolctl import threadpool_limits
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera
 from list3r.memory.errors import ExportError, OptionError
-from list3r.simulation.changes import Change, apply_changes
 from list3r.simulation.movers import Mover
 from list3r.simulation.presets import Shot, make_shot
-from list3r.simulation.render import Renderer
-from list3r.simulation.sensor import SensorSettings, sense
-from list3r.simulation.truth import mover_truth, world_truth
+from list3r.simulation.rendering.render import Renderer
+from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.world import World, make_world
+from list3r.simulation.worlds.changes import Change, apply_changes
+from list3r.simulation.worlds.truth import mover_truth, world_truth
+from list3r.simulation.worlds.world import World, make_world
 
 DEPTH_UNITS_PER_M = 5000.0
 _BATCH = 12

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from list3r.simulation import furniture as f
-from list3r.simulation.buildings import Building
-from list3r.simulation.layout import Placer
-from list3r.simulation.materials import Material
 from list3r.simulation.routes import FreeMap
-from list3r.simulation.things import Thing
+from list3r.simulation.worlds import furniture as f
+from list3r.simulation.worlds.buildings import Building
+from list3r.simulation.worlds.layout import Placer
+from list3r.simulation.worlds.materials import Material
+from list3r.simulation.worlds.things import Thing
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
-from list3r.simulation.buildings import Building, BuildingSettings, appearance_classes, make_building
-from list3r.simulation.casting import Caster
 from list3r.simulation.covisibility import shared_view
 from list3r.simulation.movers import Mover, make_movers
+from list3r.simulation.rendering.casting import Caster
 from list3r.simulation.routes import Director, FreeMap, View, mapped_view
 from list3r.simulation.video import MoverTruth, SimulatedVideo
 from list3r.simulation.walk import PathSettings, camera_path, looking_at
-from list3r.simulation.world import Stop
+from list3r.simulation.worlds.buildings import Building, BuildingSettings, appearance_classes, make_building
+from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from list3r.simulation.buildings import Building, PlacedRoom
-from list3r.simulation.things import Thing, stack_solids
 from list3r.simulation.walk import PathSettings, walk_duration
-from list3r.simulation.world import Stop
+from list3r.simulation.worlds.buildings import Building, PlacedRoom
+from list3r.simulation.worlds.things import Thing, stack_solids
+from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
 

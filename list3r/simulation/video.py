@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.world import World
+from list3r.simulation.worlds.world import World
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from list3r.memory.errors import OptionError
-from list3r.simulation.world import Stop
+from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
 

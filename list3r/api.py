@@ -1,0 +1,407 @@
+"""The face of a memory for Python: opening, asking, exporting."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Unpack
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from list3r.exporters.registry import export as export_memory
+from list3r.memory.errors import OptionError
+from list3r.memory.maintenance.as_of import store_at
+from list3r.memory.maintenance.editing import MemoryEdits
+from list3r.memory.maintenance.history import world_at
+from list3r.memory.records import Instance, Support
+from list3r.memory.store.store import Store
+from list3r.queries.changes import Changed, changes
+from list3r.queries.find import Found, find
+from list3r.queries.free_words import WordEncoder
+from list3r.queries.match import FilterOptions, Match, Matches
+from list3r.queries.nearest import nearest
+from list3r.queries.path import path
+from list3r.queries.relations import Place, Relations, relations
+from list3r.queries.seen import Sightings, seen, visible
+from list3r.queries.similar import similar
+from list3r.queries.tables import Table, Value, records_of
+from list3r.queries.views.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame
+from list3r.queries.within import within
+
+if TYPE_CHECKING:
+    import networkx
+
+    from list3r.frames.options import SourceOptions
+    from list3r.pipeline.chunk import BuildSettings
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concatenate[SceneMemory, P], R]:
+    """One thread at a time: the file's connection and what is kept for the next question are shared by all of them."""
+
+    @functools.wraps(method)
+    def guarded(self: SceneMemory, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        # Of what another process writes meanwhile an answer must see one state; a writer has no other beside it.
+        with self._lock, nullcontext() if self.store.writable else self.store.snapshot():
+            return method(self, *args, **kwargs)
+
+    return guarded
+
+
+def open(path: str | Path, *, writable: bool = False, at: int | None = None) -> SceneMemory:
+    """Open a memory, for reading or for editing too. Raises `MemoryFileError` for anything that is not one.
+
+    Many may read while one writes; a second writer is refused. With `at` every question is about the world as it was
+    after that session, and nothing can be written; `OptionError` for a session that there is not.
+
+    >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
+    """
+    if at is None:
+        return SceneMemory(Store.open(path, writable=writable))
+    if writable:
+        raise OptionError(f"{path} as it was after session {at} can only be read")
+    with Store.open(path) as store:
+        return SceneMemory(store_at(store, at))
+
+
+def build(
+    source: str | Path,
+    memory: str | Path,
+    *,
+    options: SourceOptions | None = None,
+    settings: BuildSettings | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    force: bool = False,
+    licence: str = "research",
+) -> SceneMemory:
+    """Build the memory of a video or folder and open it.
+
+    `options` says what is known of the source (intrinsics, depth scale, ...), `settings` how it is worked on.
+    `resume` goes on with a build that was interrupted; `force` replaces an existing memory. `licence` is what networks
+    may be under: permissive (any use, no account), research (non-commercial, gated and own terms too) or any.
+    Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`, each with the way to mend it.
+    """
+    from list3r.pipeline import build as pipeline
+
+    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    pipeline.build(source, memory, force=force, licence=licence, **run)
+    return open(memory)
+
+
+def update(
+    memory: str | Path,
+    source: str | Path,
+    *,
+    options: SourceOptions | None = None,
+    settings: BuildSettings | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    force: bool = False,
+    licence: str = "research",
+) -> SceneMemory:
+    """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
+
+    The arguments are those of `build`; `force` gives up an update that was interrupted. A video in which no stored
+    place is recognised is kept apart, in a component of its own. Raises `SourceError`, `OptionError`,
+    `TrackingError` or `MemoryFileError`, each with the way to mend it.
+    """
+    from list3r.pipeline import update as updating
+
+    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
+    updating.update(memory, source, force=force, licence=licence, **run)
+    return open(memory)
+
+
+class SceneMemory(MemoryEdits):
+    """A memory that is open; use it as a context manager or call `close`.
+
+    No question writes to the file. Several threads may ask one `SceneMemory`: their questions take turns. For questions
+    side by side open the file once in each thread or process; a writer does not disturb them.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._lock = threading.RLock()
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.store.path
+
+    @property
+    def units(self) -> str:
+        """`m` when lengths are metres, `unit` when the memory has no known scale."""
+        with self._lock:
+            return "unit" if self.store.get_value("scale_kind") == "relative" else "m"
+
+    @property
+    def gravity(self) -> str:
+        """known, estimated (z is up in both) or unknown."""
+        with self._lock:
+            return str(self.store.get_value("gravity", "unknown"))
+
+    @_alone
+    def instances(self, *, structure: bool | None = False) -> list[Instance]:
+        """All things by id; the structure of the room with `structure=True`, both with None."""
+        return self.store.instances(structure=structure)
+
+    @_alone
+    def instances_at(self, session_id: int) -> list[Instance]:
+        """All things, structure too, as they were after a session. Raises `OptionError` for one that there is not."""
+        return world_at(self.store, session_id)
+
+    @_alone
+    def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> list[Changed]:
+        """What was moved, removed and added in the sessions after `since`, the newest session first."""
+        return changes(self.store, since, min_confidence=min_confidence)
+
+    @_alone
+    def instance(self, instance_id: int) -> Instance:
+        """One instance, by its id or by any id it ever had. Raises `UnknownIdError`."""
+        return self.store.instance(instance_id)
+
+    @_alone
+    def support(self, instance_id: int) -> Support:
+        """Surface points of an instance, world coordinates."""
+        return self.store.support(instance_id)
+
+    @_alone
+    def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a moving (`dynamic`) instance was: seconds (V,) and places in the world (V, 3); nothing for others."""
+        return self.store.track(instance_id)
+
+    @_alone
+    def nearest(
+        self,
+        target: str | int | ArrayLike,
+        k: int = 5,
+        *,
+        max_distance: float | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> Matches:
+        """The k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
+
+        Distances are between surfaces and between centres. For the filters (`structure`, `min_confidence`, `state`,
+        `label`, `color`, `min_size`, `max_size`, `component`, `dynamic`) see `list3r.queries.match.Filters`.
+
+            >>> memory.nearest((0.5, 1.2, 0.8), k=3, color="red", max_distance=1.0)
+        """
+        if isinstance(target, str):
+            encoder = self.word_encoder()
+            return nearest(self.store, words=target, k=k, max_distance=max_distance, encoder=encoder, **filters)
+        if isinstance(target, int | np.integer):
+            return nearest(self.store, instance_id=int(target), k=k, max_distance=max_distance, **filters)
+        return nearest(self.store, point=target, k=k, max_distance=max_distance, **filters)
+
+    @_alone
+    def within(
+        self,
+        *,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        center: ArrayLike | None = None,
+        radius: float | None = None,
+        camera: Camera | None = None,
+        max_depth: float | None = None,
+        occlusion: bool = True,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """Things in a box (`lower`, `upper`), a sphere (`center`, `radius`) or the frustum of a `camera`.
+
+        A camera comes from `memory.camera(...)`; what other things hide from it is left out unless `occlusion` is off.
+
+            >>> memory.within(camera=memory.camera(frame=120), max_depth=3.0)
+        """
+        return within(
+            self.store,
+            lower=lower,
+            upper=upper,
+            center=center,
+            radius=radius,
+            camera=camera,
+            max_depth=max_depth,
+            occlusion=occlusion,
+            **filters,
+        )
+
+    @_alone
+    def similar(
+        self,
+        target: int | ArrayLike,
+        k: int = 5,
+        *,
+        space: str | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """The things that look most like an instance (its id), or like a vector of a named embedding space."""
+        if isinstance(target, int | np.integer):
+            return similar(self.store, instance_id=int(target), space=space, k=k, **filters)
+        return similar(self.store, vector=target, space=space, k=k, **filters)
+
+    @_alone
+    def similar_to_picture(
+        self,
+        image: str | Path | NDArray[np.uint8],
+        k: int = 5,
+        *,
+        box_xyxy: tuple[float, float, float, float] | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """The things that look most like a picture (a file, or RGB of shape (H, W, 3)), or like what is in its box.
+
+        By the model that `list3r embed` was run with; by colours alone where it was not: the reason says which.
+
+            >>> memory.similar_to_picture("mug.jpg", box_xyxy=(120, 80, 180, 150))
+        """
+        from list3r.semantics.picture_query import picture_query
+
+        asked = picture_query(self.store, image, box_xyxy)
+        return similar(self.store, vector=asked.vector, space=asked.space, part=asked.part, k=k, **filters)
+
+    @_alone
+    def find(
+        self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
+    ) -> Found:
+        """The things that a text describes, the best first; nothing where nothing fits, with `notes` that say why.
+
+        Words are matched with labels, descriptions, colours and sizes; an id may stand for a thing. Left, right, front
+        and behind are told from `viewpoint`, else as in the picture that shows the other thing best. An `encoder` of
+        an embedding space that the memory holds stands in where no thing bears a word; without one, the model that
+        `list3r embed` used.
+
+            >>> memory.find("white mug on table")
+            >>> memory.find("the biggest red thing near the door", k=1)
+        """
+        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self.word_encoder())
+
+    def word_encoder(self) -> WordEncoder | None:
+        """What compares free words, where the memory was embedded by a text and image model."""
+        from list3r.semantics.embedding import stored_words
+
+        return stored_words(self.store)
+
+    @_alone
+    def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
+        """When and in which frames an instance was seen; stretches with breaks of at most `gap_s` count as one."""
+        return seen(self.store, instance_id, gap_s=gap_s)
+
+    @_alone
+    def visible(
+        self,
+        camera: Camera,
+        *,
+        min_visible: float = 0.1,
+        max_depth: float | None = None,
+        **filters: Unpack[FilterOptions],
+    ) -> list[Match]:
+        """What a camera sees: all of which at least a share of `min_visible` is not hidden by other things.
+
+        >>> memory.visible(memory.camera(time_s=12.5))
+        """
+        return visible(self.store, camera, min_visible=min_visible, max_depth=max_depth, **filters)
+
+    @_alone
+    def camera(
+        self,
+        *,
+        frame: int | None = None,
+        time_s: float | None = None,
+        position: ArrayLike | None = None,
+        quat_wxyz: ArrayLike | None = None,
+        session: int | None = None,
+    ) -> Camera:
+        """The camera of a posed `frame`, of the posed frame nearest to `time_s`, or one put at a pose.
+
+        A pose is a `position` in the world and the rotation R_world_cam (OpenCV axes) as a quaternion w, x, y, z.
+        Raises `OptionError` unless one of the three is given.
+        """
+        posed = position is not None and quat_wxyz is not None
+        if (frame is not None) + (time_s is not None) + posed != 1 or (position is None) != (quat_wxyz is None):
+            raise OptionError(
+                "name a camera by its frame, by a time, or by a position with a quaternion: one of the three"
+            )
+        if frame is not None:
+            return camera_of_frame(self.store, frame, session)
+        if time_s is not None:
+            return camera_at_time(self.store, time_s, session)
+        assert position is not None and quat_wxyz is not None
+        return camera_at_pose(self.store, position, quat_wxyz, session)
+
+    @_alone
+    def relations(
+        self,
+        subject: int | str | None = None,
+        predicate: str | None = None,
+        object: int | str | None = None,
+        min_confidence: float = 0.0,
+        *,
+        viewpoint: Place | None = None,
+        other: int | str | None = None,
+    ) -> Relations:
+        """Relations that match what is given (ids or words); `state` is unknown where the memory cannot tell.
+
+        With `viewpoint` (an id, "camera", "camera:FRAME" or a point) also left_of, right_of, in_front_of and behind;
+        `between` with `object` and `other`. Raises `OptionError` for a predicate that there is not.
+
+            >>> memory.relations(predicate="left_of", object=4, viewpoint=(0.0, 0.0, 1.5))
+            >>> memory.relations(predicate="between", object=4, other=7)
+        """
+        return relations(self.store, subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
+
+    @_alone
+    def path_between(self, start: int, end: int, *, structure: bool = True) -> Relations:
+        """The fewest relations that lead from one instance to another; not over floor and walls without `structure`."""
+        return path(self.store, start, end, structure=structure)
+
+    @_alone
+    def to_records(self, table: Table = "instances") -> list[dict[str, Value]]:
+        """The instances, relations or frames as flat dicts: what `pandas.DataFrame` and its like take as they are.
+
+        >>> pandas.DataFrame(memory.to_records()).set_index("id")
+        """
+        return records_of(self.store, table)
+
+    @_alone
+    def relation_graph(self) -> networkx.MultiDiGraph:
+        """Instances and relations as a graph."""
+        from list3r.memory.search.graphs import relation_graph
+
+        return relation_graph(self.store)
+
+    @_alone
+    def merge_graph(self) -> networkx.Graph:
+        """Local instances, and the decisions that joined them, as a graph."""
+        from list3r.memory.search.graphs import merge_graph
+
+        return merge_graph(self.store)
+
+    @_alone
+    def export(self, format: str, path: str | Path) -> tuple[Path, ...]:
+        """Write the memory in a format: json, usd, ply, glb, tum, plan. Raises `OptionError` and `ExportError`.
+
+        Returns the files written: `path`, and more beside it where parts of the memory could not be joined.
+        """
+        with self.store.snapshot():
+            return export_memory(self.store, format, path)
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self.store.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.store.__exit__(kind, error, trace)

@@ -1,0 +1,244 @@
+"""Which edges the graph believes: false loops are switched off instead of bending the map.
+
+A Geman-McClure kernel tightened from convex (graduated non-convexity: Yang et al., "Graduated non-convexity for robust
+spatial perception", 2020), on Mahalanobis distances. False loops that agree with each other, as those between twin
+rooms do, can win against a chain that has to bend for them; so there is a second start from the loops that lie within
+what the chain of adjacent edges can have drifted, and the explanation of least cost is taken. How far the chain can
+have drifted is measured on the loops themselves, by the median.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from list3r.association.graph.marginals import Marginals, marginals, variance_factors
+from list3r.association.graph.solver import GraphProblem, adjoint
+from list3r.memory.geometry import Sim3
+
+Array = NDArray[np.float64]
+
+
+_NONE = 1e-9
+"""What edges that are not believed weigh, so that what hangs on them alone stays put."""
+
+
+_SETTLED = 0.05
+"""Change of the logarithm of a variance factor that no longer matters."""
+
+_ROUGHLY, _CLOSELY = 1e-3, 1e-9
+"""Relative gain of a step at which a stage of the annealing, and at which the solution, has settled."""
+
+
+@dataclass(frozen=True)
+class TrustSettings:
+    """When an edge is believed."""
+
+    loop_quantile: float = 0.999
+    """Share of true loops whose error lies inside the limit, were all errors as stated."""
+    adjacent_limit: float = 4.0
+    """The limit of adjacent edges, in limits of loops: so many agreeing loops outvote one."""
+    least_loops: float = 0.5
+    """Least share of loops and"""
+    least_adjacent: float = 0.9
+    """of adjacent edges that must be believed before errors are taken to be as stated."""
+    prior_loops: int = 4
+    """Loops that speak for the stated drift of the chain when its true drift is measured."""
+    most_drift: float = 30.0
+    """Largest factor by which the chain may have drifted more than stated (deviations, not squares)."""
+    prior_freedom: float = 10.0
+    """Degrees of freedom that speak for the stated errors of edges."""
+    rounds: int = 8
+    """Most times that errors are scaled and edges judged anew."""
+    iterations: int = 20
+    """Most steps of a solution; each stage of the annealing takes a quarter."""
+
+
+@dataclass(frozen=True)
+class Believed:
+    """A graph with its edges judged."""
+
+    poses: Sim3
+    trust: Array
+    """1 for edges that count, 0 for those that do not. Shape (E,)."""
+    squares: Array
+    """Squared Mahalanobis distances of the edges, errors scaled. Shape (E,)."""
+    limit: Array
+    """Largest of those that is believed. Shape (E,)."""
+    factors: Array
+    """Variance factors of adjacent and of loop edges. Shape (2,)."""
+    freedom: Array
+    """Degrees of freedom behind the factors. Shape (2,)."""
+    marginals: Marginals
+
+
+@dataclass(frozen=True)
+class Tree:
+    """The spanning tree that the start was chained along."""
+
+    parent: NDArray[np.int64]
+    """Row of each chunk's parent, its own row for roots. Shape (K,)."""
+    edge: NDArray[np.int64]
+    """Edge to the parent, -1 for roots. Shape (K,)."""
+    order: NDArray[np.int64]
+    """Rows, parents first. Shape (K,)."""
+
+
+def judge(
+    problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], robust: bool, settings: TrustSettings
+) -> Believed:
+    """Solve the graph and find which edges to believe. `loop` (E,) marks those that may be false."""
+    kinds = loop.astype(np.int64)
+    limit = chi2.ppf(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
+    poses, trust, factors = _as_stated_or_drifted(problem, start, tree, loop, limit, robust, settings)
+    freedom = np.full(2, settings.prior_freedom)
+    for judged_anew in range(settings.rounds if loop.any() else 0):
+        scaled = problem.scaled(factors[kinds])
+        if judged_anew:
+            poses, trust = _harden(scaled, poses, limit, robust, settings)
+        known, squares = marginals(scaled, poses, np.maximum(trust, _NONE)), scaled.squares(poses)
+        before = factors
+        factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, before, settings.prior_freedom)
+        if np.abs(np.log(factors / before)).max() < _SETTLED:
+            break
+    scaled = problem.scaled(factors[kinds])
+    known = marginals(scaled, poses, np.maximum(trust, _NONE))
+    return Believed(poses, trust, scaled.squares(poses), limit, factors, freedom, known)
+
+
+def _as_stated_or_drifted(
+    problem: GraphProblem,
+    start: Sim3,
+    tree: Tree,
+    loop: NDArray[np.bool_],
+    limit: Array,
+    robust: bool,
+    settings: TrustSettings,
+) -> tuple[Sim3, Array, Array]:
+    """Poses, trust and variance factors with errors as stated; where too few edges are believed so, with the chain's
+    drift as large as the loops say it is."""
+    ones = np.ones(len(loop))
+    if not loop.any() or not robust:
+        return problem.solve(start, ones, settings.iterations), ones, np.ones(2)
+    poses, trust = _first(problem, start, tree, loop, limit, settings)
+    chain = trust[~loop]
+    enough = trust[loop].mean() >= settings.least_loops and (not len(chain) or chain.mean() >= settings.least_adjacent)
+    drift = 1.0 if enough else drift_factor(problem, start, tree, loop, settings)
+    if drift > 1.0:
+        poses, trust = _first(problem.scaled(np.where(loop, 1.0, drift)), start, tree, loop, limit, settings)
+    return poses, trust, np.array([drift, 1.0])
+
+
+def _first(
+    problem: GraphProblem,
+    start: Sim3,
+    tree: Tree,
+    loop: NDArray[np.bool_],
+    limit: Array,
+    settings: TrustSettings,
+) -> tuple[Sim3, Array]:
+    """Anneal from all edges, from all with adjacent ones held, and from the loops within what the chain can have
+    drifted; the explanation of least cost."""
+    ones = np.ones(len(loop))
+    within = ~loop
+    within[loop] = chain_squares(problem, start, tree, loop) <= limit[loop]
+    found = []
+    held = np.where(loop, limit, np.inf)
+    for first, kernel in ((ones, limit), (ones, held), (within.astype(np.float64), limit)):
+        poses = start if first.all() else problem.solve(start, np.maximum(first, _NONE), settings.iterations)
+        poses, _ = _anneal(problem, poses, kernel, settings, gated=not first.all())
+        poses, trust = _harden(problem, poses, limit, True, settings)
+        cost = float(np.minimum(problem.squares(poses), limit).sum())
+        found.append((cost, poses, trust))
+        if trust.all():
+            break
+    return min(found, key=lambda f: f[0])[1:]
+
+
+def _anneal(
+    problem: GraphProblem, poses: Sim3, limit: Array, settings: TrustSettings, gated: bool
+) -> tuple[Sim3, Array]:
+    """Tighten the kernel step by step; from a gated start only the last stages."""
+    worst = float((problem.squares(poses) / limit).max())
+    mu = 2.0 if gated else max(2.0 * worst, 1.0)
+    steps = settings.iterations // 4
+    trust = (mu / (problem.squares(poses) / limit + mu)) ** 2 if gated else np.ones(len(limit))
+    while True:
+        poses = problem.solve(poses, np.maximum(trust, _NONE), steps, _ROUGHLY)
+        share = problem.squares(poses) / limit
+        trust = (mu / (share + mu)) ** 2
+        if mu == 1.0:
+            return poses, trust
+        mu = max(1.0, min(mu / 1.6, 2.0 * float(share.max())))
+
+
+def _harden(
+    problem: GraphProblem, poses: Sim3, limit: Array, robust: bool, settings: TrustSettings
+) -> tuple[Sim3, Array]:
+    """Solve by the edges inside their limits alone, until that set stays."""
+    inside = problem.squares(poses) <= limit if robust else np.ones(len(limit), bool)
+    seen: set[bytes] = set()
+    while True:
+        poses = problem.solve(poses, np.where(inside, 1.0, _NONE), settings.iterations, _CLOSELY)
+        seen.add(inside.tobytes())
+        after = problem.squares(poses) <= limit if robust else inside
+        if after.tobytes() in seen or len(seen) == 6:
+            return poses, inside.astype(np.float64)
+        inside = after
+
+
+# -------------------------------------------------------------------------------------------------- the chain
+
+
+def drift_factor(
+    problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], settings: TrustSettings
+) -> float:
+    """How many times larger (squared, at least 1) the chain's drift is than its edges say: the median over loops.
+
+    Up to half of the loops may be false.
+    """
+    ratio = chain_squares(problem, start, tree, loop) / chi2.ppf(0.5, problem.size)
+    pooled = np.concatenate([ratio, np.ones(settings.prior_loops)])
+    return float(np.clip(np.median(pooled), 1.0, settings.most_drift**2))
+
+
+def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_]) -> Array:
+    """Squared Mahalanobis distances of the loops from the chain, by its uncertainty and their own. Shape (L,)."""
+    d = problem.size
+    world = adjoint(start)[:, :d, :d]
+    # Covariances of edges in the frame of the world, summed from the root.
+    own = np.linalg.inv(problem.information)
+    total = np.zeros((len(tree.parent), d, d))
+    for row in tree.order:
+        k = tree.edge[row]
+        if k >= 0:
+            here = world[problem.u[k]]
+            total[row] = total[tree.parent[row]] + here @ own[k] @ here.T
+    u, v = problem.u[loop], problem.v[loop]
+    meet = _common_ancestor(tree, u, v)
+    back = np.linalg.inv(world[u])
+    chain = back @ (total[u] + total[v] - 2 * total[meet]) @ np.swapaxes(back, 1, 2)
+    e = problem.residuals(start)[loop]
+    return np.asarray(np.einsum("ei,ei->e", e, np.linalg.solve(chain + own[loop], e[..., None])[..., 0]))
+
+
+def _common_ancestor(tree: Tree, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Row of the last common ancestor of pairs (binary lifting); a root where they lie in different trees."""
+    depth = np.zeros(len(tree.parent), np.int64)
+    for row in tree.order:
+        if tree.edge[row] >= 0:
+            depth[row] = depth[tree.parent[row]] + 1
+    jumps = [tree.parent]
+    while len(jumps) <= int(depth.max(initial=0)).bit_length():
+        jumps.append(jumps[-1][jumps[-1]])
+    deep, other = np.where(depth[u] >= depth[v], u, v), np.where(depth[u] >= depth[v], v, u)
+    for k in reversed(range(len(jumps))):
+        far = depth[deep] - depth[other] >= 2**k
+        deep = np.where(far, jumps[k][deep], deep)
+    for k in reversed(range(len(jumps))):
+        apart = jumps[k][deep] != jumps[k][other]
+        deep, other = np.where(apart, jumps[k][deep], deep), np.where(apart, jumps[k][other], other)
+    return np.where(deep == other, deep, tree.parent[deep])

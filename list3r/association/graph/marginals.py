@@ -1,0 +1,65 @@
+"""How well each chunk is placed: marginal covariances, scaled by how well the edges kept their word."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from list3r.association.graph.solver import GraphProblem
+from list3r.memory.geometry import Sim3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Uncertainty of a solved graph."""
+
+    covariance: Array
+    """Of each chunk's tangent error relative to the first of its component. Shape (K, D, D), 0 for that first one."""
+    redundancy: Array
+    """Degrees of freedom that each edge has over what it determines, in [0, D]. Shape (E,)."""
+
+
+def marginals(problem: GraphProblem, poses: Sim3, trust: Array) -> Marginals:
+    """Blocks of the inverse information of all chunks, and what they leave over of each edge."""
+    d = problem.size
+    out = np.zeros((len(problem.fixed), d, d))
+    if problem.pattern.count == 0:
+        return Marginals(out, np.full(len(problem.u), float(d)))
+    diagonal, off = problem.factor(poses, trust).inverse_blocks()
+    out[~problem.fixed] = diagonal
+    between = np.zeros((len(problem.u), d, d))
+    between[problem.inner] = off
+    to_u, to_v = problem.jacobians(problem.residuals(poses))
+    mixed = to_u @ between @ np.swapaxes(to_v, 1, 2)
+    spread = to_u @ out[problem.u] @ np.swapaxes(to_u, 1, 2) + to_v @ out[problem.v] @ np.swapaxes(to_v, 1, 2)
+    spread += mixed + np.swapaxes(mixed, 1, 2)
+    used = trust * np.einsum("eij,eji->e", problem.information, spread)
+    return Marginals(out, np.clip(d - used, 0.0, d))
+
+
+def variance_factors(
+    squares: Array, redundancy: Array, trust: Array, kinds: NDArray[np.int64], before: Array, prior: float
+) -> tuple[Array, Array]:
+    """How many times larger the errors of each kind of edge are (squared) than `before` says, and the freedom behind.
+
+    Helmert's estimation of variance components with `prior` degrees of freedom at 1. `squares`, `redundancy` and
+    `trust` have shape (E,), `kinds` numbers the kind of each edge, `before` has a factor for each kind. What edges
+    that are not trusted say does not count.
+    """
+    factors, freedom = np.ones_like(before), np.full_like(before, prior)
+    for kind in range(len(before)):
+        mine = (kinds == kind) & (trust > 0.5)
+        freedom[kind] = prior + float(redundancy[mine].sum())
+        factors[kind] = (prior + float(squares[mine].sum()) * before[kind]) / freedom[kind]
+    return factors, freedom
+
+
+def widening(freedom: float) -> float:
+    """Factor on a covariance whose scale was estimated with so many degrees of freedom: F against chi^2 at 95 %."""
+    return float(3.0 * f_distribution.ppf(0.95, 3, freedom) / chi2.ppf(0.95, 3))

@@ -1,0 +1,215 @@
+"""Bend chunks so that the frames they share, and the revisits, agree: a graph of nodes within chunks (paper A.1 speaks
+of anchors every 50 frames).
+
+The graph of chunks (`pose_graph`) decides which edges are believed. Here every chunk is cut into nodes (`chunk_nodes`);
+neighbouring nodes are tied as stiffly as the overlaps show that chunks are, nodes of two chunks by the frames that both
+hold, and loops hold the nodes of the frames that they were found at. The same solver places all nodes; their mean
+places the chunk, and what is left is the chunk's bend.
+
+Measured: on 18 simulated videos (seeds 101 and up) the ATE falls by 16 % against rigid chunks (geometric mean; by 28 %
+at best, one grows by 7 %); on held-out seeds 1 to 8 calm falls from 0.040 to 0.033 m, loop from 0.065 to 0.056, kidnap
+from 0.059 to 0.055, sparse from 0.062 to 0.049. redkitchen with every chunk's scale thrown away: 0.0274 to 0.0263 m;
+with metric chunks, whose overlaps show next to no bending, 0.0246 to 0.0252 m (SE(3)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.graph.chunk_nodes import (
+    ChunkNodes,
+    FrameRelations,
+    NodeSettings,
+    Tie,
+    measured_walk,
+    relate_frames,
+    ties_of,
+    walk_covariance,
+)
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of
+from list3r.association.graph.solver import GraphProblem, stack, take
+from list3r.memory.bends import Bend
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge, FrameSamples
+
+Array = NDArray[np.float64]
+
+_NOTHING = 1e9
+"""Variance factor of edges that are not believed, so that what hangs on them alone stays put."""
+_STEPS = 10
+"""Most steps of the solution; it starts near."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """What the graph is made of."""
+
+    nodes: dict[int, ChunkNodes]
+    """By chunk id."""
+    relations: list[tuple[Edge, FrameRelations]]
+    """Of adjacent edges that are believed."""
+
+
+def bend_chunks(
+    read_samples: Callable[[int], FrameSamples],
+    graph: GraphResult,
+    rigid: Collection[int],
+    metric: bool,
+    settings: NodeSettings | None = None,
+    weights: GraphSettings | None = None,
+) -> tuple[GraphResult, dict[int, Bend]]:
+    """The graph with every chunk where its nodes are on average, and the bend of each chunk.
+
+    The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given); chunks
+    without posed frames have no bend. Samples are read chunk by chunk in order, two at a time are held.
+    """
+    chosen = settings or NodeSettings()
+    known = graph.S_graph_chunk
+    believed = [e for e in graph.edges if e.u in known and e.v in known and (e.accepted or "trust" in e.scores)]
+    if not chosen.enabled or not believed:
+        return graph, {}
+    pieces = pieces_of(read_samples, sorted(graph.S_graph_chunk), believed, rigid, chosen)
+    first, count = {}, 0
+    for chunk, nodes in pieces.nodes.items():
+        first[chunk], count = count, count + len(nodes.at)
+    start = [graph.S_graph_chunk[c] for c, nodes in pieces.nodes.items() for _ in nodes.at]
+    problem = _problem(pieces, believed, first, count, graph.components, metric, chosen, weights or GraphSettings())
+    placed = problem.solve(stack(start), np.ones(len(problem.u)), _STEPS)
+    return _settled(placed, pieces.nodes, first, graph, rigid)
+
+
+def pieces_of(
+    read_samples: Callable[[int], FrameSamples],
+    ids: Sequence[int],
+    believed: Sequence[Edge],
+    rigid: Collection[int],
+    settings: NodeSettings,
+) -> Pieces:
+    """Nodes of all chunks and relations of adjacent ones, in one pass over the samples."""
+    to = {e.v: e for e in believed if e.kind == "adjacent" and e.accepted}
+    nodes: dict[int, ChunkNodes] = {}
+    relations = []
+    before: tuple[int, FrameSamples] | None = None
+    for chunk in ids:
+        samples = read_samples(chunk)
+        samples = _known_poses(samples)
+        length = 0 if chunk in rigid else settings.frames
+        if len(samples.camera_frames) == 0:
+            nodes[chunk] = _one_node()
+        else:
+            nodes[chunk] = ChunkNodes.of(samples, length)
+        edge = to.get(chunk)
+        if edge is not None:
+            there = before[1] if before is not None and before[0] == edge.u else _known_poses(read_samples(edge.u))
+            relations.append((edge, relate_frames(there, samples, edge, nodes[edge.u])))
+        before = (chunk, samples)
+    return Pieces(nodes, relations)
+
+
+def _problem(
+    pieces: Pieces,
+    believed: Sequence[Edge],
+    first: Mapping[int, int],
+    count: int,
+    components: Mapping[int, int],
+    metric: bool,
+    settings: NodeSettings,
+    weights: GraphSettings,
+) -> GraphProblem:
+    """All nodes and all that ties them."""
+    ends: list[tuple[int, int]] = []
+    between: list[Sim3] = []
+    covariances: list[Array] = []
+
+    def add(u: int, v: int, S_v_u: Sim3, covariance: Array) -> None:
+        ends.append((u, v))
+        between.append(S_v_u)
+        covariances.append(covariance)
+
+    walk = settings.measured_share * measured_walk([r for _, r in pieces.relations])
+    walk = np.maximum(walk + np.array([settings.shift_walk, settings.turn_walk, 0.0]) ** 2, settings.least_walk**2)
+    for chunk, nodes in pieces.nodes.items():
+        for k in range(len(nodes.at) - 1):
+            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), walk_covariance(nodes, k, walk))
+    tied = set()
+    for edge, relations in pieces.relations:
+        ties = ties_of(relations, edge, pieces.nodes[edge.u], pieces.nodes[edge.v], settings)
+        for tie in ties:
+            add(first[edge.u] + tie.u, first[edge.v] + tie.v, tie.S_v_u, tie.covariance)
+        if ties:
+            tied.add((edge.u, edge.v))
+    size = 6 if metric else 7
+    information = inverses(np.array(covariances).reshape(-1, 7, 7)[:, :size, :size])
+    rest = [e for e in believed if e.kind != "adjacent" or (e.u, e.v) not in tied]
+    for edge in rest:
+        tie = _whole(edge, pieces.nodes)
+        add(first[edge.u] + tie.u, first[edge.v] + tie.v, tie.S_v_u, tie.covariance)
+    if rest:
+        factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
+        factors[[not e.accepted for e in rest]] *= _NOTHING
+        stiff = replace(weights, weights=replace(weights.weights, bend=0.0))  # the nodes bend instead
+        information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
+    fixed = np.zeros(count, bool)
+    fixed[[first[c] for c in first if components[c] == c]] = True
+    u, v = np.array(ends).T
+    return GraphProblem.build(u, v, stack(between), information, fixed)
+
+
+def _whole(edge: Edge, nodes: Mapping[int, ChunkNodes]) -> Tie:
+    """An edge that holds the nodes of the frames that it was found at; the ends that face each other where it does not
+    say (its information is that of the edge)."""
+    u, v = nodes[edge.u], nodes[edge.v]
+    if edge.frames is not None:
+        return Tie(u.nearest(edge.frames[0]), v.nearest(edge.frames[1]), edge.S_v_u, np.eye(7))
+    return Tie(len(u.at) - 1, 0, edge.S_v_u, np.eye(7))
+
+
+def _settled(
+    placed: Sim3,
+    nodes: Mapping[int, ChunkNodes],
+    first: Mapping[int, int],
+    graph: GraphResult,
+    rigid: Collection[int],
+) -> tuple[GraphResult, dict[int, Bend]]:
+    """Chunks at the mean of their nodes, moved so that the first chunk of each component stays, and their bends."""
+    poses, bends = {}, {}
+    for chunk, mine in nodes.items():
+        S = graph.S_graph_chunk[chunk]
+        here = take(placed, np.arange(first[chunk], first[chunk] + len(mine.at)))
+        x = (repeated(S.inverse(), len(mine.at)) @ here).log()
+        poses[chunk] = S @ Sim3.exp(np.asarray(mine.count @ x / mine.count.sum()))
+        if len(mine.at) > 1 and chunk not in rigid:
+            bends[chunk] = Bend(mine.at, (repeated(poses[chunk].inverse(), len(mine.at)) @ here).log())
+    back = {c: graph.S_graph_chunk[c] @ poses[c].inverse() for c in poses if graph.components[c] == c}
+    moved = {c: back[graph.components[c]] @ S for c, S in poses.items()}
+    return replace(graph, S_graph_chunk=moved), bends
+
+
+def inverses(covariance: Array) -> Array:
+    """Inverses of symmetric matrices, symmetric. Shape (E, D, D)."""
+    inverse = np.linalg.inv(covariance)
+    return np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2.0)
+
+
+def repeated(S: Sim3, count: int) -> Sim3:
+    """The same similarity many times over."""
+    return Sim3(np.full(count, float(S.scale)), np.tile(S.rotation, (count, 1, 1)), np.tile(S.translation, (count, 1)))
+
+
+def _known_poses(samples: FrameSamples) -> FrameSamples:
+    """Without frames whose pose is not finite."""
+    good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
+    if good.all():
+        return samples
+    return replace(samples, camera_frames=samples.camera_frames[good], T_chunk_cam=samples.T_chunk_cam[good])
+
+
+def _one_node() -> ChunkNodes:
+    """A chunk that shows nothing."""
+    zero = np.zeros(1)
+    none = np.zeros(1, np.int64)
+    return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64))

@@ -1,0 +1,262 @@
+"""The graph of chunks: all edges together decide where every chunk lies (paper A.4).
+
+Minimises the sum of e^T W e, e = log(S_v_u^-1 S_v_world S_world_u), by Levenberg-Marquardt (`graph_solver`), W from
+the covariance of each edge and the bending of chunks (`edge_information`); false loops are switched off (`loop_trust`),
+and every chunk gets a covariance (`marginals`). The start is always the chain of adjacent edges from each component's
+first chunk, so the result does not depend on the order in which chunks arrived.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.graph.edge_information import WeightSettings, information, own_shapes, plain_information
+from list3r.association.graph.loop_trust import Believed, Tree, TrustSettings, judge
+from list3r.association.graph.marginals import widening
+from list3r.association.graph.solver import GraphProblem, adjoint, stack, take, unstack
+from list3r.memory.errors import DegenerateError
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GraphSettings:
+    """How the graph is weighted and solved. Without `weighted` and `robust`: plain least squares, as VGGT-Long."""
+
+    weighted: bool = True
+    """Edges count by their information; else all the same."""
+    robust: bool = True
+    """Edges that the rest contradicts are switched off."""
+    weights: WeightSettings = field(default_factory=WeightSettings)
+    trust: TrustSettings = field(default_factory=TrustSettings)
+    least_weight: float = 1e-5
+    """Loops of less information than this share of the strongest edge's are dropped (deviations 300 times larger)."""
+    most_moved: int = 150
+    """Chunks near a new loop that move before the end of the session, where the way that it closes is no longer."""
+
+
+@dataclass(frozen=True)
+class GraphResult:
+    """Where the chunks are."""
+
+    S_graph_chunk: Mapping[int, Sim3]
+    """By chunk id; chunks of different components share no frame."""
+    components: Mapping[int, int]
+    """By chunk id: the smallest chunk id of its component."""
+    edges: tuple[Edge, ...]
+    """The edges as given, with `weight`, and loop edges that the rest contradicts no longer `accepted`."""
+    residual: float
+    """RMS of the trusted edges' errors in their own standard deviations, 1 where they keep what they state."""
+    covariances: Mapping[int, Array]
+    """By chunk id, of x in S_true = S_graph_chunk exp(x), x = (rho, omega, sigma), relative to the first chunk of the
+    component, which has 0. Shape (7, 7) each."""
+
+
+def optimize(
+    chunk_ids: Sequence[int],
+    edges: Sequence[Edge],
+    initial: Mapping[int, Sim3],
+    metric: bool,
+    settings: GraphSettings | None = None,
+) -> GraphResult:
+    """Place all chunks. The first chunk of each component stays at `initial`, or at the origin where that is silent.
+
+    Edges that geometry did not accept are passed through; those that an earlier call rejected are tried again. Raises
+    `DegenerateError` for an edge that holds a number that is not finite.
+    """
+    chosen = settings or GraphSettings()
+    ids = sorted(chunk_ids)
+    known = set(ids)
+    used = [k for k, e in enumerate(edges) if e.u in known and e.v in known and (e.accepted or "trust" in e.scores)]
+    used.sort(key=lambda k: (edges[k].u, edges[k].v, edges[k].kind, edges[k].frames or (-1, -1), k))
+    active = [edges[k] for k in used]
+    check(active)
+    component = _components(ids, active)
+    out = list(edges)
+    weights = information_of(active, metric, chosen)
+    weak = _weak(active, ids, weights, chosen)
+    weights = np.delete(weights, weak, axis=0)
+    for n in reversed(weak):
+        scores = {**active[n].scores, "trust": 0.0}
+        reason = f"too uncertain beside the other edges (geometry alone: {active[n].reason})"
+        reason = active[n].reason if "trust" in active[n].scores and not active[n].accepted else reason
+        out[used[n]] = replace(active[n], weight=0.0, accepted=False, scores=scores, reason=reason)
+        del used[n], active[n]
+    start, tree = _chain(ids, active, component, initial)
+    if not active:
+        return GraphResult(start, component, tuple(edges), 0.0, dict.fromkeys(ids, np.zeros((7, 7))))
+    row = {chunk: k for k, chunk in enumerate(ids)}
+    problem = problem_of(active, row, np.array([component[chunk] == chunk for chunk in ids]), weights)
+    loop = np.array([e.kind != "adjacent" for e in active])
+    found = judge(problem, stack([start[k] for k in ids]), tree, loop, chosen.robust, chosen.trust)
+    strength = _strengths(problem.information / found.factors[loop.astype(np.int64), None, None])
+    for n, k in enumerate(used):
+        out[k] = _judged(edges[k], float(strength[n]), float(found.squares[n]), found, n)
+    count = max(float(found.trust @ found.marginals.redundancy), 1e-9)
+    residual = float(np.sqrt(found.trust @ found.squares / max(count, 1.0)))
+    own = own_shapes(active, row, len(ids), chosen.weights)
+    first = np.array([row[component[chunk]] for chunk in ids])
+    covariances = dict(zip(ids, _covariances(found, own, first), strict=True))
+    return GraphResult(unstack(found.poses, ids), component, tuple(out), residual, covariances)
+
+
+def problem_of(
+    active: Sequence[Edge], row: Mapping[int, int], fixed: NDArray[np.bool_], weights: Array
+) -> GraphProblem:
+    """The graph of some edges with information `weights` (E, D, D); `row` numbers the chunks."""
+    u, v = np.array([row[e.u] for e in active]), np.array([row[e.v] for e in active])
+    return GraphProblem.build(u, v, stack([e.S_v_u for e in active]), weights, fixed)
+
+
+def information_of(edges: Sequence[Edge], metric: bool, settings: GraphSettings) -> Array:
+    """What each edge has to say. Shape (E, D, D)."""
+    return (information if settings.weighted else plain_information)(edges, metric, settings.weights)
+
+
+def check(edges: Sequence[Edge]) -> None:
+    """Raises `DegenerateError` for an edge that holds a number that is not finite, by its name."""
+    if not edges:
+        return
+    S = stack([e.S_v_u for e in edges])
+    confidence = np.array([e.confidence for e in edges])
+    each = [S.scale[:, None], S.rotation.reshape(-1, 9), S.translation, confidence[:, None]]
+    finite = np.asarray(np.isfinite(np.hstack(each)).all(axis=1))
+    stated = [k for k, e in enumerate(edges) if e.covariance is not None]
+    if stated:
+        finite[stated] &= np.isfinite(np.array([edges[k].covariance for k in stated])).all(axis=(1, 2))
+    if not finite.all():
+        e = edges[int(np.argmin(finite))]
+        raise DegenerateError(f"the edge between chunks {e.u} and {e.v} ({e.kind}) holds a number not finite")
+
+
+def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array:
+    """What is stated of each chunk: its place in the graph, its own bending, and that of the first chunk, `first` (K,),
+    which moves all others. Shape (K, 7, 7)."""
+    size = found.marginals.covariance.shape[1]
+    own = own * found.factors[0]
+    from_first = adjoint(found.poses.inverse() @ take(found.poses, first))
+    out = own + from_first @ own[first] @ np.swapaxes(from_first, 1, 2)
+    out[:, size:], out[:, :, size:] = 0.0, 0.0
+    out[:, :size, :size] += found.marginals.covariance
+    out[first] = 0.0
+    return np.asarray(out * widening(float(found.freedom.sum() - found.freedom.min())))
+
+
+def _strengths(information: Array) -> Array:
+    """Information of each edge on the turn (which has no unit), by geometric mean, the strongest 1. Shape (E,)."""
+    size = np.cbrt(np.maximum(np.linalg.det(information[:, 3:6, 3:6]), 0.0))
+    return np.asarray(size / max(float(size.max()), 1e-300))
+
+
+def _weak(edges: Sequence[Edge], ids: Sequence[int], weights: Array, settings: GraphSettings) -> list[int]:
+    """Numbers of the loops that say next to nothing; none where the graph would fall apart without them."""
+    if not settings.weighted or not any(e.kind != "adjacent" for e in edges):
+        return []
+    strength = _strengths(weights)
+    weak = [k for k, e in enumerate(edges) if e.kind != "adjacent" and strength[k] < settings.least_weight]
+    gone = set(weak)
+    rest = [e for k, e in enumerate(edges) if k not in gone]
+    return weak if not weak or _components(ids, rest) == _components(ids, edges) else []
+
+
+def _components(ids: Sequence[int], edges: Sequence[Edge]) -> dict[int, int]:
+    """The smallest chunk id that each chunk is connected to."""
+    neighbours = _neighbours(edges)
+    component: dict[int, int] = {}
+    for root in ids:
+        queue = deque([root] if root not in component else [])
+        while queue:
+            chunk = queue.popleft()
+            if chunk not in component:
+                component[chunk] = root
+                queue.extend(other for other, _ in neighbours.get(chunk, []))
+    return component
+
+
+def _chain(
+    ids: Sequence[int], edges: Sequence[Edge], component: Mapping[int, int], initial: Mapping[int, Sim3]
+) -> tuple[dict[int, Sim3], Tree]:
+    """Poses along a spanning tree that prefers adjacent edges, then confident ones (Prim's algorithm, few edges)."""
+    neighbours = _neighbours(edges)
+    row = {chunk: k for k, chunk in enumerate(ids)}
+    parent, by, order = np.arange(len(ids)), np.full(len(ids), -1), []
+    placed: dict[int, Sim3] = {}
+
+    def place(there: int, here: int, k: int) -> None:
+        placed[there] = across(placed[here], edges[k], here)
+        parent[row[there]], by[row[there]] = row[here], k
+        order.append(row[there])
+
+    for root in ids:
+        if component[root] != root:
+            continue
+        placed[root] = initial.get(root, Sim3.identity())
+        order.append(row[root])
+        queue = deque([root])
+        waiting: list[int] = []
+        while queue or waiting:
+            while queue:
+                chunk = queue.popleft()
+                for other, k in neighbours.get(chunk, []):
+                    if other in placed:
+                        continue
+                    if edges[k].kind != "adjacent":
+                        waiting.append(k)
+                        continue
+                    place(other, chunk, k)
+                    queue.append(other)
+            waiting = [k for k in waiting if (edges[k].u in placed) != (edges[k].v in placed)]
+            if waiting:
+                best = max(waiting, key=lambda k: (edges[k].confidence, -edges[k].u, -edges[k].v))
+                here, there = (edges[best].u, edges[best].v)
+                here, there = (here, there) if here in placed else (there, here)
+                place(there, here, best)
+                queue.append(there)
+    return placed, Tree(parent, by, np.array(order, np.int64))
+
+
+def chain_poses(ids: Sequence[int], edges: Sequence[Edge]) -> tuple[dict[int, Sim3], dict[int, int]]:
+    """Poses of chunks along a spanning tree of the edges, from the first of each component, and the components."""
+    component = _components(ids, edges)
+    return _chain(ids, edges, component, {})[0], component
+
+
+def across(S_world_here: Sim3, edge: Edge, here: int) -> Sim3:
+    """Pose of the chunk at the other end of an edge."""
+    S_here_there = edge.S_v_u.inverse() if here == edge.u else edge.S_v_u
+    return S_world_here @ S_here_there
+
+
+def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
+    """By chunk id: (other chunk, number of the edge)."""
+    out: dict[int, list[tuple[int, int]]] = {}
+    for k, edge in enumerate(edges):
+        out.setdefault(edge.u, []).append((edge.v, k))
+        out.setdefault(edge.v, []).append((edge.u, k))
+    return out
+
+
+def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int) -> Edge:
+    """The edge with its weight in the graph, and what the graph thinks of it."""
+    deviations = float(np.sqrt(square / 3.0))
+    trusted = bool(found.trust[n] > 0.5)
+    trust = float((found.limit[n] / (square + found.limit[n])) ** 2)
+    factor = float(found.factors[int(edge.kind != "adjacent")])
+    scores = {**edge.scores, "trust": trust, "graph_residual": deviations, "variance_factor": factor}
+    if trusted:
+        return replace(edge, weight=strength, accepted=True, scores=scores)
+    already = "trust" in edge.scores and not edge.accepted
+    reason = contradicted(edge, deviations)
+    return replace(edge, weight=0.0, accepted=False, scores=scores, reason=edge.reason if already else reason)
+
+
+def contradicted(edge: Edge, deviations: float) -> str:
+    """Why a loop is not believed."""
+    return f"the rest of the graph contradicts it by {deviations:.1f} deviations (geometry alone: {edge.reason})"

@@ -1,0 +1,397 @@
+"""Align two sets of corresponding points: a robust similarity, and how far it can be trusted (paper 3.2, A.3, A.4).
+
+Both sides are noisy, so the fit is symmetric: the scale at which neither side is shrunk, with rotation and translation
+after Umeyama. Outliers are let go of in two steps: a start that up to about half of the frames being misplaced
+together does not spoil, then Tukey's biweight. The covariance is measured, not assumed: errors within a frame go
+together, so whole frames are left out in turn; a reconstruction bends slowly along a chunk, so whole thirds are too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from list3r.association.overlap.alignment_covariance import measure_uncertainty
+from list3r.memory.errors import DegenerateError
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge, FrameSamples
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """How point sets are aligned."""
+
+    least_pairs: int = 60
+    """Fewest pairs of points."""
+    least_groups: int = 1
+    """Fewest groups (shared frames)."""
+    start_pairs: int = 3000
+    """Pairs that the robust start works on; the fit itself uses all."""
+    start_iterations: int = 40
+    """Most rounds of re-weighting of the robust start."""
+    huber_quantile: float = 0.2
+    """Share of the residuals inside the quadratic part of the start's kernel: near to least absolute deviations, it
+    lets go of a third of the frames being misplaced together, where their median itself is spoilt."""
+    iterations: int = 20
+    """Most rounds of re-weighting of the fit."""
+    kernel: float = 4.0
+    """Residual beyond which a pair has no say (Tukey's biweight), in medians of the residuals: 6.2 standard deviations
+    of one coordinate where noise is Gaussian, which gives up 4 % of the efficiency of least squares."""
+    residual_scale: float = 0.02
+    """Residual at which a pair counts 1/e in the confidence m_uv, as a share of the points' spread (sigma_r)."""
+    most_angle_sigma_rad: float = 0.35
+    """Standard deviation of an angle beyond which the rotation counts as open."""
+    most_scale_sigma: float = 0.35
+    """Standard deviation of the log scale beyond which the scale counts as open."""
+    bending_gain: float = 10.0
+    """Variance added for bending, in units of what the shared frames' own walk shows. In simulation 10 holds where the
+    bending goes together over a tenth to a third of the shared frames; what bends more slowly than the frames that
+    are shared cannot be seen in them and asks for more."""
+    cells: int = 10
+    """Cells across the spread of the points, for even coverage."""
+    least_inliers: float = 0.3
+    """Least share of the weight within three residual scales for an edge to be accepted."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A measured similarity between two sets of N corresponding points."""
+
+    S_v_u: Sim3
+    """Takes u's coordinates to v's; its scale is 1 for a rigid one."""
+    covariance: Array
+    """Of the tangent error x in S_true = S_v_u exp(x), x = (rho, omega, sigma) in u's units; row and column of sigma
+    are 0 for a rigid one. A Gaussian 95 % region of it holds the truth in about 95 % of cases. Shape (7, 7)."""
+    confidence: float
+    """m_uv of the paper (A.4), in [0, 1]."""
+    residual: Array
+    """Distance of each pair after alignment, v's units, infinite where a pair was not used. Shape (N,)."""
+    inside: NDArray[np.bool_]
+    """Pairs that agree with the fit. Shape (N,)."""
+    rms: float
+    """Root mean square residual of those, v's units."""
+    spread: float
+    """Diagonal of the box round the points of v, 5 % trimmed at either end, v's units."""
+    close: float
+    """Share of the weight that lies within three residual scales (sigma_r), in [0, 1]."""
+    groups: int
+    """Groups that had a say."""
+    bending: float
+    """How much more the thirds of the groups disagree than the groups' own scatter explains; 1 for no bending."""
+
+    @property
+    def inliers(self) -> int:
+        """Number of pairs that agree."""
+        return int(self.inside.sum())
+
+
+def align(
+    p_u: ArrayLike,
+    p_v: ArrayLike,
+    weight: ArrayLike,
+    group: ArrayLike,
+    metric: bool,
+    settings: AlignmentSettings | None = None,
+) -> Alignment:
+    """The similarity (rigid when `metric`) that takes `p_u` to `p_v`, with its covariance.
+
+    `p_u` and `p_v` have shape (N, 3); `weight` (N,) is >= 0, a pair of weight 0 or with a coordinate that is not finite
+    is left out; `group` (N,) int numbers the frame of each pair, in order of time. Raises `DegenerateError` for support
+    that does not determine the transform, naming what is wrong with it. Formulas: Umeyama 1991; Beaton and Tukey 1974;
+    Bell and McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples", 2002.
+    """
+    chosen = settings or AlignmentSettings()
+    every = _Pairs.build(p_u, p_v, weight, group)
+    pairs, used = _usable(every, chosen)
+    spread = _spread(pairs.v)
+    start = _robust_start(pairs.thinned(chosen.start_pairs), metric, spread, chosen)
+    S_v_u, trust, limit = _refine(pairs, start, metric, spread, chosen)
+    scale, back = float(S_v_u.scale), S_v_u.inverse().apply(pairs.v)
+    known = measure_uncertainty(
+        pairs.u, back, pairs.weight, trust, limit / scale, pairs.group, metric, chosen.bending_gain
+    )
+    _check_extent(pairs.u, back, pairs.weight * trust)
+    _check_determined(known.covariance, metric, chosen)
+    residual = np.full(len(every.u), np.inf)
+    residual[used] = pairs.residual(S_v_u)
+    sigma = chosen.residual_scale * spread
+    inside = residual < limit
+    return Alignment(
+        S_v_u=S_v_u,
+        covariance=known.covariance,
+        confidence=float((pairs.weight * np.exp(-residual[used] / sigma)).sum() / pairs.weight.sum()),
+        residual=residual,
+        inside=inside,
+        rms=float(np.sqrt(np.mean(residual[inside] ** 2))),
+        spread=spread,
+        close=float((pairs.weight * (residual[used] < 3 * sigma)).sum() / pairs.weight.sum()),
+        groups=known.groups,
+        bending=known.bending,
+    )
+
+
+def robust_start(
+    p_u: ArrayLike,
+    p_v: ArrayLike,
+    weight: ArrayLike,
+    group: ArrayLike,
+    metric: bool,
+    settings: AlignmentSettings | None = None,
+) -> Sim3:
+    """The transform that `align` starts from: by few of the pairs, not exact, but spoilt neither by scattered outliers
+    nor by up to about half of the frames being misplaced together. Raises `DegenerateError`."""
+    chosen = settings or AlignmentSettings()
+    pairs, _ = _usable(_Pairs.build(p_u, p_v, weight, group), chosen)
+    return _robust_start(pairs.thinned(chosen.start_pairs), metric, _spread(pairs.v), chosen)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Corresponding points, N of them."""
+
+    u: Array
+    v: Array
+    weight: Array
+    group: NDArray[np.int64]
+
+    @staticmethod
+    def build(p_u: ArrayLike, p_v: ArrayLike, weight: ArrayLike, group: ArrayLike) -> _Pairs:
+        u, v = np.asarray(p_u, np.float64), np.asarray(p_v, np.float64)
+        assert u.shape == v.shape == (len(u), 3)
+        w, g = np.asarray(weight, np.float64), np.asarray(group, np.int64)
+        assert w.shape == g.shape == (len(u),)
+        return _Pairs(u, v, w, g)
+
+    def __getitem__(self, rows: NDArray[np.generic]) -> _Pairs:
+        return _Pairs(self.u[rows], self.v[rows], self.weight[rows], self.group[rows])
+
+    def thinned(self, most: int) -> _Pairs:
+        """At most `most` pairs, evenly over the groups."""
+        if len(self.u) <= most:
+            return self
+        order = np.argsort(self.group, kind="stable")
+        return self[order[np.linspace(0, len(order) - 1, most).astype(np.int64)]]
+
+    def residual(self, S_v_u: Sim3) -> Array:
+        """Distances after alignment, v's units. Shape (N,)."""
+        off = S_v_u.apply(self.u) - self.v
+        return np.asarray(np.sqrt(np.einsum("ni,ni->n", off, off)))
+
+
+def _usable(every: _Pairs, settings: AlignmentSettings) -> tuple[_Pairs, NDArray[np.bool_]]:
+    """The pairs that can be used, and which they are. Raises `DegenerateError` when they are too few."""
+    finite = np.isfinite(every.u).all(axis=1) & np.isfinite(every.v).all(axis=1) & np.isfinite(every.weight)
+    used = finite & (every.weight > 0)
+    count, least = int(used.sum()), settings.least_pairs
+    if count < least:
+        of = f"of {len(every.u)} pairs of points only {count} can be used; at least {least} are needed"
+        if not finite.all() and int(finite.sum()) < least:
+            raise DegenerateError(f"{of} ({int((~finite).sum())} are not finite)")
+        if len(every.u) >= least:
+            raise DegenerateError(f"{of} (the weights of {int((finite & ~used).sum())} are zero)")
+        raise DegenerateError(f"{len(every.u)} pairs of points do not determine a transform; {least} are needed")
+    groups = len(np.unique(every.group[used]))
+    if groups < settings.least_groups:
+        raise DegenerateError(f"the pairs lie in {groups} frames; at least {settings.least_groups} are needed")
+    pairs = every[used]
+    for side in (pairs.u, pairs.v):
+        spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(side.T, aweights=pairs.weight)), 0.0))
+        if not spread[2] > 1e-9 * np.abs(side).max():
+            raise DegenerateError("the points have no extent: neither rotation nor scale can be told")
+        if spread[1] < 1e-4 * spread[2]:
+            raise DegenerateError("the points lie on one line and leave the rotation about it open")
+    return pairs, used
+
+
+def _spread(points: Array) -> float:
+    low, high = np.quantile(points, [0.05, 0.95], axis=0)
+    return max(float(np.linalg.norm(high - low)), 1e-300)
+
+
+# ---------------------------------------------------------------------------------------------- the fit
+
+
+def _fit(pairs: _Pairs, weight: Array, metric: bool, symmetric: bool) -> Sim3:
+    """Weighted Umeyama. The symmetric scale is the geometric mean of the least squares ones of both directions, the
+    maximum likelihood where both sides are equally noisy relative to their size (Deming regression); least squares
+    itself shrinks towards zero with the noise of u."""
+    w = weight / weight.sum()
+    mean_u, mean_v = w @ pairs.u, w @ pairs.v
+    du, dv = pairs.u - mean_u, pairs.v - mean_v
+    weighted = w[:, None] * dv
+    left, size, right = np.linalg.svd(weighted.T @ du)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = (left * sign) @ right
+    scale = 1.0
+    if not metric:
+        u2 = float(w @ np.einsum("ni,ni->n", du, du))
+        v2 = float(np.einsum("ni,ni->", weighted, dv))
+        scale = float(np.sqrt(v2 / u2)) if symmetric else max(float((size * sign).sum()) / u2, 1e-12)
+    return Sim3(np.asarray(scale), rotation, mean_v - scale * rotation @ mean_u)
+
+
+def _robust_start(pairs: _Pairs, metric: bool, spread: float, settings: AlignmentSettings) -> Sim3:
+    """The better of two starts: least absolute deviations over all pairs, and the best fit of one group alone."""
+    starts = [_least_absolute(pairs, metric, spread, settings), *_fits_of_groups(pairs, metric)]
+    residuals = [pairs.residual(S) for S in starts]
+    scale = max(min(float(np.median(r)) for r in residuals), 1e-12 * spread)
+    costs = [float((pairs.weight * r / (r + scale)).sum()) for r in residuals]
+    return starts[int(np.argmin(costs))]
+
+
+def _least_absolute(pairs: _Pairs, metric: bool, spread: float, settings: AlignmentSettings) -> Sim3:
+    S_v_u, corners = _fit(pairs, pairs.weight, metric, symmetric=False), _corners(pairs.u)
+    for _ in range(settings.start_iterations):
+        residual = pairs.residual(S_v_u)
+        limit = max(float(np.quantile(residual, settings.huber_quantile)), 1e-9 * spread)
+        trust = np.minimum(1.0, limit / np.maximum(residual, limit))
+        S_new = _fit(pairs, pairs.weight * trust, metric, symmetric=False)
+        moved = _moved(S_new, S_v_u, corners)
+        S_v_u = S_new
+        if moved < 1e-4 * spread:
+            break
+    return S_v_u
+
+
+def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
+    """Fits of single groups that hold enough, spread over all groups."""
+    values, counts = np.unique(pairs.group, return_counts=True)
+    values = values[counts >= 8]
+    if len(values) > most:
+        values = values[np.linspace(0, len(values) - 1, most).astype(np.int64)]
+    rows = (pairs[pairs.group == value] for value in values)
+    return [_fit(part, part.weight, metric, symmetric=True) for part in rows]
+
+
+def _corners(points: Array) -> Array:
+    """Corners of the points' box: what two transforms do there bounds what they do inside. Shape (8, 3)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return np.asarray(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high))
+
+
+def _moved(S_a: Sim3, S_b: Sim3, corners: Array) -> float:
+    """How far two transforms carry the points apart."""
+    return float(np.abs(S_a.apply(corners) - S_b.apply(corners)).max())
+
+
+def _refine(
+    pairs: _Pairs, start: Sim3, metric: bool, spread: float, settings: AlignmentSettings
+) -> tuple[Sim3, Array, float]:
+    """The fit under Tukey's biweight: transform, trust in each pair (N,), and the residual beyond which it is none."""
+    S_v_u, corners = start, _corners(pairs.u)
+    for k in range(settings.iterations):
+        residual = pairs.residual(S_v_u)
+        if k < settings.iterations // 2:
+            limit = max(settings.kernel * float(np.median(residual)), 1e-9 * spread)
+        trust = np.maximum(0.0, 1.0 - (residual / limit) ** 2) ** 2
+        S_new = _fit(pairs, pairs.weight * trust, metric, symmetric=True)
+        moved = _moved(S_new, S_v_u, corners)
+        S_v_u = S_new
+        if moved < 1e-7 * spread:
+            break
+    return S_v_u, trust, limit
+
+
+def _check_extent(p: Array, q: Array, weight: Array) -> None:
+    """Raise `DegenerateError` for a line that only noise makes thick: both sides do not agree on what makes it so."""
+    w = weight / weight.sum()
+    dp, dq = p - w @ p, q - w @ q
+    together = (w[:, None] * dp).T @ dq
+    _, across, along = np.linalg.eigvalsh((together + together.T) / 2.0)
+    noise = float(w @ ((dp - dq) ** 2).sum(axis=1)) / 3.0
+    if across < min(0.25 * noise, 0.01 * along):
+        raise DegenerateError("beside their noise the points lie on one line and leave the rotation about it open")
+
+
+def _check_determined(covariance: Array, metric: bool, settings: AlignmentSettings) -> None:
+    angle = float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[2], 0.0)))
+    if not angle < settings.most_angle_sigma_rad:
+        raise DegenerateError(
+            f"the points leave the rotation open (to {angle:.2g} rad): beside their noise they lie on a line or a spot"
+        )
+    scale = float(np.sqrt(max(covariance[6, 6], 0.0)))
+    if not metric and not scale < settings.most_scale_sigma:
+        raise DegenerateError(
+            f"the points leave the scale open (to {scale:.0%}): they have no extent beside their noise"
+        )
+
+
+# ---------------------------------------------------------------------------------------------- shared frames
+
+
+def align_overlap(
+    u: FrameSamples,
+    v: FrameSamples,
+    u_id: int,
+    v_id: int,
+    metric: bool,
+    settings: AlignmentSettings | None = None,
+) -> Edge:
+    """The edge between two chunks that share frames, by all points of them; a rigid one when `metric`.
+
+    Raises `DegenerateError` when the shared points do not determine it.
+    """
+    chosen = settings or AlignmentSettings()
+    pick_u, pick_v = _shared(u, v)
+    if len(pick_u) < chosen.least_pairs:
+        raise DegenerateError(
+            f"chunks {u_id} and {v_id} share {len(pick_u)} points; at least {chosen.least_pairs} are needed"
+        )
+    p_v = v.points[pick_v].astype(np.float64)
+    weight = u.confidence[pick_u].astype(np.float64) * v.confidence[pick_v]
+    weight *= coverage(p_v, chosen.cells)
+    found = align(u.points[pick_u], p_v, weight, u.frame[pick_u], metric, chosen)
+    accepted = found.close >= chosen.least_inliers
+    frames = len(np.unique(u.frame[pick_u]))
+    fit = f"{found.inliers} of {len(pick_u)} shared points of {frames} frames agree to {found.rms:.4f}"
+    outside = f"only {found.close:.0%} of the weight lies within {3 * chosen.residual_scale * found.spread:.3f}"
+    return Edge(
+        u=u_id,
+        v=v_id,
+        kind="adjacent",
+        S_v_u=found.S_v_u,
+        confidence=found.confidence,
+        weight=found.confidence,
+        inliers=found.inliers,
+        residual_m=found.rms,
+        accepted=accepted,
+        reason=fit if accepted else f"{fit}; {outside}",
+        scores={
+            "pairs": float(len(pick_u)),
+            "spread": found.spread,
+            "close": found.close,
+            "shared_frames": float(frames),
+        },
+        covariance=found.covariance,
+    )
+
+
+def _shared(u: FrameSamples, v: FrameSamples) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Positions in u and v of the samples at the same pixel of the same frame."""
+    key_u = (u.frame << np.int64(32)) + u.pixel
+    key_v = (v.frame << np.int64(32)) + v.pixel
+    _, pick_u, pick_v = np.intersect1d(key_u, key_v, assume_unique=True, return_indices=True)
+    return pick_u, pick_v
+
+
+def coverage(points: Array, cells: int) -> Array:
+    """Weights (N,) that fall with the root of the number of points in a cell, `cells` of them across the spread."""
+    cell = np.floor(points / (_spread(points) / cells)).astype(np.int64)
+    _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / np.sqrt(count[which.ravel()]))
+
+
+def coverage_rank(points: Array, weight: Array, cells: int) -> NDArray[np.int64]:
+    """Place of each point in its cell, the heaviest first, `cells` of them across the spread. Taking points in order of
+    it gives each cell a like share. Shape (N,)."""
+    cell = np.floor((points - points.min(axis=0)) / (_spread(points) / cells)).astype(np.int64)
+    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    order = np.lexsort((-weight, key))
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    rank = np.empty(len(points), np.int64)
+    rank[order] = np.arange(len(points)) - np.repeat(starts, np.diff([*starts, len(points)]))
+    return rank

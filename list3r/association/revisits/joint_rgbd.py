@@ -1,0 +1,93 @@
+"""Joint windows of RGB-D videos: the frames of both places are read again and reconstructed together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from list3r.frames.base import Camera, Frame, FrameSource, guessed_camera
+from list3r.frames.options import SourceOptions
+from list3r.frames.source import open_source
+from list3r.memory.errors import TrackingError
+from list3r.memory.records import JointWindow, Session
+from list3r.reconstruction.base import Reconstruction, Reconstructor
+from list3r.reconstruction.keyframe_record import frame_samples
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
+
+
+class SessionStore(Protocol):
+    """What of the memory is read here."""
+
+    def sessions(self) -> list[Session]: ...
+
+
+class RgbdJointReconstructor:
+    """A `JointReconstructor` that reads the sessions' sources, opened when a window is first asked for.
+
+    `options` are those that each session was built with, by session id; the defaults where it is silent.
+    """
+
+    def __init__(
+        self,
+        store: SessionStore,
+        options: Mapping[int, SourceOptions] | None = None,
+        reconstructor: Reconstructor | None = None,
+    ) -> None:
+        self._store = store
+        self._options = dict(options or {})
+        self._reconstructor = reconstructor or RgbdReconstructor(poses="estimate")
+        self._sources: dict[int, FrameSource] = {}
+
+    def __call__(
+        self, u_session: int, u_frames: Sequence[int], v_session: int, v_frames: Sequence[int]
+    ) -> JointWindow | None:
+        """The window of frames (Frame.index) of two sessions; None when its two sides cannot be related.
+
+        Raises `SourceError` when a session's source is no longer there.
+        """
+        u, v = self._read(u_session, u_frames), self._read(v_session, v_frames)
+        camera = self._camera(u_session)
+        if camera != self._camera(v_session) or not u or not v:
+            return None
+        try:
+            made = self._reconstructor([*u, *v], camera)
+        except TrackingError:
+            return None
+        one, two = _part(made, slice(0, len(u))), _part(made, slice(len(u), None))
+        if min(int(one.posed.sum()), int(two.posed.sum())) < 2:
+            return None
+        return JointWindow(frame_samples(one), frame_samples(two), made.scale_kind)
+
+    def _camera(self, session_id: int) -> Camera:
+        info = self._source(session_id).info
+        return info.camera or guessed_camera(info)
+
+    def _source(self, session_id: int) -> FrameSource:
+        if session_id not in self._sources:
+            path = next(s.source for s in self._store.sessions() if s.session_id == session_id)
+            self._sources[session_id] = open_source(path, self._options.get(session_id, SourceOptions()))
+        return self._sources[session_id]
+
+    def _read(self, session_id: int, indices: Sequence[int]) -> list[Frame]:
+        source = self._source(session_id)
+        wanted = sorted({source.position(int(i)) for i in indices})
+        if not wanted:
+            return []
+        read = source.read(wanted[0], wanted[-1] + 1)
+        return [f for f in read if isinstance(f, Frame) and f.index in set(indices)]
+
+
+def _part(made: Reconstruction, which: slice) -> Reconstruction:
+    """Some of the frames."""
+    return replace(
+        made,
+        frame_indices=made.frame_indices[which],
+        posed=made.posed[which],
+        T_chunk_cam=made.T_chunk_cam[which],
+        depth=made.depth[which],
+        confidence=made.confidence[which],
+        keyframes=np.zeros(0, np.int64),
+    )

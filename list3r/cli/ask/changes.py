@@ -1,0 +1,78 @@
+"""query changes: what sessions have changed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+
+
+def changes(
+    memory: MemoryArgument,
+    since: Annotated[
+        int | None, typer.Option("--since", metavar="SESSION", help="Only what changed after this session.")
+    ] = None,
+    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also what was found where it was.")] = False,
+    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only changes at least this sure.")] = 0.0,
+    json: JsonOption = False,
+) -> None:
+    """The things that were moved, removed and added from one session to the next, with the frames that show it.
+
+    Example: list3r query changes house.l3r --since 1
+    """
+    from list3r.queries.changes import KINDS
+    from list3r.queries.changes import changes as find
+
+    with open_memory(memory) as scene:
+        found = find(scene.store, since, KINDS if seen_again else KINDS[:3], min_confidence)
+        if json:
+            print_json([_entry(c, scene.units) for c in found])
+            return
+        rows = [
+            [
+                c.event.session_id,
+                c.instance.id,
+                c.event.kind.replace("_", " "),
+                c.instance.label or c.instance.description,
+                _place(c.event.from_box),
+                _place(c.event.to_box),
+                c.score,
+                " ".join(str(frame) for _, frame in c.event.frames[:3]),
+                c.reason,
+            ]
+            for c in found
+        ]
+        print_table(rows, ["session", "id", "change", "what", "from", "to", "sure", "frames", "why"])
+
+
+def _place(box: Any) -> str:
+    return "" if box is None else ", ".join(f"{v:.2f}" for v in box.center)
+
+
+def _entry(changed: Any, units: str) -> dict[str, Any]:
+    from list3r.cli.ask.memory import instance_dict
+
+    event = changed.event
+    return {
+        "session": event.session_id,
+        "id": event.instance_id,
+        "kind": event.kind,
+        "from": _box(event.from_box),
+        "to": _box(event.to_box),
+        "distance": changed.distance_m,
+        "units": units,
+        "confidence": event.confidence,
+        "reason": event.reason,
+        "frames": [{"session": s, "frame": f} for s, f in event.frames],
+        "instance": instance_dict(changed.instance),
+    }
+
+
+def _box(box: Any) -> dict[str, Any] | None:
+    from list3r.memory.geometry import quat_wxyz_from_rotation
+
+    if box is None:
+        return None
+    return {"center": box.center, "size": box.size, "quat_wxyz": quat_wxyz_from_rotation(box.rotation)}

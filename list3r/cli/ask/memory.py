@@ -1,0 +1,211 @@
+"""info, list, show: what a memory holds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+    from list3r.memory.library.labels import DetectedLabel
+    from list3r.memory.records import Instance
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.command("info")(info)
+    app.command("list")(list_instances)
+    app.command("show")(show)
+
+
+def info(
+    memory: MemoryArgument,
+    loops: Annotated[
+        bool,
+        typer.Option(
+            "--loops", help="List every loop candidate: scores, verdict and reason; how surely chunks are placed."
+        ),
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Say what a memory is: sessions, frames, scale, gravity, instances, loops.
+
+    Example: list3r info house.l3r --loops
+    """
+    from list3r.cli.ask.loops import loop_report, print_loop_report
+
+    with open_memory(memory) as scene:
+        report = memory_report(scene)
+        chunks = loop_report(scene.store) if loops else {}
+        units = scene.units
+    if json:
+        print_json({**report, **chunks})
+        return
+    for key, value in report.items():
+        if key != "sessions":
+            print(f"{key.replace('_', ' '):20} {value}")
+    for session in report["sessions"]:
+        print(
+            f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}"
+        )
+    if loops:
+        print_loop_report(chunks, units)
+
+
+def memory_report(scene: SceneMemory) -> dict[str, Any]:
+    """The facts of a memory."""
+    store = scene.store
+    frames, chunks, edges = store.frames(), store.chunks(), store.edges()
+    states = {state: sum(f.state == state for f in frames) for state in ("posed", "lost", "bad")}
+    return {
+        "memory": str(scene.path),
+        "size_mb": round(scene.path.stat().st_size / 1e6, 2),
+        "created_by": store.get_value("created_by"),
+        "scale": store.get_value("scale_kind"),
+        "scale_source": store.get_value("scale_source"),
+        "units": scene.units,
+        "gravity": scene.gravity,
+        "frames": len(frames),
+        **states,
+        "chunks": len(chunks),
+        "components": len({c.component for c in chunks}),
+        "loops": sum(e.kind == "loop" and e.accepted for e in edges),
+        "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
+        "instances": len(store.instances(structure=False)),
+        "structure": len(store.instances(structure=True)),
+        "relations": len(store.relations()),
+        "aliases": len(store.aliases()),
+        "embedding_spaces": store.embedding_spaces(),
+        "sessions": [
+            {"id": s.session_id, "source": s.source, "frames": s.frame_count, "state": s.state}
+            for s in store.sessions()
+        ],
+    }
+
+
+def list_instances(
+    memory: MemoryArgument,
+    structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
+    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")] = 0.0,
+    at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the instances with their place and size.
+
+    Example: list3r list house.l3r --min-confidence 0.5
+    """
+    from list3r.memory.errors import OptionError
+
+    if not 0.0 <= min_confidence <= 1.0:
+        raise OptionError(f"--min-confidence {min_confidence:g} must lie between 0 and 1")
+    with open_memory(memory) as scene:
+        found = scene.instances(structure=None if structure else False)
+        if at is not None:
+            from list3r.memory.maintenance.history import world_at
+
+            found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
+        units = scene.units
+    kept = [i for i in found if i.confidence >= min_confidence]
+    if json:
+        print_json([instance_dict(i) for i in kept])
+        return
+    rows = [
+        [
+            i.id,
+            i.label or i.description,
+            _triple(i.center),
+            _triple(i.box.size),
+            i.confidence,
+            i.observations,
+            i.structure or ("dynamic" if i.dynamic else ""),
+            "" if i.state == "present" else i.state,
+        ]
+        for i in kept
+    ]
+    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind", "state"])
+
+
+def _give_or_take(sigma: float | None, units: str) -> str:
+    """How sure a position is, where the memory can tell."""
+    return "" if sigma is None else f", give or take {sigma:.2f} {units} against the start"
+
+
+def _triple(values: Any) -> str:
+    return " ".join(f"{v:6.2f}" for v in values)
+
+
+def show(
+    memory: MemoryArgument,
+    instance_id: Annotated[
+        int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
+    ],
+    json: JsonOption = False,
+) -> None:
+    """Show one instance: where, how big, when seen, its relations.
+
+    Example: list3r show house.l3r 12
+    """
+    from list3r.memory.library.labels import detected_labels, label_source
+
+    with open_memory(memory) as scene:
+        instance = scene.instance(instance_id)
+        relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
+        names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
+        aliases = [old for old, _ in scene.store.aliases().items() if scene.store.resolve(old) == instance.id]
+        track = scene.track(instance.id) if instance.dynamic else None
+        parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations(instance.id)]
+        units = scene.units
+        named = detected_labels(scene.store).get(instance.id)
+    if json:
+        related = [vars(r) for r in relations]
+        told = {"relations": related, "aliases": aliases, "observed_as": parts}
+        print_json({**instance_dict(instance, track), **label_source(instance, named), **told})
+        return
+    print(f"{instance.id}  {instance.label or instance.description}")
+    for key, value in (
+        ("center", f"{_triple(instance.center)} {units}{_give_or_take(instance.position_sigma_m, units)}"),
+        ("size", f"{_triple(instance.box.size)} {units}"),
+        (
+            "confidence",
+            f"{instance.confidence:.2f}, seen in {instance.observations} frames of {len(parts)} chunk instances",
+        ),
+        *(() if instance.label is None else (("named by", _named_by(instance, named)),)),
+        ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
+        ("aliases", ", ".join(map(str, aliases)) or "none"),
+        *(() if track is None else _track_lines(*track, units)),
+    ):
+        print(f"  {key:11} {value}")
+    for r in relations:
+        print(
+            f"  {names.get(r.subject, '?')} ({r.subject}) {r.predicate} {names.get(r.object, '?')} ({r.object})"
+            f"  confidence {r.confidence:.2f}, margin {r.margin:.3f} {units}"
+        )
+
+
+def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
+    who = "an operator" if named is None else f"{named.detector}, confidence {named.confidence:.2f}"
+    return f"{who}; it looks like {instance.description}"
+
+
+def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:
+    """What is told of a moving thing: when, how far, from where to where."""
+    if not len(times_s):
+        return [("moved", "seen moving; where it was is not known")]
+    way = sum(math.dist(a, b) for a, b in itertools.pairwise(places.tolist()))
+    return [
+        ("moved", f"{times_s[0]:.2f} s to {times_s[-1]:.2f} s, {way:.2f} {units} in {len(times_s)} frames"),
+        ("from", f"{_triple(places[0])} {units}"),
+        ("to", f"{_triple(places[-1])} {units}"),
+    ]
+
+
+def instance_dict(instance: Instance, track: tuple[Any, Any] | None = None) -> dict[str, Any]:
+    """An instance in the words of the scene JSON, with its track where it is given."""
+    from list3r.exporters.scene_json import instance_entry
+
+    return instance_entry(instance, track=track)

@@ -1,0 +1,137 @@
+"""What the query commands share: their options, and how answers are shown."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.ask.memory import instance_dict
+from list3r.cli.common import note, print_json, print_table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from list3r.api import SceneMemory
+    from list3r.memory.records import BestView, Relation
+    from list3r.queries.match import Match
+    from list3r.queries.relations import Relations
+    from list3r.queries.views.camera import Camera
+
+Count = Annotated[int, typer.Option("-k", help="How many at most.")]
+MinConfidence = Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")]
+Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
+Label = Annotated[str | None, typer.Option("--label", metavar="WORDS", help="Only what label or description bear.")]
+Color = Annotated[str | None, typer.Option("--color", help="Only things of this colour.")]
+MinSize = Annotated[float | None, typer.Option("--min-size", help="Longest edge at least this.")]
+MaxSize = Annotated[float | None, typer.Option("--max-size", help="Longest edge at most this.")]
+State = Annotated[
+    str | None, typer.Option("--state", help="present, moved, removed, added, unseen, any; else all but removed.")
+]
+Component = Annotated[int | None, typer.Option("--component", help="Only this part of a memory in parts.")]
+View = Annotated[int | None, typer.Option("--view", metavar="FRAME", help="What the camera of this frame sees.")]
+Time = Annotated[float | None, typer.Option("--time", metavar="S", help="The posed frame nearest to this second.")]
+Pose = Annotated[
+    str | None,
+    typer.Option("--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera put here and turned so (OpenCV axes)."),
+]
+SessionOption = Annotated[int | None, typer.Option("--session", help="The session of the frame or camera.")]
+MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera sees no further than this.")]
+
+
+def camera_from(
+    scene: SceneMemory, view: int | None, time: float | None, pose: str | None, session: int | None
+) -> Camera | None:
+    """The camera that the options name; None for none of them. Raises `OptionError`."""
+    from list3r.memory.errors import OptionError
+
+    if sum(option is not None for option in (view, time, pose)) > 1:
+        raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
+    if view is None and time is None and pose is None:
+        if session is not None:
+            raise OptionError(f"--session {session} goes with a camera: --view FRAME, --time S or --pose; leave it out")
+        return None
+    if pose is None:
+        return scene.camera(frame=view, time_s=time, session=session)
+    try:
+        values = [float(part) for part in pose.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 7 or not all(math.isfinite(v) for v in values):
+        raise OptionError(f"--pose {pose!r}: seven finite numbers with commas are needed, x,y,z and w,x,y,z")
+    return scene.camera(position=values[:3], quat_wxyz=values[3:], session=session)
+
+
+def match_dict(match: Match, units: str) -> dict[str, Any]:
+    """A match for machines."""
+    return {
+        "id": match.instance.id,
+        "score": match.score,
+        "distance": match.distance_m,
+        "center_distance": match.center_distance_m,
+        "units": units,
+        "reason": match.reason,
+        "view": view_dict(match.best_view),
+        "instance": instance_dict(match.instance),
+    }
+
+
+def view_dict(view: BestView | None) -> dict[str, Any] | None:
+    """A frame with a box in it, for machines."""
+    if view is None:
+        return None
+    return {"session": view.session_id, "frame": view.frame_index, "box_xyxy": list(view.box_xyxy)}
+
+
+def print_matches(matches: Sequence[Match], units: str, json: bool) -> None:
+    """Matches as a table, or as JSON; what is to be said of all of them goes to standard error."""
+    for line in getattr(matches, "notes", ()):
+        note(f"note: {line}")
+    if json:
+        print_json([match_dict(m, units) for m in matches])
+        return
+    placed = any(m.distance_m is not None or m.center_distance_m is not None for m in matches)
+    rows = [
+        [
+            m.instance.id,
+            m.instance.label or m.instance.description,
+            m.score,
+            *((_length(m.distance_m), _length(m.center_distance_m)) if placed else ()),
+            "" if m.best_view is None else m.best_view.frame_index,
+            m.reason,
+        ]
+        for m in matches
+    ]
+    distances = (f"surface ({units})", f"centre ({units})") if placed else ()
+    print_table(rows, ["id", "what", "score", *distances, "frame", "why"])
+
+
+def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
+    """Relations with what can be said of the question as a whole."""
+    names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
+    gravity, units = scene.gravity, scene.units
+    if json:
+        entries = [vars(r) for r in found]
+        head = {"gravity": gravity, "units": units, "state": found.state, "reason": found.reason}
+        print_json({**head, "relations": entries})
+        return
+    if found.state == "unknown":
+        print(f"unknown: {found.reason}")
+        return
+    rows = [
+        [r.subject, names[r.subject], r.predicate, r.object, _object(r, names), r.confidence, r.margin] for r in found
+    ]
+    print_table(rows, ["id", "subject", "predicate", "id", "object", "conf", f"margin ({units})"])
+    if found.reason:
+        note(f"note: {found.reason}")
+
+
+def _object(relation: Relation, names: dict[int, str]) -> str:
+    """The object, or both objects of `between`."""
+    other = getattr(relation, "other", None)
+    return names[relation.object] + ("" if other is None else f" and {other} {names[other]}")
+
+
+def _length(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"

@@ -1,0 +1,126 @@
+"""The demo: a simulated walk, its memory, questions, exports, and the score against the known truth."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from list3r.api import SceneMemory
+from list3r.cli.build.progress import report_lines, run_build
+from list3r.cli.common import open_memory, print_table
+from list3r.cli.measure.commands import score_rows
+from list3r.memory.errors import OptionError
+
+EXPORTS = (("json", "json"), ("usd", "usda"), ("plan", "png"), ("glb", "glb"), ("ply", "ply"), ("tum", "txt"))
+
+
+def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, quiet: bool) -> dict[str, Any]:
+    """Make `out/walk`, `out/rooms.l3r` and the exports beside it; what was found, for JSON."""
+    from list3r.pipeline.target import make_folder
+
+    _check_numbers(seed=seed, frames=frames, workers=workers)
+    make_folder(out)
+    walk, memory = out / "walk", out / "rooms.l3r"
+    _say(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
+    _render(walk, seed=seed, frames=frames, workers=workers, quiet=quiet)
+    _say(quiet, f"\n2. list3r build {walk} -m {memory} --poses estimate")
+    from list3r.pipeline.chunk import BuildSettings
+
+    settings = BuildSettings(poses="estimate")
+    report = run_build(walk, memory, quiet=quiet, settings=settings, workers=workers, resume=memory.exists())
+    _say(quiet, "\n".join(report_lines(memory, report)))
+    with open_memory(memory) as scene:
+        _ask(scene, memory, quiet)
+        written = _export(scene, out, quiet)
+        scores = _score(out, walk, quiet)
+    _say(quiet, f"\nThe picture to look at: {written['plan']}")
+    return {"memory": str(memory), "walk": str(walk), "build": report.as_dict(), "exports": written, "scores": scores}
+
+
+def _render(walk: Path, *, seed: int, frames: int | None, workers: int | None, quiet: bool) -> None:
+    from tqdm import tqdm
+
+    from list3r.pipeline.workers import default_workers
+    from list3r.simulation.dataset import WalkSettings, write_walk
+
+    settings = WalkSettings(seed=seed, frames=frames)
+    done = walk / "made.json"
+    made = {"seed": seed, "frames": frames}
+    if done.exists():
+        if json.loads(done.read_text(encoding="utf-8")) == made:
+            return
+        raise OptionError(f"{walk} holds another walk; name another folder with --out, or remove it")
+    if walk.exists():
+        _remove_unfinished(walk)
+    hidden = quiet or not sys.stderr.isatty()
+    with tqdm(unit="frame", desc="rendering", disable=hidden, file=sys.stderr) as bar:
+        write_walk(walk, settings, workers=workers or default_workers(), progress=lambda n: bar.update(n) and None)
+    done.write_text(json.dumps(made), encoding="utf-8")
+
+
+def _remove_unfinished(walk: Path) -> None:
+    """Take away what an interrupted demo left: only files and folders that the simulation writes."""
+    import shutil
+
+    for name in ("rgb", "depth", "ids"):
+        shutil.rmtree(walk / name, ignore_errors=True)
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "truth.json"):
+        (walk / name).unlink(missing_ok=True)
+
+
+def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
+    if quiet:
+        return
+    things = scene.instances()
+    names = {i.id: i.description for i in scene.instances(structure=None)}
+    print(f"\n3. list3r list {memory}")
+    print_table([[i.id, i.description, i.confidence] for i in things], ["id", "what", "conf"])
+    print(f"\n4. list3r query relations {memory} --predicate on")
+    rows = [[names[r.subject], "on", names[r.object], r.confidence] for r in scene.relations(predicate="on")]
+    print_table(rows, ["subject", "", "object", "conf"])
+    if not things:
+        return
+    first = min(things, key=lambda i: float(i.box.size.prod()))
+    print(f"\n5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {first.description})")
+    matches = scene.nearest(first.id, k=3)
+    print_table([[m.instance.id, m.instance.description, m.distance_m] for m in matches], ["id", "what", "surface (m)"])
+
+
+def _export(scene: SceneMemory, out: Path, quiet: bool) -> dict[str, str]:
+    _say(quiet, "\n6. exports")
+    written = {}
+    for name, suffix in EXPORTS:
+        path = out / f"rooms.{suffix}"
+        scene.export(name, path)
+        written[name] = str(path)
+        _say(quiet, f"   {name:5} {path}  {path.stat().st_size / 1e6:.2f} MB")
+    return written
+
+
+def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
+    """The truth of a simulated walk is known, so say how far the memory is from it."""
+    from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
+    from list3r.evaluation.trajectory import evaluate_trajectory, read_tum
+
+    truth, estimate = read_tum(walk / "groundtruth.txt"), read_tum(out / "rooms.txt")
+    errors = evaluate_trajectory(truth, estimate)
+    S_truth_scene = alignment_of(truth, estimate, with_scale=False)
+    scene = evaluate_scene(read_scene(out / "rooms.json"), read_scene(walk / "truth.json"), S_truth_scene)
+    _say(quiet, "\n7. against the known truth")
+    if not quiet:
+        print(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
+        print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
+    return {"trajectory": errors.as_dict(), "scene": scene}
+
+
+def _check_numbers(*, seed: int, frames: int | None, workers: int | None) -> None:
+    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("workers", workers, 1)):
+        if value is not None and value < least:
+            raise OptionError(f"--{name} {value}: at least {least} is needed")
+
+
+def _say(quiet: bool, text: str) -> None:
+    if not quiet:
+        print(text)

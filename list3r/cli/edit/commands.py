@@ -1,0 +1,176 @@
+"""merges, undo, merge, split, label, delete: what an operator puts right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+    from list3r.memory.maintenance.edits import EditReport
+
+IdArgument = Annotated[
+    int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
+]
+AuthorOption = Annotated[str | None, typer.Option("--author", help="Who says so; you, unless told.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.command("merges")(merges)
+    app.command("undo")(undo)
+    app.command("merge")(merge)
+    app.command("split")(split)
+    app.command("label")(label)
+    app.command("delete")(delete)
+
+
+def merges(
+    memory: MemoryArgument,
+    instance_id: Annotated[
+        int | None, typer.Argument(metavar="[ID]", help="Only what concerns this instance.", show_default=False)
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Show the merge log: every decision with its numbers, every edit with its author.
+
+    Example: list3r merges house.l3r 12
+    """
+    from list3r.memory.maintenance.merge_log import states
+
+    with open_memory(memory) as scene, scene.store.snapshot():
+        entries = scene.merges(instance_id)
+        edits = {e.entry: e for e in scene.store.edits()}
+        state = states(scene.store)
+    if json:
+        print_json(
+            [
+                {
+                    "entry": e.entry,
+                    "chunk": e.chunk_id,
+                    **vars(e.decision),
+                    "author": edits[e.entry].author if e.entry in edits else None,
+                    "created_at": edits[e.entry].created_at if e.entry in edits else None,
+                    "state": state.get(e.entry),
+                }
+                for e in entries
+            ]
+        )
+        return
+    rows = []
+    for e in entries:
+        d = e.decision
+        numbers = ", ".join(f"{k} {v:g}" for k, v in d.scores.items())
+        undone = " (undone)" if state.get(e.entry) == "undone" else ""
+        rows.append([e.entry, d.kind + undone, d.a, d.b, d.reason + (f" [{numbers}]" if numbers else "")])
+    print_table(rows, ["entry", "decision", "a", "b", "why"])
+
+
+def undo(
+    memory: MemoryArgument,
+    entry: Annotated[
+        int | None,
+        typer.Argument(
+            metavar="[ENTRY]", help="An entry of `list3r merges`; without it, the last edit.", show_default=False
+        ),
+    ] = None,
+    author: AuthorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Take back an edit, or a decision of the merge log; ids that had retired come back.
+
+    Example: list3r undo house.l3r 41
+    """
+    _carry_out(memory, lambda scene: scene.undo(entry, author=author), json)
+
+
+def merge(
+    memory: MemoryArgument,
+    a: Annotated[int, typer.Argument(metavar="A", help="An instance.", show_default=False)],
+    b: Annotated[int, typer.Argument(metavar="B", help="The same thing under another id.", show_default=False)],
+    author: AuthorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Say that two instances are one thing: the older id stays, the other resolves to it for ever.
+
+    Example: list3r merge house.l3r 12 31
+    """
+    _carry_out(memory, lambda scene: scene.merge(a, b, author=author), json)
+
+
+def split(
+    memory: MemoryArgument,
+    instance_id: IdArgument,
+    out: Annotated[
+        str | None,
+        typer.Option(
+            "--out",
+            metavar="CHUNK:LOCAL,...",
+            help="What leaves it, by chunk and local id (see `observed_as` of `list3r show --json`); "
+            "without it, where the evidence parts it best.",
+        ),
+    ] = None,
+    author: AuthorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Say that an instance is two things: the larger part keeps the id.
+
+    Example: list3r split house.l3r 12 --out 3:4,5:2
+    """
+    parts = None if out is None else _parse_parts(out)
+    _carry_out(memory, lambda scene: scene.split(instance_id, parts, author=author), json)
+
+
+def label(
+    memory: MemoryArgument,
+    instance_id: IdArgument,
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="Its name; '' takes it away.", show_default=False)],
+    author: AuthorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Name an instance; the name survives merges and later sessions.
+
+    Example: list3r label house.l3r 12 "my mug"
+    """
+    _carry_out(memory, lambda scene: scene.label(instance_id, text, author=author), json)
+
+
+def delete(
+    memory: MemoryArgument, instance_id: IdArgument, author: AuthorOption = None, json: JsonOption = False
+) -> None:
+    """Take an instance out of the memory, with all that is seen of it later; undo brings it back.
+
+    Example: list3r delete house.l3r 12
+    """
+    _carry_out(memory, lambda scene: scene.delete(instance_id, author=author), json)
+
+
+def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool) -> None:
+    from list3r.api import open as open_scene
+
+    with open_scene(path, writable=True) as scene:
+        report = verb(scene)
+    if json:
+        print_json(report.as_dict())
+        return
+    print(f"{report.text} (entry {report.entry})")
+    told = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]
+    told += [f"#{old} resolves to #{new}" for old, new in report.aliases]
+    if told:
+        print("; ".join(told))
+
+
+def _parse_parts(text: str) -> list[tuple[int, int]]:
+    """`3:4,5:2` as pairs. Raises `OptionError`."""
+    from list3r.memory.errors import OptionError
+
+    try:
+        pairs = [part.split(":") for part in text.split(",")]
+        return [(int(chunk), int(local)) for chunk, local in pairs]
+    except ValueError:
+        raise OptionError(f"--out {text!r}: CHUNK:LOCAL pairs with commas are needed, such as 3:4,5:2") from None

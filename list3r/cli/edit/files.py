@@ -1,0 +1,127 @@
+"""export, verify, repair, doctor: the file and the machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.command("export")(export)
+    app.command("verify")(verify)
+    app.command("repair")(repair)
+    app.command("doctor")(doctor)
+
+
+def export(
+    memory: MemoryArgument,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="json, usd, ply, glb, tum or plan.")],
+    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file to write.")],
+    json: JsonOption = False,
+) -> None:
+    """Write a memory in another format: scene JSON, USD, coloured points, boxes, trajectory, plan picture.
+
+    Example: list3r export house.l3r --to usd --out house.usda
+    """
+    with open_memory(memory) as scene:
+        written = scene.export(to, out)
+    sizes = {str(path): path.stat().st_size for path in written}
+    if json:
+        print_json({"format": to, "path": str(out), "bytes": sizes[str(out)], "files": sizes})
+    else:
+        print("\n".join(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
+
+
+def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
+    """Check every page, checksum and reference of a memory; status 1 when damage is found.
+
+    Example: list3r verify house.l3r
+    """
+    from list3r.memory.errors import MemoryFileError
+
+    found, state, chunks = [], [], None
+    try:
+        with open_memory(memory) as scene:
+            found = scene.store.verify()
+            if not found:
+                chunks = len(scene.store.chunks())
+                state = [{"id": s.session_id, "state": s.state} for s in scene.store.sessions()]
+    except MemoryFileError as error:
+        if not _is_broken(memory, error):
+            raise
+        found = [f"it cannot be opened: {error.__cause__}"]
+    if json:
+        print_json({"memory": str(memory), "sound": not found, "damage": found, "sessions": state, "chunks": chunks})
+    elif found:
+        print("\n".join(found))
+        print(f"`list3r repair {memory}` saves what is sound")
+    else:
+        unfinished = (
+            "; the build is unfinished, go on with --resume" if any(s["state"] == "building" for s in state) else ""
+        )
+        print(f"{memory} is sound: {chunks} chunks{unfinished}")
+    if found:
+        raise typer.Exit(1)
+
+
+def _is_broken(memory: Path, error: Exception) -> bool:
+    """Whether a file that cannot be opened is an SQLite file with broken pages, and not some other file."""
+    import sqlite3
+
+    cause = error.__cause__
+    if not isinstance(cause, sqlite3.DatabaseError) or isinstance(cause, sqlite3.OperationalError):
+        return False
+    with memory.open("rb") as file:
+        return file.read(16) == b"SQLite format 3\x00"
+
+
+def repair(
+    memory: MemoryArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Write the sound file there; default: in its place.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Salvage a damaged memory: keep every sound row, derive the rest anew, say what is lost. The original is kept.
+
+    Example: list3r repair house.l3r
+    """
+    from list3r.memory.maintenance.repair import repair as salvage
+
+    report = salvage(memory, out)
+    if json:
+        print_json(report.as_dict())
+        return
+    if not report.damage:
+        where = "nothing was changed" if out is None else f"{out} is a copy"
+        print(f"{memory} is sound; {where}")
+        return
+    print(f"{report.memory} is sound: {report.chunks} chunks, {report.instances} instances")
+    print(f"the damaged file is {report.original}")
+    for kind, names in report.lost.items():
+        print(f"lost {kind.replace('_', ' ')}: {', '.join(names)}")
+    if not report.lost:
+        print("nothing is lost")
+    elif report.rebuilt:
+        print("instances and relations were derived anew from what is left")
+
+
+def doctor(json: JsonOption = False) -> None:
+    """Say what is installed, what is missing, and what that means.
+
+    Example: list3r doctor
+    """
+    from list3r.cli.measure.doctor import findings
+
+    rows = findings()
+    if json:
+        print_json([{"part": part, "state": state, "means": means} for part, state, means in rows])
+    else:
+        print_table(rows, ["part", "state", "needed for"])
+    if any(state.startswith("MISSING") for _, state, _ in rows):
+        raise typer.Exit(1)

@@ -1,0 +1,179 @@
+"""eval cloud: the five measures of a cloud."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.common import JsonOption, print_json, print_table
+from list3r.cli.measure.inputs import is_memory, is_source, read_points, read_trajectory
+from list3r.cli.measure.options import (
+    Estimate,
+    EveryOption,
+    PlotOption,
+    ScaleOption,
+    Truth,
+    check_every,
+    check_plot,
+    check_scale,
+    free_scale,
+    save_picture,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from list3r.evaluation.cloud import CloudErrors
+    from list3r.evaluation.point_clouds import PointCloud
+    from list3r.evaluation.trajectory import Trajectory
+    from list3r.memory.geometry import Sim3
+
+
+def cloud(
+    truth: Truth,
+    estimate: Estimate,
+    align: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--align",
+            metavar="TRAJECTORY|icp|none",
+            help="Place the estimate by the true path of its camera, by its surfaces, or (give both) by one after the"
+            " other. Absent: by the path where TRUTH is a source, else none.",
+        ),
+    ] = None,
+    path: Annotated[
+        Path | None,
+        typer.Option("--path", metavar="TRAJECTORY", help="The estimate's own camera path, where it is no memory."),
+    ] = None,
+    scale: ScaleOption = "auto",
+    threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05,
+    truncate: Annotated[
+        float | None, typer.Option("--truncate", help="Cap single distances, metres; absent: no cap.")
+    ] = None,
+    voxel: Annotated[
+        float, typer.Option("--voxel", help="Thin both clouds to one point a cell, metres; 0: not.")
+    ] = 0.01,
+    points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000,
+    every: EveryOption = None,
+    plot: PlotOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Accuracy, completeness, Chamfer, normal consistency, F-score. TRUTH: a cloud or mesh, a memory, or a source with
+    depth and poses; ESTIMATE: a cloud or a memory (all supports of its things and surfaces, in the world).
+
+    Example: list3r eval cloud truth.ply house.l3r --align walk/groundtruth.txt --plot cloud.png
+    """
+    from list3r.evaluation.cloud import cloud_distances, evaluate_cloud
+    from list3r.evaluation.point_clouds import thinned
+
+    check_scale(scale)
+    check_every(every)
+    check_plot(plot)
+    _check_lengths(threshold=threshold, truncate=truncate)
+    found, _ = read_points(estimate)
+    true, true_path = read_points(truth, every)
+    true = thinned(true, voxel, points)
+    true = replace(true, normals=_normals(true))
+    S_truth_estimate, how = _cloud_alignment(align, true, found, true_path, path or estimate, truth, scale)
+    found = thinned(found.moved(S_truth_estimate), voxel, points)
+    distances = cloud_distances(true.points, found.points)
+    errors = evaluate_cloud(true.points, found.points, true.normals, _normals(found), threshold, truncate, distances)
+    if plot is not None:
+        title = (
+            f"{estimate.name} against {truth.name}: Chamfer {errors.chamfer_cm:.2f} cm, F {100 * errors.f_score:.1f} %"
+        )
+        gaps = (distances.to_truth, distances.to_estimate)
+        save_picture(_figure(found, true, gaps, 2 * threshold, title, true_path), plot)
+    if json:
+        used = {"truth": true.words, "estimate": found.words, "alignment": how, "voxel_m": voxel}
+        counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
+        print_json({**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)})
+        return
+    print(f"truth     {true.words}; {len(true.points):,} compared")
+    print(f"estimate  {found.words}; {len(found.points):,} compared")
+    print(f"aligned   {how}")
+    _print_errors(errors)
+
+
+def _print_errors(errors: CloudErrors) -> None:
+    consistency = "-" if errors.normal_consistency is None else f"{errors.normal_consistency:.3f}"
+    shares = f"precision {100 * errors.precision:.2f}, recall {100 * errors.recall:.2f}"
+    rows = [
+        ["accuracy", f"{errors.accuracy_cm:.3f} cm", f"median {errors.accuracy_median_cm:.3f}"],
+        ["completeness", f"{errors.completeness_cm:.3f} cm", f"median {errors.completeness_median_cm:.3f}"],
+        ["Chamfer distance", f"{errors.chamfer_cm:.3f} cm", "mean of the two"],
+        ["normal consistency", consistency, "mean |cosine|, both ways"],
+        [f"F at {errors.threshold_cm:g} cm", f"{100 * errors.f_score:.2f} %", shares],
+    ]
+    print_table(rows, ["measure", "value", ""])
+
+
+def _figure(
+    found: PointCloud,
+    true: PointCloud,
+    distances: tuple[Any, Any],
+    limit_m: float,
+    title: str,
+    true_path: Trajectory | None,
+) -> Figure:
+    from list3r.evaluation.figures import UPRIGHT, cloud_figure, page_axes
+
+    page = UPRIGHT if true_path is None else page_axes(true_path.T_world_cam)
+    return cloud_figure((found.points, true.points), distances, limit_m, title, page)
+
+
+def _cloud_alignment(
+    words: list[str] | None,
+    true: PointCloud,
+    found: PointCloud,
+    true_path: Trajectory | None,
+    estimate_path: Path,
+    truth: Path,
+    scale: str,
+) -> tuple[Sim3, str]:
+    """S_truth_estimate, and how it was found."""
+    from list3r.evaluation.icp import IcpSettings, register
+    from list3r.evaluation.scene import alignment_of
+    from list3r.memory.errors import OptionError
+    from list3r.memory.geometry import Sim3
+
+    by_source = words is None and is_source(truth) and true_path is not None
+    chosen = words or (["path"] if by_source else ["none"])
+    free = free_scale(scale, estimate_path)
+    kind = "Sim(3)" if free else "SE(3)"
+    S, said = Sim3.identity(), []
+    for word in chosen:
+        if word == "none":
+            continue
+        if word == "icp":
+            near = found.moved(S).points
+            S = register(true.points, _normals(true), near, with_scale=free, settings=IcpSettings()) @ S
+            said.append(f"{kind} by point-to-plane ICP")
+            continue
+        if not is_memory(estimate_path) and not estimate_path.suffix.lower() == ".txt":
+            raise OptionError(f"--align {word}: {estimate_path} knows no camera path; give its own with --path")
+        goal = true_path if by_source and true_path is not None else read_trajectory(Path(word))
+        S = alignment_of(goal, read_trajectory(estimate_path), with_scale=free)
+        said.append(f"{kind} by the camera's path")
+    if not said:
+        return S, "not: both lie in one frame of reference"
+    return S, f"{', then '.join(said)}; scale {float(S.scale):.4f}"
+
+
+def _normals(points: PointCloud) -> Any:
+    from list3r.evaluation.point_clouds import estimate_normals
+
+    return estimate_normals(points.points) if points.normals is None else points.normals
+
+
+def _check_lengths(**lengths: float | None) -> None:
+    import math
+
+    from list3r.memory.errors import OptionError
+
+    for name, value in lengths.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise OptionError(f"--{name} {value:g}: a length above 0 in metres is needed")

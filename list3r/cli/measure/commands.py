@@ -1,0 +1,220 @@
+"""eval trajectory, cloud, instances, revisits: results against truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.common import JsonOption, open_memory, print_json, print_table
+from list3r.cli.measure.cloud import cloud
+from list3r.cli.measure.inputs import align_by_path, is_memory, mask_frames, read_scene_of, read_trajectory
+from list3r.cli.measure.options import (
+    Estimate,
+    PlotOption,
+    ScaleOption,
+    Truth,
+    check_every,
+    check_plot,
+    check_scale,
+    free_scale,
+    save_picture,
+    share,
+)
+from list3r.cli.measure.revisits import revisits
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from list3r.evaluation.trajectory import Trajectory
+    from list3r.memory.geometry import Sim3
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    group = typer.Typer(help="Measure a result against truth.", no_args_is_help=True, rich_markup_mode=None)
+    for command in (trajectory, cloud, instances, revisits):
+        group.command(command.__name__)(command)
+    app.add_typer(group, name="eval")
+
+
+# ---------------------------------------------------------------------------------------------- trajectory
+
+
+def trajectory(
+    truth: Truth,
+    estimate: Estimate,
+    delta: Annotated[
+        str, typer.Option("--delta", help="Distance of the poses that RPE relates: 10 (frames), 0.5m or 2s.")
+    ] = "1",
+    tolerance: Annotated[float, typer.Option("--tolerance", help="Greatest gap of associated times, seconds.")] = 0.01,
+    scale: Annotated[
+        str, typer.Option("--scale", help="Of the picture: free, fixed or auto (free for a memory of relative scale).")
+    ] = "auto",
+    plot: PlotOption = None,
+    json: JsonOption = False,
+) -> None:
+    """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a TUM file, a memory, or a source with poses.
+
+    Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
+    """
+    from list3r.evaluation.trajectory import Delta, evaluate_trajectory
+    from list3r.memory.errors import OptionError
+
+    check_scale(scale)
+    check_plot(plot)
+    if not tolerance >= 0:
+        raise OptionError(f"--tolerance {tolerance:g}: seconds, 0 or more, are needed")
+    apart = Delta.parse(delta)
+    true, found = read_trajectory(truth), read_trajectory(estimate)
+    errors = evaluate_trajectory(true, found, tolerance, delta=apart)
+    if plot is not None:
+        free = free_scale(scale, estimate)
+        save_picture(
+            _trajectory_figure(true, found, tolerance, f"{estimate.name} against {truth.name}", free=free), plot
+        )
+    scores = errors.as_dict()
+    if json:
+        print_json(scores)
+        return
+    covered = errors.covered
+    print(f"{errors.pairs} poses associated; scale {errors.scale:.4f}; RPE over {apart}")
+    gaps = f"{covered.gaps} gap{'s' * (covered.gaps != 1)}, the longest stretch without poses"
+    missing = "" if covered.longest_gap_s == 0 else f"; {gaps} {covered.longest_gap_s:.2f} s"
+    print(f"the estimate covers {100 * covered.truth:.1f} % of the truth's time{missing}")
+    if errors.coverage < 1:
+        print(f"{100 * errors.coverage:.1f} % of its poses have a true one within {tolerance:g} s")
+    names = ("ate_se3_m", "ate_sim3_m", "rpe_translation_m", "rpe_translation_sim3_m", "rpe_rotation_deg")
+    keys = ("rmse", "mean", "median", "std", "max")
+    print_table([[name, *[f"{scores[name][key]:.4f}" for key in keys]] for name in names], ["", *keys])
+
+
+def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float, title: str, *, free: bool) -> Figure:
+    from list3r.evaluation.figures import trajectory_figure
+    from list3r.evaluation.trajectory import align, associated, position_errors
+
+    a, b = associated(truth, estimate, tolerance)
+    S_truth_estimate = align(a, b, with_scale=free)
+    errors = position_errors(a, b, S_truth_estimate)
+    kind = f"Sim(3), scale {float(S_truth_estimate.scale):.4f}" if free else "SE(3)"
+    words = f"{title}\nATE {float((errors**2).mean() ** 0.5):.4f} m RMSE over {len(errors)} poses, {kind}"
+    return trajectory_figure(truth, b.time_s, S_truth_estimate.apply(b.positions()), errors, words)
+
+
+# ---------------------------------------------------------------------------------------------- instances
+
+
+def instances(
+    truth: Truth,
+    estimate: Estimate,
+    align: Annotated[
+        str | None,
+        typer.Option(
+            "--align",
+            metavar="TRAJECTORY|none",
+            help="True path of the camera, to place a memory by. Absent: groundtruth.txt beside TRUTH, if it is there.",
+        ),
+    ] = None,
+    scale: ScaleOption = "auto",
+    ids: Annotated[
+        Path | None,
+        typer.Option(
+            "--ids",
+            metavar="FOLDER",
+            help="Pictures of the true ids of every frame, for id switches of a memory. Absent: ids/ beside TRUTH.",
+        ),
+    ] = None,
+    every: Annotated[int, typer.Option("--every", metavar="N", help="Follow ids over every N-th frame.")] = 1,
+    plot: PlotOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Recall, precision, duplicates, merges, id switches; relations. TRUTH: a truth.json; ESTIMATE: a memory or scene
+    JSON.
+
+    Example: list3r eval instances walk/truth.json rooms.l3r --plot found.png
+    """
+    from list3r.evaluation.scene import evaluate_scene, read_scene
+    from list3r.memory.errors import OptionError
+
+    if align not in (None, "none") and estimate.is_file() and not is_memory(estimate):
+        raise OptionError(f"--align {align} places a memory; {estimate} is none and knows no camera path")
+    check_scale(scale)
+    check_plot(plot)
+    check_every(every)
+    true, found = read_scene(truth), read_scene_of(estimate)
+    beside = truth.parent / "groundtruth.txt"
+    if align is None and is_memory(estimate) and beside.is_file():
+        align = str(beside)
+    S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, scale)
+    scores = evaluate_scene(found, true, S_truth_scene)
+    scores["identities"] = _identities(true, truth, estimate, ids, every)
+    if plot is not None:
+        save_picture(
+            _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), plot
+        )
+    if json:
+        print_json(scores)
+        return
+    if S_truth_scene is not None:
+        print(f"placed by the camera's path in {align}, scale {float(S_truth_scene.scale):.4f}")
+    print_table(score_rows(scores), ["", "recall", "precision", "more"])
+    for missed in scores["missed"]:
+        print(f"missed: {missed['label']} ({missed['id']})")
+    identities = scores["identities"]
+    if identities is not None:
+        print(
+            f"{identities['switches']} id switches of {identities['objects']} things in {identities['frames']} frames"
+        )
+        labels = {int(e["id"]): e.get("label") for e in true["instances"]}
+        for k, several in identities["several_ids"].items():
+            print(f"several ids: {labels.get(k)} ({k}) was {', '.join(map(str, several))}")
+
+
+def _identities(
+    true: dict[str, Any], truth: Path, estimate: Path, ids: Path | None, every: int
+) -> dict[str, Any] | None:
+    """Id switches, None where there are no true ids of pixels or the estimate has no masks."""
+    from list3r.evaluation.identity import evaluate_identities
+    from list3r.memory.errors import OptionError
+
+    folder = ids or truth.parent / "ids"
+    if ids is not None and not ids.is_dir():
+        raise OptionError(f"--ids {ids} is no folder; give the folder with one picture of true ids a frame")
+    if not is_memory(estimate):
+        if ids is not None:
+            raise OptionError(f"--ids: {estimate} has no masks; id switches are measured on a memory")
+        return None
+    if not folder.is_dir():
+        return None
+    wanted = {int(e["id"]) for e in true["instances"] if not e.get("structure")}
+    with open_memory(estimate) as scene:
+        return evaluate_identities(mask_frames(scene.store, folder, every), wanted).as_dict()
+
+
+def _instances_figure(
+    true: dict[str, Any], found: dict[str, Any], scores: dict[str, Any], S_truth_scene: Sim3 | None, title: str
+) -> Figure:
+    from list3r.evaluation.figures import instances_figure
+    from list3r.evaluation.scene import scene_boxes
+
+    labels = {int(e["id"]): str(e.get("label") or e.get("description") or "") for e in true["instances"]}
+    matches = scores["matched_ids"]
+    counted = {t for t, _, _ in matches} | {m["id"] for m in scores["missed"]}
+    true_boxes = {k: (box, labels[k]) for k, box in scene_boxes(true).items() if k in counted}
+    boxes = {k: (box, "") for k, box in scene_boxes(found, S_truth_scene).items()}
+    loose = scores["instances_0.25"]
+    words = f"{title}: recall {loose['recall']:.2f}, precision {loose['precision']:.2f} at IoU 0.25"
+    return instances_figure(true_boxes, boxes, matches, words)
+
+
+def score_rows(scores: dict[str, Any]) -> list[list[object]]:
+    """Rows (what, recall, precision, more) of the scores of a scene."""
+    rows: list[list[object]] = []
+    for threshold in ("0.25", "0.50"):
+        entry = scores[f"instances_{threshold}"]
+        more = f"{entry['duplicates']} duplicates, {entry['merged_pairs']} merged pairs"
+        rows.append([f"things at IoU {threshold}", share(entry["recall"]), share(entry["precision"]), more])
+    for name, entry in scores["relations"]["by_predicate"].items():
+        rows.append([f"{name}, of matched things", share(entry["recall"]), share(entry["precision"]), ""])
+    return rows

@@ -1,0 +1,73 @@
+"""What the eval commands share: their options, and how pictures are checked and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from list3r.cli.common import note
+from list3r.cli.measure.inputs import scale_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Truth = Annotated[Path, typer.Argument(metavar="TRUTH", show_default=False)]
+Estimate = Annotated[Path, typer.Argument(metavar="ESTIMATE", show_default=False)]
+PlotOption = Annotated[
+    Path | None, typer.Option("--plot", metavar="FILE", help="Also draw a picture: .png, .pdf or .svg.")
+]
+ScaleOption = Annotated[
+    str, typer.Option("--scale", help="free (Sim(3)), fixed (SE(3)) or auto: free for a memory of relative scale.")
+]
+EveryOption = Annotated[
+    int | None,
+    typer.Option("--every", metavar="N", help="Read every N-th frame of a source; about 250 in all if absent."),
+]
+
+
+def share(value: float | None) -> str:
+    """A share in two decimals, a dash for none."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+def check_scale(scale: str) -> None:
+    """Raises `OptionError` for a scale that is none of the choices."""
+    from list3r.memory.errors import OptionError
+
+    if scale not in ("auto", "free", "fixed"):
+        raise OptionError(f"--scale {scale}: choose auto, free or fixed")
+
+
+def check_every(every: int | None) -> None:
+    """Raises `OptionError` for an `--every` below 1."""
+    from list3r.memory.errors import OptionError
+
+    if every is not None and every < 1:
+        raise OptionError(f"--every {every}: take every n-th frame with n of at least 1")
+
+
+def check_plot(plot: Path | None) -> None:
+    """Raises `OptionError` or `ExportError` before any work when the picture cannot be written."""
+    if plot is None:
+        return
+    from list3r.evaluation.figures import check_ending
+    from list3r.exporters.output import check_target
+
+    check_target(check_ending(plot))
+
+
+def save_picture(figure: Figure, path: Path) -> None:
+    """Write a picture whole or not at all, and say so."""
+    from list3r.evaluation.figures import save
+    from list3r.exporters.output import replacing
+
+    with replacing(path) as temporary:
+        save(figure, temporary)
+    note(f"note: {path} written")
+
+
+def free_scale(scale: str, estimate: Path) -> bool:
+    """Whether the scale of an alignment is free: as told, or by `auto` for a memory of relative scale."""
+    return scale == "free" or (scale == "auto" and scale_of(estimate) == "relative")

@@ -1,0 +1,226 @@
+"""models list, models fetch, precompute: the networks, their weights, and their answers as files."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.build import model_options as mod
+from list3r.cli.build import source_options as src
+from list3r.cli.build.progress import looking, show
+from list3r.cli.common import JsonOption, note, print_json, print_table, spread
+
+if TYPE_CHECKING:
+    from list3r.frames.base import SourceInfo
+    from list3r.frames.options import SourceOptions
+    from list3r.models.cards import ModelCard, Weights
+    from list3r.pipeline.chunk import BuildSettings
+
+models = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="The networks that can be used: licences, weights in the cache, fetching.",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.add_typer(models, name="models")
+    app.command("precompute")(precompute)
+
+
+@models.command("list")
+def list_models(
+    licence: Annotated[
+        str, typer.Option("--licence", help="Show what this profile allows: permissive, research or any.")
+    ] = "any",
+    json: JsonOption = False,
+) -> None:
+    """Say of every model what it does, under which licences, whether its package and its weights are here.
+
+    Example: list3r models list --licence permissive
+    """
+    from list3r.models.cards import CARDS
+    from list3r.models.licences import objection
+
+    shown = [(c, w) for c in CARDS for w in (c.weights or (None,)) if objection(c, w, licence) is None]
+    rows = [model_facts(card, weights) for card, weights in shown]
+    if json:
+        print_json(rows)
+        return
+    table = [
+        (
+            r["name"],
+            r["part"],
+            "yes" if r["installed"] else "no",
+            r["repository"] or "the user's own",
+            _size(r),
+            r["code_licence"],
+            _licence(r),
+        )
+        for r in rows
+    ]
+    print_table(table, ["model", "part", "package", "weights", "in the cache", "code", "licence of the weights"])
+
+
+@models.command("fetch")
+def fetch_model(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A model, or owner/name of weights.", show_default=False)],
+    licence: mod.LicenceProfile = "research",
+    revision: Annotated[
+        str | None,
+        typer.Option("--revision", help="Commit, tag or branch; default: the card's.", show_default=False),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Bring the weights of a model into the cache, so that it runs without a network from then on.
+
+    Example: list3r models fetch mapanything --licence permissive
+    """
+    from list3r.models.cache import fetch, find_cached
+
+    done = []
+    for weights in _wanted(name, licence):
+        before = find_cached(weights.repository, revision or weights.revision)
+        cached = fetch(weights, revision)
+        done.append({"weights": cached.name, "folder": str(cached.folder), "bytes": cached.size_bytes})
+        if not json:
+            said = "was there" if before is not None and before.commit == cached.commit else "fetched"
+            print(f"{cached.name}  {cached.size_bytes / 1e6:.1f} MB  {said}: {cached.folder}")
+    if json:
+        print_json(done)
+
+
+@spread
+def precompute(
+    source: src.SourceArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
+    *,
+    geometry: mod.GeometryWords,
+    poses: Annotated[str, typer.Option("--poses", help="estimate, given or auto.")] = "auto",
+    cut: mod.CutWords,
+    words: src.SourceWords,
+    force: Annotated[bool, typer.Option("--force", help="Write chunks anew that are there already.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Reconstruct a video into .npz files, which `build --reconstruction precomputed --weights DIR` reads elsewhere.
+
+    Example: list3r precompute walk.mp4 --out walk-pi3/ --reconstruction pi3
+    """
+    options = words.options()
+    from list3r.frames.source import open_source
+
+    info = open_source(source, options).info
+    words.check_fits(info)
+    settings, told = mod.build_settings(info, geometry.models(), cut, poses=poses, pictures=False)
+    if not json:
+        for line in told:
+            note(line)
+    report = _write_all(source, out, options, settings, info, force=force, licence=geometry.licence, quiet=json)
+    if json:
+        print_json({"folder": str(out), **report})
+        return
+    print(
+        f"{out}  {report['files']} files, {report['bytes'] / 1e6:.1f} MB, {report['posed']} of {report['frames']} posed"
+    )
+    for line in report["notes"]:
+        print(f"note: {line}")
+
+
+def _write_all(
+    source: str,
+    out: Path,
+    options: SourceOptions,
+    settings: BuildSettings,
+    info: SourceInfo,
+    *,
+    force: bool,
+    licence: str,
+    quiet: bool,
+) -> dict[str, Any]:
+    from tqdm import tqdm
+
+    from list3r.pipeline.precompute import precompute as write
+
+    with tqdm(unit="frame", desc="reconstructing", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
+        progress = functools.partial(show, bar)
+        run: dict[str, Any] = {"progress": progress, "look": looking(bar, "reconstructing")}
+        return write(source, out, options, settings, info, force=force, licence=licence, **run).as_dict()
+
+
+def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
+    """What is known of a model with some weights, and what of it is on this machine."""
+    from list3r.models.cache import find_cached
+    from list3r.models.presets import missing_package
+
+    cached = None if weights is None else find_cached(weights.repository, weights.revision)
+    return {
+        "name": card.name,
+        "part": card.part,
+        "about": card.about,
+        "installed": missing_package(card) is None,
+        "install": card.install,
+        "code_licence": card.code.name,
+        "repository": None if weights is None else weights.repository,
+        "revision": None if weights is None else weights.revision,
+        "pinned": weights is not None and weights.pinned,
+        "weights_licence": None if weights is None else weights.licence.name,
+        "gated": weights is not None and weights.gated,
+        "any_use": card.code.kind == "permissive"
+        and (weights is None or (weights.licence.kind == "permissive" and not weights.gated)),
+        "cached_commit": None if cached is None else cached.commit,
+        "cached_bytes": None if cached is None else cached.size_bytes,
+        "memory_mb": None if card.memory is None else {"fixed": card.memory.fixed_mb, "source": card.memory.source},
+    }
+
+
+def _wanted(name: str, licence: str) -> list[Weights]:
+    """The weights that a name means. Raises `OptionError` for what is unknown or not allowed."""
+    from list3r.memory.errors import OptionError
+    from list3r.models.cards import cards_named
+    from list3r.models.licences import check_profile, choose_weights
+
+    check_profile(licence)
+    if "/" in name:
+        return [_named(name, licence)]
+    found = {w.repository: w for c in cards_named(name) if (w := choose_weights(c, None, licence, "model")) is not None}
+    if not found:
+        raise OptionError(f"{name} has no weights of its own; give yours with --weights")
+    return list(found.values())
+
+
+def _named(name: str, licence: str) -> Weights:
+    """Weights that are named by their repository. Raises `OptionError` for what the profile does not allow."""
+    from list3r.memory.errors import OptionError
+    from list3r.models.cache import split_name
+    from list3r.models.cards import CARDS, OTHER, UNPINNED, Weights, find_weights
+    from list3r.models.licences import choose_weights
+
+    parts = split_name(name)
+    if parts is None:
+        raise OptionError(f"{name} is no repository; its name is owner/name or owner/name@revision")
+    for card in CARDS:
+        if (known := find_weights(card, parts[0])) is not None:
+            choose_weights(card, name, licence, "model")
+            return replace(known, revision=known.revision if parts[1] == UNPINNED else parts[1])
+    if licence == "permissive":
+        raise OptionError(f"--licence permissive does not allow {name}, whose licence is not known here")
+    return Weights(parts[0], OTHER, revision=parts[1])
+
+
+def _size(facts: dict[str, Any]) -> str:
+    if facts["repository"] is None:
+        return "-"
+    return "no" if facts["cached_bytes"] is None else f"{facts['cached_bytes'] / 1e6:.0f} MB"
+
+
+def _licence(facts: dict[str, Any]) -> str:
+    if facts["repository"] is None:
+        return "-"
+    marks = [facts["weights_licence"], *(["gated"] if facts["gated"] else [])]
+    return ", ".join(marks) + ("" if facts["any_use"] else "  (not for any use)")

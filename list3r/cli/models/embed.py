@@ -1,0 +1,49 @@
+"""embed: vectors of a text and image model, so that free words find things."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from list3r.cli.build.model_options import LicenceProfile
+from list3r.cli.common import JsonOption, MemoryArgument, print_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("embed")(embed)
+
+
+def embed(
+    memory: MemoryArgument,
+    model: Annotated[str, typer.Option("--model", help="siglip2 or clip.")] = "siglip2",
+    weights: Annotated[
+        str | None,
+        typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
+    ] = None,
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto.")] = "auto",
+    licence: LicenceProfile = "research",
+    json: JsonOption = False,
+) -> None:
+    """Look at the stored pictures of every thing with a text and image model; then free words find things.
+
+    Example: list3r embed house.l3r --model siglip2
+    """
+    from tqdm import tqdm
+
+    from list3r.semantics.embedding import embed_memory
+
+    with tqdm(total=1, desc="embed", unit="chunk", disable=None if not json else True) as bar:
+
+        def shown(done: int, total: int) -> None:
+            bar.total, bar.n = total, done
+            bar.refresh()
+
+        report = embed_memory(memory, weights, device, shown, model=model, licence=licence)
+    if json:
+        print_json(vars(report))
+        return
+    print(f"{report.instances} things have a vector in {report.space}")
+    if report.without_picture:
+        print(f"{report.without_picture} are shown by no stored picture")

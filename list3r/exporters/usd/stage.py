@@ -1,0 +1,231 @@
+"""The memory as an OpenUSD stage: a prim for each instance, relations between prims, the camera's path."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+
+from list3r.exporters.components import Component, has_box, point_spacing, read_components, thinned_support
+from list3r.exporters.output import replacing, units
+from list3r.exporters.palette import instance_color, linear_from_srgb
+from list3r.exporters.usd.camera import add_cameras, set_time_range
+from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
+from list3r.memory.records import Instance, Support
+from list3r.memory.store.store import Store
+
+
+@dataclass(frozen=True)
+class UsdSettings:
+    """What goes into the stage."""
+
+    points_per_instance: int = 5000
+    """At most so many points of a thing."""
+    points_per_structure: int = 20000
+    """At most so many points of a floor, a wall and the like."""
+
+    def __post_init__(self) -> None:
+        if min(self.points_per_instance, self.points_per_structure) < 0:
+            raise OptionError("a number of points cannot be negative; 0 leaves the points out")
+
+
+def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = None) -> tuple[Path, ...]:
+    """Write `usd_stage` to a .usda, .usdc or .usd file. Returns the file written."""
+    path = Path(path)
+    with replacing(path) as temporary:
+        stage = usd_stage(store, settings)
+        try:
+            saved = stage.GetRootLayer().Export(str(temporary))
+        except Tf.ErrorException as error:
+            raise ExportError(f"{path} cannot be written; is the disk full?") from error
+        if not saved:
+            raise ExportError(f"{path} cannot be written; is the disk full?")
+    return (path,)
+
+
+def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
+    """The stage in memory: z up, metersPerUnit 1 (arbitrary units in a relative memory, `customLayerData` says so).
+
+    `/World/Instances/instance_12` is the box's own frame (translate, orient), with the points in it and the box as a
+    guide; what moves has a sample of its translation for each frame that saw it. Floor, walls and the like are under
+    `/World/Structure`; time codes are frame numbers of the source. A component that was not placed against the main
+    one is under `/World/component_7`, invisible, so that it is not overlaid.
+    """
+    settings = settings or UsdSettings()
+    components = read_components(store)
+    stage = Usd.Stage.CreateInMemory()
+    world = _prepare(stage, store)
+    paths: dict[int, Sdf.Path] = {}
+    for component in components:
+        scope = world if component.main else _component_scope(stage, component)
+        for instance in component.instances:
+            limit = settings.points_per_structure if instance.structure else settings.points_per_instance
+            support = thinned_support(store, instance, limit)
+            paths[instance.id] = _add_instance(stage, scope.GetPath(), instance, support)
+            if instance.dynamic and has_box(instance):
+                _animate(stage.GetPrimAtPath(paths[instance.id]), instance, store)
+        add_cameras(stage, scope.GetPath(), component)
+    set_time_range(stage, components, store)
+    _add_relations(stage, store, paths)
+    return stage
+
+
+def _prepare(stage: Usd.Stage, store: Store) -> Usd.Prim:
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetMetadata("kilogramsPerUnit", 1.0)
+    world = UsdGeom.Xform.Define(stage, "/World").GetPrim()
+    Usd.ModelAPI(world).SetKind("assembly")
+    stage.SetDefaultPrim(world)
+    facts = {
+        "format": "list3r-usd",
+        "version": 1,
+        "units": units(store),
+        "metric": str(store.get_value("scale_kind", "relative")),
+        "gravity": str(store.get_value("gravity", "unknown")),
+    }
+    if facts["units"] != "m":
+        facts["note"] = "the scale of this memory is relative: metersPerUnit 1 is nominal, lengths are not metres"
+    if facts["gravity"] == "unknown":
+        facts["gravityNote"] = "the direction of gravity is unknown: upAxis Z is nominal"
+    stage.GetRootLayer().customLayerData = {"list3r": facts}
+    world.SetCustomDataByKey("list3r", facts)
+    return world
+
+
+def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:
+    prim = UsdGeom.Xform.Define(stage, f"/World/{component.name}").GetPrim()
+    UsdGeom.Imageable(prim).MakeInvisible()
+    note = "not placed against the main component: its coordinates are its own, so it is invisible"
+    prim.SetCustomDataByKey("list3r", {"component": component.id, "note": note})
+    return prim
+
+
+# ---------------------------------------------------------------------------------------------- instances
+
+
+def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support: Support) -> Sdf.Path:
+    group = UsdGeom.Xform.Define(stage, scope.AppendChild("Structure" if instance.structure else "Instances"))
+    path = group.GetPath().AppendChild(f"instance_{instance.id}")
+    xform = UsdGeom.Xform.Define(stage, path)
+    prim = xform.GetPrim()
+    Usd.ModelAPI(prim).SetKind("component")
+    Usd.ModelAPI(group.GetPrim()).SetKind("group")
+    prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'thing'} #{instance.id}")
+    _set_label(prim, instance)
+    _set_facts(prim, instance)
+    T_world_object = Sim3.identity()
+    if has_box(instance):
+        box = instance.box
+        T_world_object = Sim3(np.ones(()), box.rotation, box.center)
+        xform.AddTranslateOp().Set(Gf.Vec3d(*box.center.tolist()))
+        w, x, y, z = quat_wxyz_from_rotation(box.rotation).tolist()
+        xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
+        _add_box(stage, path, instance)
+    if len(support.points):
+        _add_points(stage, path, T_world_object.inverse().apply(support.points), support.rgb)
+    return path
+
+
+def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:
+    """Samples of a moving thing's place, as it is turned where it was last; time codes are frame numbers."""
+    keys, _, places = store.track_frames(instance.id)
+    if not len(keys):
+        return
+    translate = UsdGeom.Xformable(prim).GetOrderedXformOps()[0]
+    for (_, frame), place in zip(keys.tolist(), instance.box.center + places - places[-1], strict=True):
+        if np.isfinite(place).all():
+            translate.Set(Gf.Vec3d(*place.tolist()), frame)
+
+
+def _add_box(stage: Usd.Stage, path: Sdf.Path, instance: Instance) -> None:
+    cube = UsdGeom.Cube.Define(stage, path.AppendChild("box"))
+    cube.CreateSizeAttr(1.0)
+    cube.CreateExtentAttr([(-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)])
+    cube.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    cube.CreateDisplayColorAttr([Gf.Vec3f(*linear_from_srgb(instance_color(instance.id)).tolist())])
+    cube.CreateDisplayOpacityAttr([0.25])
+    cube.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*instance.box.size.tolist()))
+
+
+def _add_points(stage: Usd.Stage, path: Sdf.Path, points_object: NDArray[np.float64], rgb: NDArray[np.uint8]) -> None:
+    points = np.ascontiguousarray(points_object, dtype=np.float32)
+    width = point_spacing(points)
+    prim = UsdGeom.Points.Define(stage, path.AppendChild("points"))
+    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    prim.CreateWidthsAttr([width])
+    prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+    low, high = points.min(axis=0) - width / 2, points.max(axis=0) + width / 2
+    prim.CreateExtentAttr([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())])
+    colors = np.ascontiguousarray(linear_from_srgb(rgb), dtype=np.float32)
+    prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
+
+
+def _set_label(prim: Usd.Prim, instance: Instance) -> None:
+    """Semantic label in the taxonomy `class`; by hand where this build of USD has no `UsdSemantics`."""
+    token = class_token(instance)
+    try:
+        from pxr import UsdSemantics
+    except ImportError:
+        prim.AddAppliedSchema("SemanticsLabelsAPI:class")
+        attribute = prim.CreateAttribute("semantics:labels:class", Sdf.ValueTypeNames.TokenArray, custom=False)
+        attribute.Set([token])
+        return
+    UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([token])
+
+
+def class_token(instance: Instance) -> str:
+    """The label, else the kind of structure, else the words of the description before its first comma, as one token."""
+    words = instance.label or instance.structure or instance.description.split(",")[0]
+    return re.sub(r"\W+", "_", words.strip().lower()).strip("_") or "unknown"
+
+
+_FACT_TYPES: dict[type, Any] = {
+    int: Sdf.ValueTypeNames.Int,
+    float: Sdf.ValueTypeNames.Double,
+    str: Sdf.ValueTypeNames.String,
+}
+
+
+def _set_facts(prim: Usd.Prim, instance: Instance) -> None:
+    facts: dict[str, int | float | str] = {
+        "id": instance.id,
+        "label": instance.label or "",
+        "description": instance.description,
+        "confidence": float(instance.confidence),
+        "observations": instance.observations,
+        "firstSeen": float(instance.first_seen_s),
+        "lastSeen": float(instance.last_seen_s),
+        "state": instance.state,
+        "dynamic": int(instance.dynamic),
+        "structure": instance.structure or "",
+        "colorName": instance.color_name,
+        "component": instance.component,
+    }
+    for name, value in facts.items():
+        prim.CreateAttribute(f"list3r:{name}", _FACT_TYPES[type(value)], custom=True).Set(value)
+
+
+# ---------------------------------------------------------------------------------------------- relations
+
+
+def _add_relations(stage: Usd.Stage, store: Store, paths: dict[int, Sdf.Path]) -> None:
+    """`list3r:relation:on` on the subject, its targets the objects, with confidences and margins in the same order."""
+    found: dict[tuple[int, str], list[tuple[Sdf.Path, float, float]]] = {}
+    for r in store.relations():
+        if r.subject in paths and r.object in paths:
+            key = (r.subject, Tf.MakeValidIdentifier(r.predicate))
+            found.setdefault(key, []).append((paths[r.object], r.confidence, r.margin))
+    for (subject, predicate), entries in found.items():
+        prim = stage.GetPrimAtPath(paths[subject])
+        name = f"list3r:relation:{predicate}"
+        prim.CreateRelationship(name, custom=True).SetTargets([target for target, _, _ in entries])
+        for column, word in ((1, "confidence"), (2, "margin")):
+            attribute = prim.CreateAttribute(f"{name}:{word}", Sdf.ValueTypeNames.DoubleArray, custom=True)
+            attribute.Set([float(entry[column]) for entry in entries])

@@ -1,0 +1,198 @@
+"""A video file: decoded in order, never held, with the clock and the upright side that the file itself states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.exif import believable, film_focal
+from list3r.frames.folder import centred_camera, fingerprint, reduced_note
+from list3r.frames.layout import Optics
+from list3r.frames.options import SourceOptions
+from list3r.frames.picture import Upright, small_gray
+from list3r.frames.registration.rig import Rig, build_rig
+from list3r.frames.selection import select, sharpness
+from list3r.frames.stamps import list_stamps, open_container, packets, picture_stream
+from list3r.memory.errors import FrameError, OptionError, SourceError
+
+_MEASURED_PX, _THUMBNAIL_PX, _LOOKED_AT_PX = 320, 160, 640
+_EARLIER = 4
+"""Key frames that are tried, back from the nearest, before a frame counts as damaged."""
+
+
+class VideoSource:
+    """A `FrameSource` over one video stream. Every `read` opens the file anew and seeks to its first frame."""
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`."""
+        if options.depth_intrinsics or options.T_color_depth:
+            raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
+        self._path, self._options = path, options
+        self._stamps = list_stamps(path)
+        self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
+        times_s = np.array([self._time_s(k) for k in range(len(self._stamps))])
+        self._chosen = select(times_s, options, path, clock=self._stamps.clock, video=True)
+        self._upright, self._rig = self._first()
+        self._info = self._describe()
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was recognised."""
+        return self._info
+
+    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
+        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
+        return self.read_every(start, stop, 1)
+
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
+        for number, image in islice(self._pictures(start, stop, threads=False), 0, None, step):
+            if image is None:
+                yield BadFrame(number, "the video is damaged here")
+                continue
+            try:
+                color = self._rig.straight(self._upright.color(image, self._rig.color_size))
+            except FrameError as error:
+                yield BadFrame(number, str(error))
+            else:
+                yield Frame(number, self._time_s(number), color, None, None)
+
+    def position(self, index: int) -> int:
+        """Where a frame (Frame.index) is among those handed out."""
+        return self._chosen.position(index)
+
+    def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
+        """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""
+        for _, image in self._pictures(0, len(self._chosen), threads=True):
+            yield None if image is None else small_gray(image, _THUMBNAIL_PX)
+
+    def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
+        """Grey pictures at positions [start, stop), as stored, of at most 640 px; None for one that is damaged."""
+        for _, image in self._pictures(start, stop, threads=False):
+            yield None if image is None else small_gray(image, _LOOKED_AT_PX)
+
+    def _pictures(self, start: int, stop: int, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame | None]]:
+        """Number and picture of the frame handed out of each window at positions [start, stop); None where damaged."""
+        windows = range(len(self._chosen))[start:stop]
+        starts, stops = self._chosen.starts[windows.start :], self._chosen.stops[windows.start :]
+        at, best, score = 0, _nothing(starts), -1.0
+        decoded = self._decode(int(starts[0]), threads=threads) if windows else iter(())
+        for number, image in decoded:
+            while at < len(windows) and number >= stops[at]:
+                yield best
+                at, best, score = at + 1, _nothing(starts[at + 1 :]), -1.0
+            if at == len(windows):
+                return
+            if number < starts[at] or image.is_corrupt:
+                continue
+            found = sharpness(small_gray(image, _MEASURED_PX)) if self._chosen.sharpest else 0.0
+            if found > score:
+                best, score = (number, image), found
+            if number == stops[at] - 1:
+                yield best
+                at, best, score = at + 1, _nothing(starts[at + 1 :]), -1.0
+                if at == len(windows):
+                    return
+        while at < len(windows):
+            yield best
+            at, best = at + 1, _nothing(starts[at + 1 :])
+
+    def _decode(self, first: int, *, threads: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Frame numbers and pictures from `first` on, in order; what cannot be decoded is left out.
+
+        Decoding begins at the key frame before it. A container may land later than asked, or begin with pictures
+        that lean on what lies before: then it is sent to the key frame before that one.
+        """
+        keys: list[int | None] = [*self._stamps.key_stamps_to(first, _EARLIER)] if first > 0 else []
+        tries = keys if len(keys) == _EARLIER else [*keys, None]
+        for stamp in tries:
+            pictures = self._decode_from(stamp, threads=threads)
+            opening = next(pictures, None)
+            if opening is None or (opening[0] > first and stamp != tries[-1]):
+                continue
+            yield from (found for found in chain([opening], pictures) if found[0] >= first)
+            return
+
+    def _decode_from(self, stamp: int | None, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Frame numbers and pictures from the key frame at a stamp, or from the beginning."""
+        with open_container(self._path, self._stamps.words) as container:
+            stream = picture_stream(container)
+            assert stream is not None
+            if threads:
+                stream.thread_type = "AUTO"
+            if stamp is not None and not _sought(container, stream, stamp):
+                return
+            count, last = 0, -1
+            for packet in packets(container, stream):
+                try:
+                    images = packet.decode()
+                except av.FFmpegError:
+                    continue
+                for image in images:
+                    number = self._stamps.number(image, count, last)
+                    count += 1
+                    if number is not None:
+                        last = number
+                        yield number, image
+
+    def _time_s(self, number: int) -> float:
+        return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
+
+    def _first(self) -> tuple[Upright, Rig]:
+        optics = Optics(self._options.intrinsics, self._options.distortion or ())
+        for _, image in self._decode(int(self._chosen.starts[0])):
+            turned = Upright.of(image, self._stamps.aspect)
+            return turned, build_rig(optics, turned.size, None, None, self._options.max_side)
+        raise SourceError(f"{self._path}: no frame of it can be decoded; is the copy complete?")
+
+    def _describe(self) -> SourceInfo:
+        rig, notes = self._rig, [*self._upright.notes(), *self._stamps.notes]
+        if rig.color_size != rig.stored_size:
+            notes.append(reduced_note(rig))
+        if not self._stamps.clock:
+            notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
+        if self._chosen.sharpest:
+            notes.append("of each so many frames the sharpest is taken; --no-sharpest takes the first")
+        missing = ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
+        if rig.camera is None:
+            missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
+        focal = None if rig.camera is not None else self._stamps.focal_35mm
+        height, width = rig.stored_size
+        guess = believable(None if focal is None else film_focal(focal, width, height), width, height)
+        listing = [(self._path.name, self._path.stat().st_size)]
+        return SourceInfo(
+            kind="video",
+            path=str(self._path),
+            frame_count=len(self._chosen),
+            fps=self._fps,
+            camera=rig.camera,
+            has_depth=False,
+            has_poses=False,
+            scale_kind="relative",
+            fingerprint=fingerprint("video", listing, self._options),
+            notes=tuple(notes),
+            missing=tuple(missing),
+            image_size=rig.color_size,
+            camera_guess=None if guess is None else centred_camera(guess, rig),
+        )
+
+
+def _sought(container: Any, stream: Any, stamp: int) -> bool:
+    """Whether a file could be sent to a key frame."""
+    try:
+        container.seek(stamp, stream=stream, backward=True)
+    except av.FFmpegError:
+        return False
+    return True
+
+
+def _nothing(starts: NDArray[np.int64]) -> tuple[int, av.VideoFrame | None]:
+    """A window, the first of these, of which nothing was decoded."""
+    return (int(starts[0]) if len(starts) else 0, None)

@@ -1,0 +1,158 @@
+"""The cameras of one source: raw colour and depth in, undistorted colour and registered metric depth out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.frames.decode import clean_depth
+from list3r.frames.layout import Layout, Optics
+from list3r.frames.options import Intrinsics, SourceOptions
+from list3r.frames.registration.reprojection import Registration, Undistortion
+from list3r.frames.selection import working_size
+from list3r.memory.errors import FrameError, OptionError, SourceError
+
+
+def merge_optics(layout: Layout, options: SourceOptions) -> tuple[Optics, tuple[str, ...]]:
+    """What the layout knows, overruled by what the user says, with notes on what that leaves to assume."""
+    optics, notes = layout.optics, []
+    if options.registered:
+        optics = replace(optics, depth_intrinsics=None, T_color_depth=None)
+        if layout.registered_intrinsics is not None:
+            optics = replace(optics, intrinsics=layout.registered_intrinsics, distortion=())
+    given: dict[str, Any] = {
+        "intrinsics": options.intrinsics,
+        "distortion": options.distortion,
+        "depth_intrinsics": options.depth_intrinsics,
+        "T_color_depth": None if options.T_color_depth is None else np.array(options.T_color_depth),
+        "depth_scale": options.depth_scale,
+    }
+    optics = replace(optics, **{name: value for name, value in given.items() if value is not None})
+    if optics.T_color_depth is not None and optics.depth_intrinsics is None:
+        optics = replace(optics, depth_intrinsics=optics.intrinsics)
+        notes.append("the depth camera is given the colour camera's intrinsics; --depth-intrinsics says otherwise")
+    if optics.depth_intrinsics is not None and optics.T_color_depth is None:
+        optics = replace(optics, T_color_depth=np.eye(4))
+        notes.append("depth and colour camera are taken to stand in one place; --depth-to-color says otherwise")
+    return optics, tuple(notes)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras, ready to work."""
+
+    camera: Camera | None
+    """Pinhole camera of the frames handed out, None where intrinsics are unknown."""
+    stored_size: tuple[int, int]
+    """(height, width) of the colour pictures as stored, upright, px."""
+    color_size: tuple[int, int]
+    """(height, width) of the frames handed out, px."""
+    depth_size: tuple[int, int] | None
+    """(height, width) of the depth files, px."""
+    depth_scale: float
+    max_depth_m: float | None
+    undistortion: Undistortion | None
+    registration: Registration | None
+
+    def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Undistorted colour. Shape (H, W, 3). Raises `FrameError` for another size than the first frame's."""
+        if image.shape[:2] != self.stored_size:
+            raise FrameError(f"colour is {_size(image.shape)}, most frames {_size(self.stored_size)}")
+        if self.color_size != self.stored_size:
+            image = np.asarray(cv2.resize(image, self.color_size[::-1], interpolation=cv2.INTER_AREA))
+        return self.straight(image)
+
+    def straight(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Undistorted colour of a picture that has the size of the frames handed out. Shape (H, W, 3)."""
+        return image if self.undistortion is None else self.undistortion.color(image)
+
+    def depth(self, raw: NDArray[Any]) -> NDArray[np.float32]:
+        """Metric depth on the pixels of `camera`. Shape (H, W). Raises `FrameError` for another size."""
+        if raw.shape != self.depth_size:
+            raise FrameError(f"depth is {_size(raw.shape)}, most frames {_size(self.depth_size or (0, 0))}")
+        depth = clean_depth(raw, self.depth_scale, self.max_depth_m)
+        if self.registration is not None:
+            depth = self.registration(depth)
+            return depth if self.undistortion is None else depth * self.undistortion.seen
+        if depth.shape != self.color_size:
+            depth = np.asarray(cv2.resize(depth, self.color_size[::-1], interpolation=cv2.INTER_NEAREST_EXACT))
+        return depth if self.undistortion is None else self.undistortion.depth(depth)
+
+
+WORKING_SIDES = (960, 1280)
+"""Longest side of the frames handed out unless said otherwise, px: without depth, with depth."""
+
+
+def resized(camera: Camera | None, size: tuple[int, int]) -> Camera | None:
+    """The camera of its pictures at another (height, width); pixel (0, 0) is the centre of the upper left pixel."""
+    if camera is None or (camera.height, camera.width) == size:
+        return camera
+    x, y = size[1] / camera.width, size[0] / camera.height
+    cx, cy = (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5
+    return Camera(size[1], size[0], camera.fx * x, camera.fy * y, cx, cy, camera.distortion)
+
+
+def build_rig(
+    optics: Optics,
+    stored_size: tuple[int, int],
+    depth_size: tuple[int, int] | None,
+    max_depth_m: float | None,
+    max_side: int | None = None,
+) -> Rig:
+    """Check the cameras against the first images and tabulate. Raises `SourceError` and `OptionError`.
+
+    Frames larger than `max_side` are reduced, and the camera with them; see `SourceOptions.max_side`.
+    """
+    if optics.distortion and optics.intrinsics is None:
+        raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
+    limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
+    color_size = working_size(stored_size, limit)
+    lens = resized(_camera(optics.intrinsics, stored_size, "intrinsics", optics.distortion), color_size)
+    camera = lens.pinhole() if lens else None
+    undistortion = Undistortion(lens) if lens and lens.distortion else None
+    registration = None
+    if depth_size is not None:
+        if optics.depth_scale is None:
+            raise SourceError("the units of the depth images are unknown; give --depth-scale UNITS_PER_METRE")
+        registration = _registration(optics, camera, depth_size, stored_size)
+    scale = optics.depth_scale or 1.0
+    return Rig(camera, stored_size, color_size, depth_size, scale, max_depth_m, undistortion, registration)
+
+
+def _registration(
+    optics: Optics, camera: Camera | None, depth_size: tuple[int, int], color_size: tuple[int, int]
+) -> Registration | None:
+    if optics.depth_intrinsics is None:
+        if depth_size != color_size:
+            raise SourceError(
+                f"depth images are {_size(depth_size)} but colour images {_size(color_size)}; give the depth camera by "
+                "--depth-intrinsics fx,fy,cx,cy and its place by --depth-to-color"
+            )
+        return None
+    if camera is None:
+        raise SourceError("depth has a camera of its own but the colour camera has none; give --intrinsics fx,fy,cx,cy")
+    depth_camera = _camera(optics.depth_intrinsics, depth_size, "depth intrinsics", ())
+    assert depth_camera is not None and optics.T_color_depth is not None
+    same = replace(camera, distortion=()) == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
+    return None if same else Registration(depth_camera, camera, optics.T_color_depth)
+
+
+def _camera(
+    intrinsics: Intrinsics | None, size: tuple[int, int], name: str, distortion: tuple[float, ...]
+) -> Camera | None:
+    if intrinsics is None:
+        return None
+    height, width = size
+    fx, fy, cx, cy = intrinsics
+    if not (0 <= cx < width and 0 <= cy < height):
+        raise OptionError(f"{name}: centre ({cx:g}, {cy:g}) lies outside the image of {_size(size)}; scale them to it")
+    return Camera(width, height, fx, fy, cx, cy, distortion)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"

@@ -1,0 +1,285 @@
+"""What came and went between sessions teaches what was there: surfaces that another session sees through.
+
+A thing that discovery overlooked, or took for part of what it stands on, shows itself when it goes: its surface is in
+the keyframes of one session, and those of the other look through it. Such surfaces, gathered chunk by chunk into
+clusters, become local instances of the chunk that saw them, with masks in its frames, so that merging and the story of
+changes treat them like any other. Only what no instance of the chunk stands for already is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from list3r.instances.carving.carved_surfaces import Bools, ChangedPlaceSettings, Ints, Seen, ask, gone, lift, told
+from list3r.instances.geometric.features import object_feature
+from list3r.instances.geometric.support import thin
+from list3r.instances.settings import FEATURE_SPACE
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.masks import encode_mask
+from list3r.memory.overlap.visibility import View, views_of
+from list3r.memory.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
+from list3r.memory.store.store import Store
+from list3r.memory.store.tables.chunks import LocalNode
+
+__all__ = ["ChangedPlaceSettings", "add_changed_places"]
+
+
+def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSettings | None = None) -> int:
+    """Add local instances for what a session shows to have gone or come and no instance stands for; how many.
+
+    Call inside a transaction, after the chunks are placed. Chunks whose features are not of the space that is computed
+    here are left as they are.
+    """
+    s = settings or ChangedPlaceSettings()
+    chunks = store.chunks()
+    worlds = {c.component for c in chunks if c.session_id == session_id}
+    near = [c for c in chunks if c.component in worlds and c.session_id <= session_id]
+    if len({c.session_id for c in near}) < 2:
+        return 0
+    keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
+    upright = store.get_value("gravity", "unknown") != "unknown"
+    asked: list[tuple[ChunkRow, list[View], float, Seen]] = []
+    for chunk in near:
+        others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
+        if others and store.feature_space(chunk.chunk_id) == FEATURE_SPACE:
+            unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
+            own = views_of([chunk], keyframes, unit)
+            asked.append((chunk, own, unit, ask(own, views_of(others, keyframes, unit), unit, s)))
+    added = 0
+    left = {chunk.chunk_id: gone(seen, s) for chunk, _, _, seen in asked}
+    for chunk, own, unit, seen in asked:
+        here = [c for c, *_ in asked if c.component == chunk.component]
+        came = [left[c.chunk_id] for c in here if _is(c, session_id) != _is(chunk, session_id)]
+        nodes = store.local_nodes([chunk.chunk_id])
+        place = _Change(left[chunk.chunk_id], came, told(seen, s), unit, s)
+        standing = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
+        clusters = _unexplained(place, nodes, standing, chunk)
+        if not clusters:
+            continue
+        frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
+        maker = _Maker(chunk, keyframes[chunk.chunk_id], own, frames, unit, upright, s)
+        in_chunk = unit / float(chunk.S_world_chunk.scale)
+        following = 1 + max((n.local_id for n in nodes), default=-1)
+        for cluster in clusters:
+            thing = maker.make(following, cluster)
+            if thing is not None:
+                store.add_local_instance(chunk.chunk_id, thing)
+                store.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, standing, in_chunk, s))
+                following += 1
+                added += 1
+    return added
+
+
+def _is(chunk: ChunkRow, session_id: int) -> bool:
+    return chunk.session_id == session_id
+
+
+# ---------------------------------------------------------------------------------------------- what stands for it
+
+
+def _clusters(points: Array, unit: float, s: ChangedPlaceSettings) -> list[Ints]:
+    """Rows of connected surfaces that are large enough for a thing, the largest first."""
+    if len(points) < s.least_cells:
+        return []
+    pairs = cKDTree(points).query_pairs(s.link_m * unit, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    _, label = connected_components(graph, directed=False)
+    rows = [np.flatnonzero(label == n) for n in range(int(label.max()) + 1)]
+    kept = [r for r in rows if _is_thing(points[r], unit, s)]
+    return sorted(kept, key=lambda r: (-len(r), int(r[0])))
+
+
+def _is_thing(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
+    sides = np.sort(np.ptp(points, axis=0))
+    large = float(np.linalg.norm(sides)) > s.largest_m * unit
+    return len(points) >= s.least_cells and sides[1] >= s.least_side_m * unit and not large
+
+
+class _Change:
+    """What one chunk shows to have changed, world coordinates.
+
+    `gone` are its surfaces that the other sessions see through, `came` theirs that it sees through, `told` its surfaces
+    of which the others tell anything. Shapes (N, 3).
+    """
+
+    def __init__(
+        self, gone: Array, came: Sequence[Array], told: Array, unit: float, settings: ChangedPlaceSettings
+    ) -> None:
+        self.gone, self.unit, self.settings = gone, unit, settings
+        self._gone, self._told = cKDTree(gone), cKDTree(told)
+        self._either = cKDTree(np.concatenate([gone, *came]))
+
+    def explains(self, support: Array) -> bool:
+        """Whether all of an instance has changed: what is not seen through lies where something else stands now.
+
+        Two solid things that stood at one place leave surfaces that both sessions measure, so an instance is not asked
+        to be seen through as a whole; what reaches beyond the change is a mixture of what went with what stayed.
+        """
+        reach, link = 1.5 * self.settings.voxel_m * self.unit, self.settings.link_m * self.unit
+        if len(support) == 0 or len(self.gone) == 0:
+            return False
+        near = np.asarray(self._either.query(support, distance_upper_bound=link)[0] < np.inf)
+        if float(np.mean(near)) >= self.settings.explained or not near.any():
+            return bool(near.any())
+        known = np.asarray(self._told.query(support, distance_upper_bound=reach)[0] < np.inf)
+        return bool(known.any() and float(np.mean(near[known])) >= self.settings.explained)
+
+
+def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[bool], chunk: ChunkRow) -> list[Array]:
+    """Clusters of surfaces that are gone and that no instance of the chunk stands for. Shapes (N, 3)."""
+    s, unit, points = place.settings, place.unit, place.gone
+    clusters = _clusters(points, unit, s)
+    if not clusters:
+        return []
+    reach = 1.5 * s.voxel_m * unit
+    stood_for = np.zeros(len(points), bool)
+    for node, stands in zip(nodes, standing, strict=True):
+        if stands:
+            support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
+            stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
+    out = []
+    for rows in clusters:
+        left = rows[~stood_for[rows]]
+        if len(left) >= (1.0 - s.scrap) * len(rows):
+            out.append(points[rows])
+        else:
+            out += [points[left[r]] for r in _clusters(points[left], unit, s) if len(r) >= s.part * len(rows)]
+    return out
+
+
+def _mixed_with(
+    thing: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
+) -> list[tuple[int, int]]:
+    """Pairs of a thing with the chunk's instances that hold part of it beside what stayed: they are not this thing."""
+    reach = 1.5 * s.voxel_m * unit
+    out = []
+    for node, stands in zip(nodes, standing, strict=True):
+        if stands or len(node.support.points) == 0:
+            continue
+        covered = cKDTree(node.support.points).query(thing.support.points, distance_upper_bound=reach)[0] < np.inf
+        if float(np.mean(covered)) >= s.mixed:
+            out.append((node.local_id, thing.local_id))
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- what becomes of it
+
+
+class _Maker:
+    """Makes local instances of clusters for one chunk."""
+
+    def __init__(
+        self,
+        chunk: ChunkRow,
+        keyframes: Sequence[Keyframe],
+        views: Sequence[View],
+        frames: Sequence[FrameRow],
+        unit: float,
+        upright: bool,
+        settings: ChangedPlaceSettings,
+    ) -> None:
+        self._chunk, self._s, self._unit = chunk, settings, unit
+        kept = [k for k in keyframes if k.depth_small.size]
+        self._pictures = [_picture(k) for k in kept]
+        self._views = list(views)
+        self._frames = list(frames)
+        R = chunk.S_world_chunk.rotation
+        self._up = R.T @ np.array([0.0, 0.0, 1.0]) if upright else np.array([0.0, -1.0, 0.0])
+
+    def make(self, local_id: int, cluster: Array) -> LocalInstance | None:
+        """The local instance of a cluster, or None where its keyframes show too little of it."""
+        tree = cKDTree(cluster)
+        reach = 1.5 * self._s.voxel_m * self._unit
+        points, rgb, masks = [], [], {}
+        for view, picture in zip(self._views, self._pictures, strict=True):
+            lifted, row, column = lift(view)
+            low, high = cluster.min(axis=0) - reach, cluster.max(axis=0) + reach
+            near = np.flatnonzero(((lifted > low) & (lifted < high)).all(axis=1))
+            near = near[tree.query(lifted[near], distance_upper_bound=reach)[0] < np.inf] if len(near) else near
+            if len(near) < self._s.least_mask_px:
+                continue
+            mask = np.zeros(view.depth.shape, bool)
+            mask[row[near], column[near]] = True
+            masks[view.frame_index] = mask
+            points.append(lifted[near])
+            rgb.append(_colors(picture, row[near], column[near], view.depth.shape))
+        if len(masks) < 1:
+            return None
+        S_chunk_world = self._chunk.S_world_chunk.inverse()
+        inside = S_chunk_world.apply(np.concatenate(points)).astype(np.float32)
+        in_chunk = self._unit / float(self._chunk.S_world_chunk.scale)
+        support = thin(inside, np.concatenate(rgb), np.ones(len(inside), np.float32), in_chunk, self._s.max_points)
+        feature = object_feature(support.points, support.rgb, self._up, in_chunk)
+        return LocalInstance(local_id, self._track(masks, support), feature, support, 0.8)
+
+    def _track(self, masks: dict[int, Bools], support: Support) -> MaskTrack:
+        """Masks in the keyframes, and by projection in the frames between two of them."""
+        size = self._chunk.image_size
+        full = {k: _fill(_enlarge(m, size)) for k, m in masks.items()}
+        order = sorted(full)
+        keys = sorted(v.frame_index for v in self._views)
+        for f in self._frames:
+            n = int(np.searchsorted(keys, f.frame_index))
+            around = keys[max(0, n - 1) : n + 1]
+            if f.frame_index not in full and len(around) == 2 and all(k in masks for k in around):
+                mask = self._projected(support.points, f)
+                if mask.any():
+                    full[f.frame_index] = mask
+        order = sorted(full)
+        places = [np.nonzero(full[k]) for k in order]
+        boxes = [[c.min(), r.min(), c.max() + 1, r.max() + 1] for r, c in places]
+        areas = np.array([len(r) for r, _ in places], np.int32)
+        return MaskTrack(
+            frames=np.array(order, np.int64),
+            boxes_xyxy=np.array(boxes, np.float32),
+            centers_xy=np.array([[c.mean(), r.mean()] for r, c in places], np.float32),
+            areas_px=areas,
+            visible_fraction=np.minimum(1.0, areas / max(float(np.quantile(areas, 0.9)), 1.0)).astype(np.float32),
+            masks=tuple(encode_mask(full[k]) for k in order),
+            image_size=size,
+        )
+
+    def _projected(self, points: NDArray[np.float32], frame: FrameRow) -> Bools:
+        """Mask of surface points in a frame between keyframes."""
+        fx, fy, cx, cy = self._chunk.intrinsics
+        height, width = self._chunk.image_size
+        p = Sim3.from_matrix(frame.T_chunk_cam).inverse().apply(points.astype(np.float64))
+        p = p[p[:, 2] > 1e-6]
+        column = np.rint(p[:, 0] / p[:, 2] * fx + cx).astype(np.int64)
+        row = np.rint(p[:, 1] / p[:, 2] * fy + cy).astype(np.int64)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        mask = np.zeros((height, width), bool)
+        mask[row[inside], column[inside]] = True
+        return _fill(mask)
+
+
+def _picture(keyframe: Keyframe) -> NDArray[np.uint8] | None:
+    if not keyframe.jpeg:
+        return None
+    decoded = cv2.imdecode(np.frombuffer(keyframe.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return None if decoded is None else np.asarray(decoded[:, :, ::-1], np.uint8)
+
+
+def _colors(picture: NDArray[np.uint8] | None, row: Ints, column: Ints, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Colours at pixels of the small depth image; grey where no picture was kept. Shape (N, 3)."""
+    if picture is None:
+        return np.full((len(row), 3), 128, np.uint8)
+    r = np.minimum(((row + 0.5) * picture.shape[0] / shape[0]).astype(np.int64), picture.shape[0] - 1)
+    c = np.minimum(((column + 0.5) * picture.shape[1] / shape[1]).astype(np.int64), picture.shape[1] - 1)
+    return np.asarray(picture[r, c])
+
+
+def _enlarge(mask: Bools, size: tuple[int, int]) -> Bools:
+    return np.asarray(cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def _fill(mask: Bools) -> Bools:
+    """Holes of a few pixels closed."""
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0)

@@ -1,0 +1,101 @@
+"""Candidates of several anchors that are views of one thing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.base import Proposals
+from list3r.instances.geometric.fusion import View, project_depth
+from list3r.instances.geometric.views import ChunkViews
+
+MIN_OVERLAP = 0.4
+"""Overlap over union, of what both anchors see, from which two candidates are taken for one thing."""
+
+
+def join_candidates(views: ChunkViews, proposals: Sequence[Proposals]) -> list[NDArray[np.int64]]:
+    """The instance of each candidate of each anchor, numbered from 0 in order of first sight.
+
+    Candidates with a common identity are one; the others are joined best overlap first, and never two of one anchor.
+    """
+    offsets = np.cumsum([0] + [len(p.score) for p in proposals])
+    parent = np.arange(offsets[-1])
+    anchors: list[set[int]] = [{a} for a, p in enumerate(proposals) for _ in p.score]
+    if all(p.identity is not None for p in proposals):
+        known = np.concatenate([p.identity for p in proposals if p.identity is not None] or [np.zeros(0, np.int64)])
+        first: dict[int, int] = {}
+        for node, identity in enumerate(known.tolist()):
+            parent[node] = first.setdefault(identity, node)
+    else:
+        for _, a, b in sorted(_overlaps(views, proposals, offsets), key=lambda e: (-e[0], e[1], e[2])):
+            _union(parent, anchors, a, b)
+    roots = np.array([_find(parent, node) for node in range(len(parent))], np.int64)
+    number = {root: k for k, root in enumerate(dict.fromkeys(roots.tolist()))}
+    joined = np.array([number[root] for root in roots.tolist()], np.int64)
+    return [joined[offsets[a] : offsets[a + 1]] for a in range(len(proposals))]
+
+
+def _find(parent: NDArray[np.int64], node: int) -> int:
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = int(parent[node])
+    return node
+
+
+def _union(parent: NDArray[np.int64], anchors: list[set[int]], a: int, b: int) -> None:
+    a, b = sorted((_find(parent, a), _find(parent, b)))
+    if a != b and not anchors[a] & anchors[b]:
+        parent[b] = a
+        anchors[a] |= anchors[b]
+
+
+def _overlaps(
+    views: ChunkViews, proposals: Sequence[Proposals], offsets: NDArray[np.int64]
+) -> list[tuple[float, int, int]]:
+    """(overlap over union, node, node) of candidates of different anchors that see the same surface."""
+    edges = []
+    for a in range(len(proposals)):
+        for b in range(a + 1, len(proposals)):
+            table = _shared(views, proposals[a], proposals[b]) + _shared(views, proposals[b], proposals[a]).T
+            inter = table[1:, 1:]
+            union = table[1:].sum(axis=1)[:, None] + table[:, 1:].sum(axis=0)[None] - inter
+            for n, m in np.argwhere(inter > np.maximum(MIN_OVERLAP * union, 30)):
+                edges.append((float(inter[n, m] / union[n, m]), int(offsets[a] + n), int(offsets[b] + m)))
+    return edges
+
+
+def _shared(views: ChunkViews, source: Proposals, target: Proposals) -> NDArray[np.int64]:
+    """Pixels of the source that see a surface of the target, by candidate in both (0 is none). Shape (N+1, M+1)."""
+    a, b = views.view(source.position), views.view(target.position)
+    label, agrees = transfer_labels(views, target.labels[:: views.stride, :: views.stride], b, a)
+    mine = source.labels[:: views.stride, :: views.stride]
+    width = len(target.score) + 1
+    codes = mine[agrees].astype(np.int64) * width + label[agrees]
+    return np.bincount(codes, minlength=(len(source.score) + 1) * width).reshape(-1, width)
+
+
+def transfer_labels(
+    views: ChunkViews, labels: NDArray[np.int32], source: View, target: View
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Labels of the source view as the target view sees them, and where both see the same surface. Shape (h, w)."""
+    moved = np.linalg.inv(source.T_chunk_cam) @ target.T_chunk_cam
+    return warp_labels(views, labels, source, target.depth, moved)
+
+
+def warp_labels(
+    views: ChunkViews,
+    labels: NDArray[np.int32],
+    source: View,
+    depth: NDArray[np.float32],
+    T_source_cam: NDArray[np.float64],
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Labels of the source view looked up from a depth image of another camera. Shape (h, w) each."""
+    x, y, z = project_depth(depth, views.camera, T_source_cam, views.camera)
+    seen = cv2.remap(source.depth, x, y, cv2.INTER_NEAREST, borderValue=0)
+    found = cv2.remap(labels.astype(np.float32), x, y, cv2.INTER_NEAREST, borderValue=0).astype(np.int32)
+    tolerance = np.float32(4.0) * views.sigma(z) + np.float32(0.005 * views.unit)
+    agrees = (depth > 0) & (seen > 0) & (np.abs(seen - z) < tolerance)
+    return np.where(agrees, found, 0).astype(np.int32), agrees

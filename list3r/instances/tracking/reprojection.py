@@ -1,0 +1,301 @@
+"""Masks followed through a chunk by re-projection with a depth check (paper 3.1, A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Frame
+from list3r.instances.base import Proposals
+from list3r.instances.geometric.features import mean_feature
+from list3r.instances.geometric.rules.joining import join_candidates, warp_labels
+from list3r.instances.geometric.support import collect_supports
+from list3r.instances.geometric.views import ChunkViews, chunk_views
+from list3r.instances.separation import cannot_link_pairs
+from list3r.instances.settings import InstanceSettings
+from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.reconstruction.base import Reconstruction
+
+SAMPLES = 150
+"""Support points of an instance that are looked for in every frame."""
+
+
+@dataclass
+class _Track:
+    """What grows frame by frame for one instance."""
+
+    frames: list[int] = field(default_factory=list)
+    boxes: list[tuple[float, float, float, float]] = field(default_factory=list)
+    centers: list[tuple[float, float]] = field(default_factory=list)
+    areas: list[int] = field(default_factory=list)
+    visible: list[float] = field(default_factory=list)
+    agreement: list[float] = field(default_factory=list)
+    masks: list[NDArray[np.uint32]] = field(default_factory=list)
+
+
+class ReprojectionTracker:
+    """Follows every candidate through the chunk along the chunk's own geometry."""
+
+    def __init__(self, settings: InstanceSettings | None = None) -> None:
+        self.settings = settings or InstanceSettings()
+
+    def __call__(
+        self,
+        frames: Sequence[Frame],
+        reconstruction: Reconstruction,
+        proposals: Sequence[Proposals],
+        feature_space: str,
+    ) -> LocalLibrary:
+        """Join the candidates, follow them through every posed frame, keep the tracks that are stable."""
+        views = chunk_views(frames, reconstruction, self.settings)
+        joined = join_candidates(views, proposals)
+        count = max((int(j.max()) + 1 for j in joined if len(j)), default=0)
+        images = [_instance_image(views, p, j) for p, j in zip(proposals, joined, strict=True)]
+        bases = _bases(views, proposals, joined, count)
+        supports = collect_supports(views, proposals, images, bases, self.settings.track.support_points)
+        positions = np.array([p.position for p in proposals], np.int64)
+
+        def labels_of(position: int) -> NDArray[np.int32]:
+            return frame_labels(views, proposals, images, positions, position)
+
+        return LabelledChunk(views, proposals, joined, supports, self.settings).library(labels_of, feature_space)
+
+
+@dataclass(frozen=True)
+class LabelledChunk:
+    """Candidates that were given to instances, and the instances' supports: what any tracker ends in."""
+
+    views: ChunkViews
+    proposals: Sequence[Proposals]
+    joined: Sequence[NDArray[np.int64]]
+    """Instance of each candidate of each anchor, -1 for none."""
+    supports: Sequence[Support]
+    """One for each instance."""
+    settings: InstanceSettings
+
+    def library(self, labels_of: Callable[[int], NDArray[np.int32]], feature_space: str) -> LocalLibrary:
+        """The stable tracks; `labels_of` gives instance + 1 of each pixel of a frame at working size, by position."""
+        return self._library(self._follow(labels_of), feature_space)
+
+    def _follow(self, labels_of: Callable[[int], NDArray[np.int32]]) -> list[_Track]:
+        views, supports = self.views, self.supports
+        tracks = [_Track() for _ in supports]
+        samples, owner = _sample_supports(supports)
+        settings, camera = self.settings.track, views.reconstruction.camera
+        min_area = settings.min_area_px * camera.width * camera.height / (640 * 480)
+        for position in np.flatnonzero(views.reconstruction.posed).tolist():
+            labels = labels_of(position)
+            seen, hit = _look_for(views, position, labels, samples, owner=owner, count=len(supports))
+            runs = encode_labels(labels, views.stride, (camera.height, camera.width))
+            for instance, (mask, area, box, center) in runs.items():
+                if area < min_area:
+                    continue
+                track = tracks[instance]
+                track.frames.append(int(views.reconstruction.frame_indices[position]))
+                track.boxes.append(box)
+                track.centers.append(center)
+                track.areas.append(area)
+                track.visible.append(float(seen[instance]))
+                track.agreement.append(float(hit[instance]))
+                track.masks.append(mask)
+        return tracks
+
+    def _library(self, tracks: Sequence[_Track], feature_space: str) -> LocalLibrary:
+        views, proposals, joined, supports = self.views, self.proposals, self.joined, self.supports
+        size = (views.reconstruction.camera.height, views.reconstruction.camera.width)
+        posed = int(views.reconstruction.posed.sum())
+        least = self.settings.track.least_frames(posed)
+        instances: list[LocalInstance] = []
+        for number, (track, support) in enumerate(zip(tracks, supports, strict=True)):
+            stability = float(np.mean(track.agreement)) if track.agreement else 0.0
+            if len(track.frames) < least or stability < self.settings.track.min_stability or len(support.points) < 10:
+                continue
+            plane, structure = _surface(views, proposals, joined, number)
+            mask_track = MaskTrack(
+                np.array(track.frames, np.int64),
+                np.array(track.boxes, np.float32),
+                np.array(track.centers, np.float32),
+                np.array(track.areas, np.int32),
+                np.array(track.visible, np.float32),
+                tuple(track.masks),
+                size,
+            )
+            feature = _joined_feature(proposals, joined, number)
+            names = () if structure else _names(proposals, joined, number)
+            instance = LocalInstance(len(instances), mask_track, feature, support, stability, plane, structure)
+            instances.append(replace(instance, names=names))
+        pairs = cannot_link_pairs(instances, self.settings.track.cannot_link_frames, views.unit)
+        return LocalLibrary(tuple(instances), pairs, feature_space)
+
+
+def _instance_image(views: ChunkViews, proposals: Proposals, joined: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Instance + 1 of each pixel of an anchor at working size."""
+    table = np.append(0, joined + 1).astype(np.int32)
+    return table[proposals.labels[:: views.stride, :: views.stride]]
+
+
+def frame_labels(
+    views: ChunkViews,
+    proposals: Sequence[Proposals],
+    images: Sequence[NDArray[np.int32]],
+    positions: NDArray[np.int64],
+    position: int,
+) -> NDArray[np.int32]:
+    """Instance + 1 of each pixel of a frame, carried over from the nearest anchors that see it. Shape (h, w)."""
+    if position in positions:
+        return _tidy(images[int(np.flatnonzero(positions == position)[0])], views.small_depth(position))
+    depth = views.small_depth(position)
+    labels = np.zeros(depth.shape, np.int32)
+    left = depth.copy()
+    pose = views.pose(position)
+    for nearest in np.argsort(np.abs(positions - position), kind="stable")[:3].tolist():
+        source = views.view(proposals[nearest].position)
+        moved = np.linalg.inv(source.T_chunk_cam) @ pose
+        found, _ = warp_labels(views, images[nearest], source, left, moved)
+        labels = np.where(labels > 0, labels, found)
+        left[found > 0] = 0.0
+    return _tidy(labels, depth)
+
+
+def _tidy(labels: NDArray[np.int32], depth: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Labels without lone pixels, grown over pixels without a label that they surround."""
+    padded = np.pad(labels, 1)
+    alike, most = np.zeros(labels.shape, np.int8), np.zeros(labels.shape, np.int32)
+    for dy in (0, 1, 2):
+        for dx in (0, 1, 2):
+            if (dy, dx) != (1, 1):
+                near = padded[dy : dy + labels.shape[0], dx : dx + labels.shape[1]]
+                alike += near == labels
+                most = np.maximum(most, near)
+    kept = np.where(alike >= 3, labels, 0)
+    filled = cv2.morphologyEx((kept > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    grow = (kept == 0) & (filled > 0) & (depth <= 0)
+    return np.where(grow, most, kept).astype(np.int32)
+
+
+def encode_labels(
+    labels: NDArray[np.int32], stride: int, shape: tuple[int, int]
+) -> dict[int, tuple[NDArray[np.uint32], int, tuple[float, float, float, float], tuple[float, float]]]:
+    """Run-length code, area, box and centroid of every instance of a label image, at the colour image's size."""
+    full = np.repeat(np.repeat(labels, stride, axis=0), stride, axis=1)[: shape[0], : shape[1]]
+    flat = full.ravel()
+    starts = np.concatenate([[0], np.flatnonzero(flat[1:] != flat[:-1]) + 1])
+    stops = np.append(starts[1:], len(flat))
+    value = flat[starts]
+    known = value > 0
+    order = np.argsort(value[known], kind="stable")
+    starts, stops, value = starts[known][order], stops[known][order], value[known][order]
+    bounds = np.flatnonzero(np.diff(value, prepend=-1, append=-1))
+    out = {}
+    for low, high in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        out[int(value[low]) - 1] = _code(starts[low:high], stops[low:high], shape)
+    return out
+
+
+def _code(
+    starts: NDArray[np.int64], stops: NDArray[np.int64], shape: tuple[int, int]
+) -> tuple[NDArray[np.uint32], int, tuple[float, float, float, float], tuple[float, float]]:
+    bounds = np.empty(2 * len(starts) + 1, np.int64)
+    bounds[0], bounds[1::2], bounds[2::2] = 0, starts, stops
+    runs = np.diff(bounds)
+    tail = shape[0] * shape[1] - int(stops[-1])
+    runs = np.append(runs, tail) if tail else runs
+    length = stops - starts
+    row, column = starts // shape[1], starts % shape[1]
+    last_row, last_column = (stops - 1) // shape[1], (stops - 1) % shape[1]
+    wraps = last_row > row
+    x0 = 0 if wraps.any() else int(column.min())
+    x1 = shape[1] - 1 if wraps.any() else int(last_column.max())
+    area = int(length.sum())
+    middle = (starts + stops - 1) / 2.0
+    center_y = float((length * (middle // shape[1])).sum() / area)
+    center_x = float((length * np.where(wraps, shape[1] / 2.0, middle % shape[1])).sum() / area)
+    box = (float(x0), float(row.min()), float(x1 + 1), float(last_row.max() + 1))
+    return runs.astype(np.uint32), area, box, (center_x, center_y)
+
+
+def _sample_supports(supports: Sequence[Support]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    parts, owner = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.int64)]
+    for number, support in enumerate(supports):
+        chosen = np.unique(np.linspace(0, len(support.points) - 1, min(SAMPLES, len(support.points))).astype(int))
+        parts.append(support.points[chosen])
+        owner.append(np.full(len(chosen), number))
+    return np.concatenate(parts), np.concatenate(owner)
+
+
+def _look_for(
+    views: ChunkViews,
+    position: int,
+    labels: NDArray[np.int32],
+    samples: NDArray[np.float32],
+    *,
+    owner: NDArray[np.int64],
+    count: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """For each instance: share of its samples that are seen, and share of these that lie on its mask."""
+    T_cam_chunk = np.linalg.inv(views.pose(position))
+    p = samples @ T_cam_chunk[:3, :3].T.astype(np.float32) + T_cam_chunk[:3, 3].astype(np.float32)
+    z = np.maximum(p[:, 2], 1e-6)
+    camera = views.camera
+    u = np.rint(p[:, 0] / z * camera.fx + camera.cx).astype(np.int64)
+    v = np.rint(p[:, 1] / z * camera.fy + camera.cy).astype(np.int64)
+    inside = (p[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    read = views.small_depth(position)[v, u]
+    tolerance = 4.0 * views.sigma(z) + 0.005 * views.unit
+    seen = inside & (read > 0) & (np.abs(read - z) < tolerance)
+    on_mask = seen & (labels[v, u] == owner + 1)
+    total = np.maximum(np.bincount(owner, minlength=count), 1)
+    seen_count = np.bincount(owner, seen, minlength=count)
+    hit = np.bincount(owner, on_mask, minlength=count)
+    return seen_count / total, hit / np.maximum(seen_count, 1)
+
+
+def _surface(
+    views: ChunkViews, proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
+) -> tuple[NDArray[np.float64] | None, bool]:
+    """The plane of an instance in chunk coordinates, if its candidates have one, and whether it bounds the room."""
+    structure = False
+    for candidates, owner in zip(proposals, joined, strict=True):
+        for n in np.flatnonzero(owner == number):
+            structure |= bool(candidates.structure[n]) if candidates.structure is not None else False
+            if np.isfinite(candidates.plane[n]).all():
+                T_cam_chunk = np.linalg.inv(views.pose(candidates.position))
+                return np.asarray(candidates.plane[n] @ T_cam_chunk), structure
+    return None, structure
+
+
+def _bases(
+    views: ChunkViews, proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], count: int
+) -> NDArray[np.float64]:
+    """Plane of the wall or floor that each flat instance lies on, chunk coordinates, NaN for the others. (count, 4)."""
+    out = np.full((count, 4), np.nan)
+    for candidates, owner in zip(proposals, joined, strict=True):
+        if candidates.base is not None:
+            known = np.isfinite(candidates.base).all(axis=1) & np.isnan(out[owner, 0])
+            out[owner[known]] = candidates.base[known] @ np.linalg.inv(views.pose(candidates.position))
+    return out
+
+
+def _names(
+    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
+) -> tuple[tuple[str, float], ...]:
+    """What an instance's candidates were called, with their scores, in order of the anchors."""
+    return tuple(
+        (p.names[n], float(p.score[n]))
+        for p, owner in zip(proposals, joined, strict=True)
+        if p.names is not None
+        for n in np.flatnonzero(owner == number).tolist()
+    )
+
+
+def _joined_feature(
+    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
+) -> NDArray[np.float32]:
+    rows = [p.features[j == number] for p, j in zip(proposals, joined, strict=True)]
+    score = [p.score[j == number] for p, j in zip(proposals, joined, strict=True)]
+    return mean_feature(np.concatenate(rows), np.concatenate(score))

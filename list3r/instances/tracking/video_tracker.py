@@ -1,0 +1,273 @@
+"""Masks followed through a chunk by a video tracker: SAM 2, SAM 3 or EdgeTAM of `transformers` (paper A.1).
+
+One bounded state for each sweep: the memories that the network no longer reads are dropped, and when more things are
+followed than allowed a new state begins with those that are in view, prompted again by their own masks. A thing first
+found on a later anchor is followed backwards in a second sweep. Ids are handed over by the overlap of masks on anchors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Frame
+from list3r.instances.base import Proposals
+from list3r.instances.geometric.support import collect_supports
+from list3r.instances.geometric.views import ChunkViews, chunk_views
+from list3r.instances.settings import InstanceSettings
+from list3r.instances.tracking.reprojection import LabelledChunk
+from list3r.memory.errors import OptionError
+from list3r.memory.records import LocalLibrary
+from list3r.models.images import InputShape, network_input, sam_input
+from list3r.models.pretrained import load_named
+from list3r.reconstruction.base import Reconstruction
+
+if TYPE_CHECKING:
+    import torch
+
+    Sessions = Callable[[], Any]
+
+CLASSES = {
+    "sam2": "Sam2VideoModel",
+    "sam3": "Sam3TrackerVideoModel",
+    "edgetam": "EdgeTamVideoModel",
+}
+SESSIONS = {
+    "sam2": "Sam2VideoInferenceSession",
+    "sam3": "Sam3TrackerVideoInferenceSession",
+    "edgetam": "EdgeTamVideoInferenceSession",
+}
+
+
+@dataclass(frozen=True)
+class VideoTrackerSettings:
+    """How things are followed and handed over."""
+
+    most_live: int = 60
+    """Things followed at one time; cost and memory of a frame grow with each."""
+    same_iou: float = 0.5
+    """A candidate that overlaps a followed thing's mask by this is a view of that thing."""
+    covered: float = 0.7
+    """A candidate of which this share is followed already, by whatever, is no new thing."""
+
+    def __post_init__(self) -> None:
+        if self.most_live < 1:
+            raise OptionError(f"at least 1 thing must be followed, not {self.most_live}")
+
+
+class VideoTracker:
+    """Tracker: candidates of the anchors prompt a network that carries masks from frame to frame."""
+
+    def __init__(
+        self,
+        model: str,
+        folder: Path,
+        device: str = "auto",
+        settings: InstanceSettings | None = None,
+        tracker: VideoTrackerSettings | None = None,
+    ) -> None:
+        """`model` is sam2, sam3 or edgetam, `folder` holds its configuration and weights. Raises `OptionError`."""
+        self._network, self._device = load_named(CLASSES, "tracking", model, folder, device)
+        if model == "edgetam":
+            _even_scores(self._network)
+        self._session_class = SESSIONS[model]
+        self._settings = settings or InstanceSettings()
+        self._tracker = tracker or VideoTrackerSettings()
+        self._shape = sam_input(model, int(self._network.config.image_size))
+
+    def __call__(
+        self,
+        frames: Sequence[Frame],
+        reconstruction: Reconstruction,
+        proposals: Sequence[Proposals],
+        feature_space: str,
+    ) -> LocalLibrary:
+        """Follow all candidates through the posed frames, forwards and backwards; keep the stable tracks."""
+        views = chunk_views(frames, reconstruction, self._settings)
+        order = np.flatnonzero(reconstruction.posed).tolist()
+        things = _Things(proposals, views, self._tracker)
+        for position, masks in self._sweep(frames, order, things, forwards=True):
+            things.keep(position, masks)
+        if things.late:
+            for position, masks in self._sweep(frames, order[::-1], things, forwards=False):
+                things.keep(position, masks)
+        images = [things.labels(p.position) for p in proposals]
+        bases = np.full((things.count, 4), np.nan)
+        supports = collect_supports(views, proposals, images, bases, self._settings.track.support_points)
+        chunk = LabelledChunk(views, proposals, things.joined, supports, self._settings)
+        return chunk.library(things.labels, feature_space)
+
+    def _sweep(
+        self, frames: Sequence[Frame], order: Sequence[int], things: _Things, *, forwards: bool
+    ) -> Iterator[tuple[int, dict[int, NDArray[np.float32]]]]:
+        """Logits (h, w) of every followed thing at working size, frame by frame in the given order."""
+        import torch
+
+        state = _State(self._new_session(frames), self._network)
+        with torch.inference_mode():
+            for position in order:
+                picture = network_input(frames[position].color, self._shape, self._device, self._network.dtype)
+                found = state.step(picture, position, things.shape, reverse=not forwards)
+                prompts = things.prompts(position, found, forwards=forwards)
+                if prompts:
+                    live = {**{k: v > 0 for k, v in found.items() if (v > 0).any()}, **prompts}
+                    if len(state.objects | prompts.keys()) > self._tracker.most_live:
+                        state = _State(self._new_session(frames), self._network)
+                        prompts = things.most_wanted(live)
+                    state.prompt(prompts, position, self._shape)
+                    found = state.step(picture, position, things.shape, reverse=not forwards)
+                state.forget(position)
+                yield position, found
+
+    def _new_session(self, frames: Sequence[Frame]) -> Any:
+        import transformers
+
+        height, width = frames[0].color.shape[:2]
+        return getattr(transformers, self._session_class)(
+            video=None,
+            video_height=height,
+            video_width=width,
+            inference_device=self._device,
+            inference_state_device=self._device,
+            video_storage_device=self._device,
+            dtype=self._network.dtype,
+        )
+
+
+def _even_scores(network: Any) -> None:
+    """Give the score of a prompted and of a followed thing one shape.
+
+    EdgeTAM of transformers 5.23 returns them with different numbers of axes, and then cannot join them when both kinds
+    are in one frame.
+    """
+    plain = network._run_single_frame_inference
+
+    def even(*arguments: Any, **options: Any) -> Any:
+        out = plain(*arguments, **options)
+        out["object_score_logits"] = out["object_score_logits"].reshape(1, 1)
+        return out
+
+    network._run_single_frame_inference = even
+
+
+class _State:
+    """One inference session of the network, kept small."""
+
+    def __init__(self, session: Any, network: Any) -> None:
+        self._session, self._network = session, network
+        self.objects: set[int] = set()
+        config = network.config
+        self._reach = max(int(config.num_maskmem), int(config.max_object_pointers_in_encoder)) + 1
+        """Frames back that the network reads from its memory."""
+
+    def step(
+        self, picture: torch.Tensor, position: int, shape: tuple[int, int], *, reverse: bool
+    ) -> dict[int, NDArray[np.float32]]:
+        """Logits (h, w) of every object on a frame."""
+        from torch.nn import functional
+
+        self._session.add_new_frame(picture, position)
+        if not self.objects:
+            return {}
+        out = self._network(inference_session=self._session, frame_idx=position, reverse=reverse)
+        logits = out.pred_masks.float().reshape(-1, 1, *out.pred_masks.shape[-2:])
+        logits = functional.interpolate(logits, size=shape, mode="bilinear", align_corners=False)[:, 0]
+        return dict(zip(self._session.obj_ids, logits.cpu().numpy(), strict=True))
+
+    def prompt(self, masks: dict[int, NDArray[np.bool_]], position: int, shape: InputShape) -> None:
+        """Tell the network where objects are on a frame by their masks (h, w)."""
+        import torch
+        from torch.nn import functional
+
+        for number, mask in masks.items():
+            at = self._session.obj_id_to_idx(number)
+            whole = torch.from_numpy(mask.astype(np.float32))[None, None]
+            whole = functional.interpolate(whole, size=(shape.height, shape.width), mode="bilinear")
+            self._session.add_mask_inputs(at, position, (whole >= 0.5).to(whole.dtype))
+        self._session.obj_with_new_inputs = list(masks)
+        self.objects |= masks.keys()
+
+    def forget(self, position: int) -> None:
+        """Drop the frame and the memories that no later frame reads."""
+        self._session.processed_frames[position] = None  # its number still counts as a frame of the video
+        self._session.cache.clear_all()
+        for number in range(len(self.objects)):
+            kept = self._session.output_dict_per_obj[number]["non_cond_frame_outputs"]
+            for old in [k for k in kept if abs(k - position) > self._reach]:
+                del kept[old]
+
+
+class _Things:
+    """What is followed: which candidate belongs to which thing, and where each thing was seen."""
+
+    def __init__(self, proposals: Sequence[Proposals], views: ChunkViews, settings: VideoTrackerSettings) -> None:
+        self._anchors = {p.position: n for n, p in enumerate(proposals)}
+        self._proposals, self._views, self._settings = proposals, views, settings
+        self.joined = [np.full(len(p.score), -1, np.int64) for p in proposals]
+        """Thing of each candidate of each anchor, -1 for none."""
+        self.count = 0
+        self.shape = (views.camera.height, views.camera.width)
+        self.late: dict[int, int] = {}
+        """First anchor's position of things that were not found on the first anchor."""
+        self._best = {
+            int(p): np.zeros(self.shape, np.float32) for p in np.flatnonzero(views.reconstruction.posed).tolist()
+        }
+        self._label = {p: np.zeros(self.shape, np.int32) for p in self._best}
+        self._prompted: dict[tuple[int, int], NDArray[np.bool_]] = {}
+
+    def prompts(
+        self, position: int, found: dict[int, NDArray[np.float32]], *, forwards: bool
+    ) -> dict[int, NDArray[np.bool_]]:
+        """Things that begin on a frame, with their masks (h, w): new ones forwards, the late ones backwards."""
+        if position not in self._anchors:
+            return {}
+        if not forwards:
+            return {k: self._prompted[position, k] for k, first in self.late.items() if first == position}
+        return self._take(position, found)
+
+    def _take(self, position: int, found: dict[int, NDArray[np.float32]]) -> dict[int, NDArray[np.bool_]]:
+        """Give each candidate of an anchor to the thing whose mask it overlaps, or make it a new thing."""
+        number = self._anchors[position]
+        labels = self._proposals[number].labels[:: self._views.stride, :: self._views.stride]
+        followed = {k: v > 0 for k, v in found.items()}
+        covered = np.logical_or.reduce(list(followed.values())) if followed else np.zeros(self.shape, bool)
+        new: dict[int, NDArray[np.bool_]] = {}
+        for candidate in range(len(self._proposals[number].score)):
+            mask = labels == candidate + 1
+            area = int(mask.sum())
+            if area == 0:
+                continue
+            iou = {k: (mask & m).sum() / max(1, (mask | m).sum()) for k, m in followed.items()}
+            best = max(iou, key=lambda k: (iou[k], -k), default=-1)
+            if best >= 0 and iou[best] >= self._settings.same_iou:
+                self.joined[number][candidate] = best
+            elif (mask & covered).sum() < self._settings.covered * area:
+                self.joined[number][candidate] = self.count
+                new[self.count] = mask
+                self._prompted[position, self.count] = mask
+                if position != min(self._anchors):
+                    self.late[self.count] = position
+                self.count += 1
+        return new
+
+    def most_wanted(self, live: dict[int, NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:
+        """The largest things in view, as many as may be followed."""
+        order = sorted(live, key=lambda k: (-int(live[k].sum()), k))
+        return {k: live[k] for k in sorted(order[: self._settings.most_live])}
+
+    def keep(self, position: int, masks: dict[int, NDArray[np.float32]]) -> None:
+        """Give every pixel of a frame to the thing that is surest of it."""
+        best, label = self._best[position], self._label[position]
+        for number, logits in masks.items():
+            wins = logits > best
+            label[wins] = number + 1
+            best[wins] = logits[wins]
+
+    def labels(self, position: int) -> NDArray[np.int32]:
+        """Thing + 1 of each pixel of a frame at working size (h, w), 0 for none."""
+        return self._label[position]

@@ -1,0 +1,97 @@
+"""What has changed between sessions: things seen again, moved, removed, added (design 3.9).
+
+Things of two sessions are one where their surfaces meet, they look alike, and neither session sees through the surface
+of the other. A thing of an earlier session that the new one did not find is asked about in the new session's frames:
+only where they see through its place, or measure there the surface of something new, is it gone, and what no frame
+could see stays unseen. What is new is asked about in the frames of the sessions before in the same
+way. What is gone from one place and new at another is one thing that moved if it looks and measures the same, one to
+one, the best pairs first decided together. A thing that moved keeps what earlier sessions saw of it, but its body is
+that of the place where it is now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from list3r.memory.change.free_space import SeenThrough
+from list3r.memory.change.matching import Story
+from list3r.memory.change.places import Places
+from list3r.memory.change.records import Change, Changes, ChangeSettings
+from list3r.memory.geometry import Sim3
+from list3r.memory.merging.edges import Key, PairScores
+from list3r.memory.overlap.summaries import ChunkSummary
+from list3r.memory.overlap.voxels import ChunkShapes
+from list3r.memory.records import ChangeEvent, ChunkRow
+from list3r.memory.store.store import Store
+
+__all__ = ["Change", "ChangeSettings", "Changes", "across_sessions", "as_events", "find_changes"]
+
+_LIGHTNESS = np.array([0.5, 1.0, 1.0])
+
+
+def across_sessions(
+    pairs: Mapping[tuple[int, int], PairScores],
+    shapes: Mapping[int, ChunkShapes],
+    S_graph_chunk: Mapping[int, Sim3],
+    seen: SeenThrough,
+    settings: ChangeSettings,
+) -> dict[tuple[int, int], PairScores]:
+    """Scores of pairs without those that plainly are two things of two sessions at one place."""
+    if len({s.session_id for s in shapes.values()}) < 2:
+        return dict(pairs)
+    out = {}
+    for (u, v), p in pairs.items():
+        a, b = shapes[u], shapes[v]
+        if a.session_id == b.session_id:
+            out[u, v] = p
+            continue
+        size_a, size_b = a.size[p.i] / a.unit, b.size[p.j] / b.unit
+        whole = (a.truncated[p.i] < settings.most_truncated) & (b.truncated[p.j] < settings.most_truncated)
+        whole &= np.maximum(size_a, size_b) < settings.small_m
+        color = np.linalg.norm((a.lab[p.i] - b.lab[p.j]) * _LIGHTNESS, axis=1)
+        ratio = np.maximum(size_a, size_b) / np.maximum(np.minimum(size_a, size_b), 1e-9)
+        changed = seen.shares(a, b, p, S_graph_chunk[v].inverse() @ S_graph_chunk[u])
+        keep = ~(whole & ((color > settings.other_color) | (ratio > settings.other_size)))
+        one, both = np.maximum(*changed), np.minimum(*changed)
+        keep &= (one < settings.seen_through) | (~whole & (both < settings.seen_through / 2))
+        out[u, v] = PairScores(*(x[keep] for x in (p.i, p.j, p.i_on_j, p.j_on_i, p.shared, p.frame_iou)))
+    return out
+
+
+def find_changes(
+    store: Store,
+    groups: Sequence[Sequence[Key]],
+    shown: Sequence[bool],
+    fixed: frozenset[Key],
+    chunks: Sequence[ChunkRow],
+    summaries: Mapping[int, ChunkSummary],
+    settings: ChangeSettings,
+) -> Changes:
+    """Go through the sessions in order and say what each has changed.
+
+    `groups` are the things by overlap, `shown` those that count, `fixed` the first members of those that were seen
+    moving and have a story of their own. Nothing is done for a memory of one session.
+    """
+    plain = [list(g) for g in groups]
+    sessions = sorted({c.session_id for c in chunks})
+    if len(sessions) < 2:
+        return Changes(plain, {}, {}, (), [])
+    places = Places(store, plain, chunks, summaries, settings)
+    story = Story(places, shown, fixed, store.constraints(), settings)
+    for session in sessions[1:]:
+        story.tell(session)
+    return story.result()
+
+
+def as_events(changes: Changes, ids: Mapping[Key, int | None]) -> list[ChangeEvent]:
+    """The events of things that have an id, by the first member of their groups."""
+    out = []
+    for c in changes.events:
+        instance = ids.get(c.first)
+        if instance is not None:
+            out.append(
+                ChangeEvent(c.session_id, instance, c.kind, c.from_box, c.to_box, c.frames, c.confidence, c.reason)
+            )
+    return out

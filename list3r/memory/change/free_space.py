@@ -1,0 +1,56 @@
+"""How much of each local instance the frames of another session see through: what stayed, and what did not.
+
+Two local instances of two sessions at one place are one thing only if neither session sees through the surface of the
+other. That is asked of depth alone, so it holds for two things that look alike and for one thing in another light.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.merging.edges import PairScores
+from list3r.memory.overlap.visibility import View, VisibilitySettings, chunk_views, seen_through_share
+from list3r.memory.overlap.voxels import ChunkShapes
+from list3r.memory.store.store import Store
+
+_KEPT = 64
+"""Chunks whose depth pictures are kept at hand."""
+
+
+class SeenThrough:
+    """Asks the keyframes of one chunk about the instances of another one."""
+
+    def __init__(self, store: Store, settings: VisibilitySettings, least_overlap: float = 0.2) -> None:
+        self._store, self._s, self._least = store, settings, least_overlap
+        self._views: OrderedDict[int, list[View]] = OrderedDict()
+
+    def shares(self, u: ChunkShapes, v: ChunkShapes, p: PairScores, S_v_u: Sim3) -> tuple[Array, Array]:
+        """For each pair of instances of two chunks the share of either that the other chunk sees through.
+
+        Of what that chunk tells about; 0 where it tells too little, where the two hardly meet, and for structure.
+        Shape (E,) each.
+        """
+        meet = np.maximum(p.i_on_j, p.j_on_i) >= self._least
+        return self._of(u, v, p.i, meet, S_v_u), self._of(v, u, p.j, meet, S_v_u.inverse())
+
+    def _of(self, own: ChunkShapes, other: ChunkShapes, at: np.ndarray, meet: np.ndarray, S_other_own: Sim3) -> Array:
+        out = np.zeros(len(at))
+        for n in np.unique(at[meet]).tolist():
+            if not own.structure[n]:
+                start, stop = np.searchsorted(own.owner, [n, n + 1])
+                points = S_other_own.apply(own.points[start:stop])
+                out[meet & (at == n)] = seen_through_share(points, self._views_of(other), self._s) or 0.0
+        return out
+
+    def _views_of(self, shapes: ChunkShapes) -> list[View]:
+        """The keyframes of a chunk, in its own coordinates."""
+        k = shapes.chunk_id
+        if k not in self._views:
+            self._views[k] = chunk_views(shapes.session_id, self._store.keyframes(k), shapes.unit)
+        self._views.move_to_end(k)
+        while len(self._views) > _KEPT:
+            self._views.popitem(last=False)
+        return self._views[k]

@@ -1,0 +1,130 @@
+"""What was told of changes when a session last ended, in terms of local instances, which never change.
+
+Until the next session ends it stands: its chunks come to the library by overlap alone, what had moved stays one thing
+whose body is where it was last, and what had events stays shown. Then all is told anew (`memory.changes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from list3r.memory.change.records import Changes
+from list3r.memory.overlap.pair_scores import Key
+from list3r.memory.records import ChunkRow
+from list3r.memory.store.store import Store
+
+_NAME = "tale"
+Group = tuple[Key, ...]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A thing that was at several places."""
+
+    places: tuple[Group, ...]
+    """Groups by overlap."""
+    now: int
+    """Which of them is where it is now."""
+
+
+@dataclass(frozen=True)
+class Tale:
+    """The story of the sessions that have ended."""
+
+    session: int
+    """The last session that it tells of."""
+    moved: tuple[Moved, ...] = ()
+    told: frozenset[Key] = frozenset()
+    """A local instance of every thing that has an event."""
+
+    @staticmethod
+    def of(changes: Changes, places: Sequence[Sequence[Key]], session: int) -> Tale:
+        """What was found, given the groups by overlap that it was found for."""
+        home = {key: tuple(g) for g in places for key in g}
+        moved = []
+        for group in changes.groups:
+            if group[0] in changes.current:
+                parts = sorted({home[key] for key in group})
+                moved.append(Moved(tuple(parts), parts.index(home[changes.current[group[0]][0]])))
+        return Tale(session, tuple(moved), frozenset(e.first for e in changes.events))
+
+    def shows(self, group: Collection[Key]) -> bool:
+        """Whether a group has an event, so that it is shown however little was seen of it."""
+        return not self.told.isdisjoint(group)
+
+    def current(self, group: Sequence[Key]) -> tuple[Key, ...]:
+        """The members of a thing that show it where it is now; all, but for what has moved."""
+        here = set(group)
+        for m in self.moved:
+            if not here.isdisjoint(m.places[m.now]):
+                return tuple(k for k in group if k in m.places[m.now])
+        return tuple(group)
+
+    def keys(self) -> set[Key]:
+        """All local instances that it speaks of."""
+        return {k for m in self.moved for place in m.places for k in place} | self.told
+
+    def joined(self, groups: Sequence[Sequence[Key]], components: Mapping[int, int]) -> tuple[list[list[Key]], Tale]:
+        """Groups by overlap with those joined that are the places of one thing, and the tale with the places as they
+        have become; what it says of things that are not among the groups stands. `components` by chunk id.
+        """
+        home = {key: n for n, group in enumerate(groups) for key in group}
+        root = list(range(len(groups)))
+        owner: dict[int, Moved] = {}
+        absent = []
+        for m in self.moved:
+            found = sorted({root[home[k]] for place in m.places for k in place if k in home})
+            here = sorted({home[k] for k in m.places[m.now] if k in home})
+            if not found or not here:
+                absent += [m] if not found else []
+                continue
+            component = components[groups[here[0]][0][0]]
+            same = [n for n in found if components[groups[n][0][0]] == component]
+            root = [same[0] if n in same else n for n in root]
+            owner[same[0]] = m
+        parts: dict[int, list[int]] = {}
+        for n, first in enumerate(root):
+            parts.setdefault(first, []).append(n)
+        renewed = [_renewed([groups[n] for n in ns], owner.get(first)) for first, ns in parts.items()]
+        out = sorted(sorted(k for n in ns for k in groups[n]) for ns in parts.values())
+        moved = sorted([*absent, *(m for m in renewed if m is not None)], key=lambda m: min(m.places))
+        return out, Tale(self.session, tuple(moved), self.told)
+
+    def state(self, before: str | None, group: Sequence[Key], rows: Mapping[int, ChunkRow]) -> str:
+        """The state of a thing: the one that was told, until a later session sees it."""
+        later = any(rows[k].session_id > self.session for k in {k for k, _ in group})
+        return "present" if before is None or later else before
+
+
+def _renewed(groups: Sequence[Sequence[Key]], before: Moved | None) -> Moved | None:
+    """The places of one thing as groups have become; nothing where they are one by overlap."""
+    if before is None or len(groups) < 2:
+        return None
+    there = set(before.places[before.now])
+    here = [g for g in groups if not there.isdisjoint(g)]
+    rest = [tuple(sorted(g)) for g in groups if there.isdisjoint(g)]
+    now = tuple(sorted(k for g in here for k in g))
+    places = sorted([now, *rest])
+    return Moved(tuple(places), places.index(now)) if here and rest else None
+
+
+def read_tale(store: Store, chunks: Sequence[ChunkRow]) -> Tale | None:
+    """What stands of changes; None where several sessions have ended and nothing is written down of them."""
+    told = store.get_value(_NAME)
+    if told is not None:
+        moved = (Moved(tuple(_keys(p) for p in m["places"]), int(m["now"])) for m in told["moved"])
+        return Tale(int(told["session"]), tuple(moved), frozenset(_keys(told["told"])))
+    complete = {s.session_id for s in store.sessions() if s.state == "complete"}
+    ended = sorted({c.session_id for c in chunks} & complete)
+    return Tale(ended[0] if ended else 0) if len(ended) < 2 else None
+
+
+def write_tale(store: Store, tale: Tale) -> None:
+    """Keep it; call inside `transaction()`."""
+    moved = [{"places": [list(map(list, p)) for p in m.places], "now": m.now} for m in tale.moved]
+    store.set_value(_NAME, {"session": tale.session, "moved": moved, "told": sorted(map(list, tale.told))})
+
+
+def _keys(pairs: Sequence[Sequence[int]]) -> Group:
+    return tuple((int(k), int(n)) for k, n in pairs)

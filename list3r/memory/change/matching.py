@@ -1,0 +1,278 @@
+"""The sessions told one after another: who was seen again, who moved, who went, who came."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from list3r.memory.change.places import Places, difference
+from list3r.memory.change.records import Change, Changes, ChangeSettings
+from list3r.memory.constraints import Constraints
+from list3r.memory.geometry import Array, OrientedBox
+from list3r.memory.merging.edges import Key
+from list3r.memory.overlap.visibility import Look
+from list3r.memory.records import MergeDecision
+
+_NEVER = 1e6
+
+
+@dataclass
+class _Thing:
+    """One thing and the places it had: groups by overlap, of which one is where it is now."""
+
+    places: list[int]
+    now: int
+    state: str = "present"
+
+
+@dataclass(frozen=True)
+class _Move:
+    """A thing that is gone from one place and found at another."""
+
+    thing: _Thing
+    place: int
+    deviations: float
+    """Sum of squared deviations between what is gone and what is found."""
+    chance: float
+    """Of being the same thing rather than one of the other candidates or none, in [0, 1]."""
+
+
+class Story:
+    """Tells what each session has changed; the result stands when all are told, in order."""
+
+    def __init__(
+        self, places: Places, shown: Sequence[bool], fixed: frozenset[Key], word: Constraints, settings: ChangeSettings
+    ) -> None:
+        self._p, self._s, self._word = places, settings, word
+        groups = places.groups
+        self._movable = [
+            g[0] not in fixed and places.flagged(n) < settings.most_structure for n, g in enumerate(groups)
+        ]
+        self._counts = [bool(show) and loose for show, loose in zip(shown, self._movable, strict=True)]
+        self._thing = {n: _Thing([n], n) for n in range(len(groups))}
+        self._instead: set[int] = set()
+        """New things that stand where others stood."""
+        self._events: list[tuple[int, Change]] = []
+        self._decisions: list[MergeDecision] = []
+
+    def tell(self, session: int) -> None:
+        """What one session has changed."""
+        p = self._p
+        components = {c.component for c in p.rows.values() if c.session_id == session}
+        fresh = [n for n, s in enumerate(p.sessions) if s[0] == session and p.component[n] in components]
+        fresh = [n for n in fresh if self._counts[n] and p.known_before(n, session)]
+        looks = {n: p.look_before(n, session) for n in fresh}
+        gone = self._missing(session, components, [n for n in fresh if looks[n].verdict != "unseen"])
+        left = {thing.now: p.box(thing.now, session, before=True) for thing, _ in gone}
+        came = {n: p.box(n, session, before=False) for n in fresh}
+        found_gone = {thing.now: found for thing, found in gone}
+        replaced = {n for n in fresh if n in self._instead or self._replaces(n, left, session)}
+        eligible = [n for n in fresh if looks[n].verdict != "there" or n in replaced]
+        news = {n: came[n] for n in eligible}
+        whole = [n for n in eligible if not self._scrap(n, news, session, before=False)]
+        lost = [(t, found) for t, found in gone if not self._scrap(t.now, left, session, before=True)]
+        for move in self._moves(lost, whole, session):
+            fresh.remove(move.place)
+            self._move(move, session, found_gone[move.thing.now])
+        for thing, found in gone:
+            if thing.state == "unseen" and self._counts[thing.now]:
+                if self._scrap(thing.now, left, session, before=True):
+                    thing.state = "removed"
+                else:
+                    self._remove(thing, session, found)
+        came = {n: box for n, box in came.items() if looks[n].verdict == "gone" or n in replaced}
+        for n in fresh:
+            if n in came and not self._scrap(n, came, session, before=False):
+                self._add(n, session, looks[n])
+
+    def _replaces(self, n: int, left: dict[int, OrientedBox], session: int) -> bool:
+        """Whether a new thing stands where one stood that is gone."""
+        p, s = self._p, self._s
+        return any(
+            p.component[n] == p.component[place]
+            and p.inside(n, box, s.replaced_slack_m, session, before=False) >= s.replaced
+            for place, box in left.items()
+        )
+
+    def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_Thing, Look]]:
+        """The things that are gone from where they were; all others that were known are given their state."""
+        p = self._p
+        gone: list[tuple[_Thing, Look]] = []
+        for thing in self._things():
+            if p.sessions[thing.now][0] >= session or p.component[thing.now] not in components:
+                continue
+            seen = [n for n in thing.places if session in p.sessions[n]]
+            if seen:
+                self._seen(thing, seen, session)
+            elif thing.state != "removed":
+                thing.state = "unseen"
+                if self._movable[thing.now] and p.frames(thing.now, session) >= self._s.least_frames:
+                    found = p.look_after(thing.now, session)
+                    other = self._displaced_by(thing.now, fresh, session)
+                    if found.verdict == "gone" or other is not None or self._taken(thing.now, found, fresh, session):
+                        gone.append((thing, found))
+                        self._instead.update([] if other is None else [other])
+                    elif found.verdict == "there" and self._counts[thing.now]:
+                        self._still_there(thing, session, found)
+        return gone
+
+    def _taken(self, n: int, found: Look, fresh: Sequence[int], session: int) -> bool:
+        """Whether something new stands where a thing was: what is not seen through of it lies at that."""
+        p, s = self._p, self._s
+        if found.verdict == "unseen" or p.changed(n, session, before=True) < s.seen_through:
+            return False
+        new = [m for m in fresh if p.component[m] == p.component[n]]
+        new = [m for m in new if p.changed(m, session, before=False) >= s.seen_through / 2]
+        return p.explained(n, new, session) >= s.explained
+
+    def _displaced_by(self, n: int, fresh: Sequence[int], session: int) -> int | None:
+        """Something new of other looks that is where most of a thing was: two bodies are never at one place."""
+        p, s = self._p, self._s
+        old = p.looks(n, session, before=True).feature
+        for m in fresh:
+            if p.component[m] == p.component[n] and p.changed(m, session, before=False) >= s.mostly_new:
+                box = p.box(m, session, before=False, stayed=True)
+                if (
+                    p.inside(n, box, 0.0, session, before=True) >= s.displaced
+                    and float(old @ p.looks(m, session, before=False).feature) < s.moved_cosine
+                ):
+                    return m
+        return None
+
+    def _things(self) -> list[_Thing]:
+        return [thing for n, thing in sorted(self._thing.items()) if thing.places[0] == n]
+
+    def _scrap(self, n: int, boxes: dict[int, OrientedBox], session: int, *, before: bool) -> bool:
+        """Whether it is a scrap of a larger thing that went or came with it."""
+        own = float(np.prod(boxes[n].size))
+        return any(
+            float(np.prod(box.size)) > own
+            and self._p.inside(n, box, self._s.replaced_slack_m, session, before=before) >= self._s.part
+            for m, box in boxes.items()
+            if m != n and self._p.component[m] == self._p.component[n]
+        )
+
+    def _seen(self, thing: _Thing, places: list[int], session: int) -> None:
+        p = self._p
+        place = thing.now if thing.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
+        kind = "seen_again" if place == thing.now else "moved"
+        before = p.box(thing.now, session, before=True, stayed=True)
+        after = p.box(place, session, before=False, stayed=True)
+        thing.now, thing.state = place, "present" if kind == "seen_again" else "moved"
+        if self._counts[place]:
+            frames = p.frames_in(place, session)
+            reason = f"its surface was found at its place in {frames} frames"
+            sure = frames / (frames + 4.0)
+            self._tell(thing, session, kind, before, after, p.evidence(place, session), sure, reason)
+
+    def _still_there(self, thing: _Thing, session: int, found: Look) -> None:
+        thing.state = "present"
+        box = self._p.box(thing.now, session, before=True, stayed=True)
+        reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
+        self._tell(thing, session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason)
+
+    def _remove(self, thing: _Thing, session: int, found: Look) -> None:
+        thing.state = "removed"
+        box = self._p.box(thing.now, session, before=True)
+        reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
+        self._tell(thing, session, "removed", box, None, found.frames, _sure(found), reason)
+
+    def _add(self, place: int, session: int, found: Look) -> None:
+        thing = self._thing[place]
+        thing.state = "added"
+        box = self._p.box(place, session, before=False)
+        seen = f"{len(found.frames)} frames of an earlier session see through its place"
+        known = found.verdict == "gone"
+        reason = seen if known else "it stands where something else stood that is gone"
+        sure = _sure(found) if known else 0.5
+        self._tell(thing, session, "added", None, box, self._p.evidence(place, session), sure, reason)
+
+    def _move(self, move: _Move, session: int, found: Look) -> None:
+        p, thing, place = self._p, move.thing, move.place
+        old, new = p.box(thing.now, session, before=True), p.box(place, session, before=False)
+        a, b = p.groups[thing.now][0], p.groups[place][0]
+        distance = float(np.linalg.norm(new.center - old.center)) / p.unit
+        reason = f"gone from its place and found {distance:.2f} m away, of the same look and size"
+        scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
+        self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
+        sure = _sure(found) * move.chance
+        self._tell(thing, session, "moved", old, new, p.evidence(place, session), sure, reason)
+        thing.places.append(place)
+        thing.now, thing.state = place, "moved"
+        del self._thing[place]
+
+    def _tell(
+        self,
+        thing: _Thing,
+        session: int,
+        kind: str,
+        before: OrientedBox | None,
+        after: OrientedBox | None,
+        frames: tuple[tuple[int, int], ...],
+        confidence: float,
+        reason: str,
+    ) -> None:
+        first = self._p.groups[thing.places[0]][0]
+        change = Change(first, session, kind, before, after, frames[:8], round(confidence, 3), reason)
+        self._events.append((thing.places[0], change))
+
+    def _moves(self, gone: Sequence[tuple[_Thing, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
+        """Pairs of what is gone and what is new, one to one, of least difference in all."""
+        if not gone or not fresh:
+            return []
+        p = self._p
+        cost = np.full((len(gone), len(fresh)), _NEVER)
+        new = [p.looks(n, session, before=False) for n in fresh]
+        for i, (thing, _) in enumerate(gone):
+            old = p.looks(thing.now, session, before=True)
+            taken = {s for n in thing.places for s in p.sessions[n]}
+            own = [k for n in thing.places for k in p.groups[n]]
+            for j, n in enumerate(fresh):
+                if (
+                    p.component[n] == p.component[thing.now]
+                    and not taken.intersection(p.sessions[n])
+                    and not self._word.forbids(own, list(p.groups[n]))
+                ):
+                    cost[i, j] = min(difference(old, new[j], self._s, p.unit), _NEVER)
+        # For every thing that is gone there is one more column: that it was not found, at the price of the limit.
+        rest = np.full((len(gone), len(gone)), _NEVER)
+        np.fill_diagonal(rest, self._s.moved_most)
+        rows, columns = linear_sum_assignment(np.hstack([cost, rest]))
+        return [
+            _Move(gone[i][0], fresh[j], float(cost[i, j]), _chance(cost, i, j, self._s.moved_most))
+            for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
+            if j < len(fresh) and cost[i, j] < _NEVER
+        ]
+
+    def result(self) -> Changes:
+        """The groups as the story leaves them."""
+        groups, current, states = [], {}, {}
+        names: dict[int, Key] = {}
+        for thing in self._things():
+            keys = sorted(k for n in thing.places for k in self._p.groups[n])
+            groups.append(keys)
+            names[thing.places[0]] = keys[0]
+            if len(thing.places) > 1:
+                current[keys[0]] = tuple(self._p.groups[thing.now])
+            if thing.state != "present":
+                states[keys[0]] = thing.state
+        events = tuple(Change(names[n], *(getattr(c, f) for f in _FIELDS)) for n, c in self._events if n in names)
+        return Changes(sorted(groups), current, states, events, self._decisions)
+
+
+_FIELDS = ("session_id", "kind", "from_box", "to_box", "frames", "confidence", "reason")
+
+
+def _sure(found: Look) -> float:
+    frames = len(found.frames)
+    return float(max(found.free, 0.3) * frames / (frames + 1.0))
+
+
+def _chance(cost: Array, i: int, j: int, none: float) -> float:
+    """How likely a pair is, beside the other candidates of either and that there is none, by their deviations."""
+    others = np.concatenate([np.delete(cost[i], j), np.delete(cost[:, j], i), [none]])
+    odds = float(np.exp(-0.5 * (others - cost[i, j])).sum())
+    return round(1.0 / (1.0 + odds), 3)

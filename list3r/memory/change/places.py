@@ -1,0 +1,253 @@
+"""The places of things, session by session: what was seen there, what it looked like, what frames tell about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from list3r.memory.change.records import ChangeSettings
+from list3r.memory.geometry import Array, OrientedBox
+from list3r.memory.merging.edges import Key
+from list3r.memory.overlap.summaries import ChunkSummary, world_unit
+from list3r.memory.overlap.visibility import Look, View, changed_points, look, seen_through_share, tally, views_of
+from list3r.memory.overlap.voxels import ChunkShapes
+from list3r.memory.records import ChunkRow
+from list3r.memory.relations.bodies import fit_box
+from list3r.memory.store.store import Store
+
+_SPREAD = 0.02
+"""Share of points outside the box at either end by which things are compared."""
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What a group looks like, over the members of some sessions."""
+
+    extent: Array
+    """Larger and smaller side of the footprint, height; world units, upright where gravity is known. Shape (3,)."""
+    feature: NDArray[np.float32]
+    """Unit length. Shape (D,)."""
+
+
+def difference(a: Looks, b: Looks, s: ChangeSettings, unit: float = 1.0) -> float:
+    """Sum of squared deviations between two looks; infinite for two that cannot be one thing."""
+    deviation = np.array(s.moved_share) * (a.extent + b.extent) / 2 + s.moved_m * unit
+    sides = np.minimum(((a.extent - b.extent) / deviation) ** 2, s.moved_side_most)
+    cosine = float(a.feature @ b.feature)
+    total = float(sides.sum()) + (1.0 - cosine) / s.moved_feature
+    return total if cosine >= s.moved_cosine and total <= s.moved_most else float("inf")
+
+
+class Places:
+    """The groups of local instances as places of things, numbered."""
+
+    def __init__(
+        self,
+        store: Store,
+        groups: Sequence[Sequence[Key]],
+        chunks: Sequence[ChunkRow],
+        summaries: Mapping[int, ChunkSummary],
+        settings: ChangeSettings,
+    ) -> None:
+        self.groups = groups
+        self.rows = {c.chunk_id: c for c in chunks}
+        self.shapes: dict[int, ChunkShapes] = {k: v.shapes for k, v in summaries.items()}
+        self.unit = world_unit(chunks, summaries)
+        self._upright = store.get_value("gravity", "unknown") != "unknown"
+        self._first = min(c.component for c in chunks)
+        self._store, self._s = store, settings
+        self._views: dict[tuple[int, int], list[View]] = {}
+        self._share: dict[tuple[Key, int, bool], float] = {}
+        self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
+        self.component = [self.rows[g[0][0]].component for g in groups]
+
+    def members(self, n: int, session: int, *, before: bool, stayed: bool = False) -> list[Key]:
+        """Members of the last session before, or of this one; those that tell of the change, if it has not `stayed`."""
+        owner = [self.rows[k].session_id for k, _ in self.groups[n]]
+        wanted = session
+        if before:
+            earlier = [s for s in owner if s < session]
+            wanted = max(earlier) if earlier else session
+        inside = [k for k, s in zip(self.groups[n], owner, strict=True) if s == wanted]
+        return inside if stayed else self._pure(n, inside, session, before=before)
+
+    def _pure(self, n: int, members: list[Key], session: int, *, before: bool) -> list[Key]:
+        """Those that hold least of what stayed, where what they show has changed: not what is mixed with a table."""
+        if len(members) < 2:
+            return members
+        shares = np.array([self._shares(key, n, session, before=before) for key in members])
+        common = float(np.average(shares, weights=[len(self._points_of(key)) + 1 for key in members]))
+        if common < self._s.seen_through / 2:
+            return members
+        return [k for k, share in zip(members, shares.tolist(), strict=True) if share >= self._s.pure * common]
+
+    def _shares(self, key: Key, n: int, session: int, *, before: bool) -> float:
+        """Share of the surface of one member that is seen through."""
+        name = (key, session, before)
+        if name not in self._share:
+            self._share[name] = self._changed(self._points_of(key), n, session, before=before)
+        return self._share[name]
+
+    def points(self, n: int, session: int, *, before: bool, stayed: bool = False) -> Array:
+        """Some surface points, world coordinates. Shape (N, 3)."""
+        parts = [self._points_of(key) for key in self.members(n, session, before=before, stayed=stayed)]
+        points = np.concatenate(parts) if parts else np.zeros((0, 3))
+        return points[:: max(1, len(points) // self._s.points)]
+
+    def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
+        """The box of what was seen of it; unless it has stayed, of what of that has changed."""
+        points = self.points(n, session, before=before, stayed=stayed)
+        if not stayed:
+            points = self._without_what_stayed(points, self._views_across(n, session, before=before))
+        upright = self._upright and self.component[n] == self._first
+        return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
+
+    def inside(self, n: int, box: OrientedBox, slack_m: float, session: int, *, before: bool) -> float:
+        """Share of its surface points that lie in a box."""
+        points = self.points(n, session, before=before)
+        if len(points) == 0:
+            return 0.0
+        off = np.abs((points - box.center) @ box.rotation)
+        return float(np.mean(np.all(off <= box.size / 2 + slack_m * self.unit, axis=1)))
+
+    def look_after(self, n: int, session: int) -> Look:
+        """What a session's frames see where a thing was before."""
+        points = self.points(n, session, before=True)
+        return look(points, self._views_of(session, self.component[n]), self._s.visibility)
+
+    def look_before(self, n: int, session: int) -> Look:
+        """What the frames of the last session that could tell saw where a thing is now."""
+        points = self.points(n, session, before=False)
+        for views in self._views_before(n, session):
+            found = look(points, views, self._s.visibility)
+            if found.verdict != "unseen":
+                return found
+        return Look("unseen", 0.0, ())
+
+    def changed(self, n: int, session: int, *, before: bool) -> float:
+        """Share of its surface that is seen through, of what is told: of what was, by a session that comes after;
+        of what is, by the sessions before.
+        """
+        return self._changed(self.points(n, session, before=before), n, session, before=before)
+
+    def explained(self, n: int, new: Sequence[int], session: int) -> float:
+        """Share of the surface that a thing had which is seen through or lies at what is new there, of what is told."""
+        points = self.points(n, session, before=True)
+        free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
+        known = free + met > 0
+        if not known.any():
+            return 0.0
+        surfaces = [self.points(m, session, before=False) for m in new]
+        near = np.zeros(len(points), bool)
+        if any(len(x) for x in surfaces):
+            reach = self._s.replaced_link_m * self.unit
+            tree = cKDTree(np.concatenate(surfaces))
+            near = np.asarray(tree.query(points, distance_upper_bound=reach)[0] < np.inf)
+        return float(np.mean((near | (free > met))[known]))
+
+    def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
+        lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)
+        shares = (seen_through_share(points, views, self._s.visibility) for views in lists)
+        return next((share for share in shares if share is not None), 0.0)
+
+    def _views_before(self, n: int, session: int) -> Iterator[list[View]]:
+        """The views of the sessions before, in the world of a thing, the last session first."""
+        component = self.component[n]
+        earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
+        return (self._views_of(s, component) for s in sorted(earlier, reverse=True))
+
+    def known_before(self, n: int, session: int) -> bool:
+        """Whether an earlier session lies in the same world, so that a thing can be new to it."""
+        return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
+
+    def looks(self, n: int, session: int, *, before: bool) -> Looks:
+        """Its looks, the views that show most of it first; what is there all along is left out of its size.
+
+        `before` a session that does not show it there any more, else in the first session that does.
+        """
+        keys = self.members(n, session, before=before)
+        weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
+        feature = np.average([self.shapes[k].feature[self._at(k, i)] for k, i in keys], axis=0, weights=weight)
+        length = float(np.linalg.norm(feature))
+        views = self._views_across(n, session, before=before)
+        return Looks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
+
+    def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[View]) -> Array:
+        """Weighted median over its whole views, so that what one view took from its surroundings does not count."""
+        whole = [self.shapes[k].truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
+        sizes, weights = [], []
+        for key, is_whole, w in zip(keys, whole, weight, strict=True):
+            points = self._points_of(key)
+            points = self._without_what_stayed(points, views)
+            if len(points) and (is_whole or not any(whole)):
+                sizes.append(self._sides(fit_box(points, upright=self._upright, trim=_SPREAD)))
+                weights.append(w)
+        if not sizes:
+            return np.ones(3)
+        return np.array([_weighted_median(np.array(sizes)[:, d], np.array(weights)) for d in range(3)])
+
+    def _views_across(self, n: int, session: int, *, before: bool) -> list[View]:
+        """The views that tell what of a thing has changed: of this session where it was there before, else before."""
+        return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
+
+    def _without_what_stayed(self, points: Array, views: Sequence[View]) -> Array:
+        """The points that have changed, where that is enough of them."""
+        changed = points[changed_points(points, views, self._s.visibility)]
+        return changed if len(changed) >= self._s.least_changed * len(points) else points
+
+    def _sides(self, box: OrientedBox) -> Array:
+        if not self._upright:
+            return np.sort(box.size)[::-1]
+        return np.array([*np.sort(box.size[:2])[::-1], box.size[2]])
+
+    def flagged(self, n: int) -> float:
+        """Share of its members that are flagged as structure."""
+        return float(np.mean([self.shapes[k].structure[self._at(k, i)] for k, i in self.groups[n]]))
+
+    def frames(self, n: int, before: int) -> int:
+        """Frames of earlier sessions in which a thing was seen."""
+        return sum(self.frames_in(n, s) for s in self.sessions[n] if s < before)
+
+    def frames_in(self, n: int, session: int) -> int:
+        """Frames of one session in which a thing was seen."""
+        return len({f for _, f in self._sightings(n, session)})
+
+    def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
+        """The frames of a session that see most of a thing."""
+        best: dict[int, int] = {}
+        for area, frame in self._sightings(n, session):
+            best[frame] = max(area, best.get(frame, 0))
+        return tuple((session, f) for f in sorted(best, key=lambda f: (-best[f], f)))
+
+    def _sightings(self, n: int, session: int) -> list[tuple[int, int]]:
+        out = []
+        for chunk_id, local_id in self.groups[n]:
+            if self.rows[chunk_id].session_id == session:
+                shape, at = self.shapes[chunk_id], self._at(chunk_id, local_id)
+                out += [(int(a), int(f)) for a, f in zip(shape.areas_px[at], shape.frames[at], strict=True)]
+        return out
+
+    def _views_of(self, session: int, component: int) -> list[View]:
+        if (session, component) not in self._views:
+            rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
+            keyframes = {c.chunk_id: self._store.keyframes(c.chunk_id) for c in rows}
+            self._views[session, component] = views_of(rows, keyframes, self.unit)
+        return self._views[session, component]
+
+    def _points_of(self, key: Key) -> Array:
+        shape, at = self.shapes[key[0]], self._at(*key)
+        start, stop = np.searchsorted(shape.owner, [at, at + 1])
+        return np.asarray(self.rows[key[0]].S_world_chunk.apply(shape.points[start:stop]))
+
+    def _at(self, chunk_id: int, local_id: int) -> int:
+        return int(np.searchsorted(self.shapes[chunk_id].local_id, local_id))
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])

@@ -1,0 +1,197 @@
+"""Which groups are things and which are fragments: what the other chunks say of the same place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import Sim3
+from list3r.memory.overlap.missed import LookSettings, bears_out, frames_beside, misses
+from list3r.memory.overlap.pair_scores import Key, Meetings, Numbering, PairScores
+from list3r.memory.overlap.voxels import ChunkShapes, Ints
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """When a group of local instances is shown."""
+
+    min_frames: int = 12
+    """A thing seen in fewer frames, over all chunks, is not shown; fewer are asked of a short memory."""
+    min_share: float = 0.15
+    """Share of all frames that is enough in a short memory, but never fewer than three frames."""
+    swallowed: float = 0.75
+    """Share of its surface that another chunk gives to one other thing, to speak against it."""
+    min_agreement: float = 0.4
+    """Share of the chunks that saw its place and found it too."""
+    claim_m: float = 0.1
+    """Edge of the cells in which the claims of things to a place are counted."""
+    claims: int = 4
+    """A bit that one chunk alone gives to a thing, and this many to another, is not part of it."""
+    looks: LookSettings = field(default_factory=LookSettings)
+    """When a chunk of computed depth has missed a thing."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for and against one group."""
+
+    frames: int
+    """Different frames in which it is seen."""
+    found: int
+    """Chunks that found it."""
+    swallowed: int
+    """Chunks that saw its place, but as part of another thing."""
+    within: tuple[int, ...]
+    """Those other things (numbers of groups), the one named most first."""
+    missed: int = 0
+    """Chunks of computed depth that looked at it in frames they share with one that found it, and found nothing."""
+
+    @property
+    def agreement(self) -> float:
+        """Share of the chunks that saw its place and found it as a thing of its own."""
+        return self.found / max(self.found + self.swallowed + self.missed, 1)
+
+    def shown(self, s: EvidenceSettings, all_frames: int) -> bool:
+        """Seen in enough of all posed frames, and more chunks for it than against (or nearly, if several found it)."""
+        agreed = self.found > self.swallowed + self.missed or (self.found >= 3 and self.agreement >= s.min_agreement)
+        enough = min(s.min_frames, max(3, math.ceil(s.min_share * all_frames)))
+        return self.frames >= enough and agreed
+
+
+def weigh(
+    groups: Sequence[Sequence[Key]],
+    chunks: Mapping[int, ChunkShapes],
+    pairs: Mapping[tuple[int, int], PairScores],
+    settings: EvidenceSettings,
+    wanted: Collection[int] | None = None,
+) -> list[Evidence]:
+    """The evidence for each group, from the scores of all pairs of chunks.
+
+    With `wanted` only these groups are weighed, by the pairs of their chunks, and the others are left without any;
+    every local instance of those chunks must be in a group.
+    """
+    numbering = Numbering(chunks)
+    home = numbering.homes(groups)
+    weighed = np.zeros(len(groups) + 1, dtype=bool)
+    weighed[list(range(len(groups)) if wanted is None else wanted)] = True
+    frames = [_frames_of(g, chunks) if weighed[n] else set() for n, g in enumerate(groups)]
+    chunk_of = np.array([k for k, _ in numbering.keys], np.int64)
+    meet = Meetings.of(pairs, numbering)
+    against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
+    beside = frames_beside(chunks, pairs)
+    for inner, outer, cover in ((meet.a, meet.b, meet.a_on_b), (meet.b, meet.a, meet.b_on_a)):
+        a, b = home[inner], home[outer]
+        swallowed = np.flatnonzero((a != b) & weighed[a] & (cover >= settings.swallowed))
+        met = zip(inner[swallowed].tolist(), outer[swallowed].tolist(), strict=True)
+        agreed = [
+            bears_out(numbering.keys[x], numbering.keys[y], chunks, beside, settings.looks.least_share) for x, y in met
+        ]
+        swallowed = swallowed[np.array(agreed, bool)]
+        seen_by = chunk_of[outer[swallowed]].tolist()
+        rows = zip(a[swallowed].tolist(), b[swallowed].tolist(), cover[swallowed].tolist(), seen_by, strict=True)
+        for n, other, share, chunk in rows:
+            claim = (share, -other)
+            against[n][chunk] = max(claim, against[n].get(chunk, claim))
+    out = []
+    for n, group in enumerate(groups):
+        own = {k for k, _ in group}
+        votes: dict[int, int] = {}
+        for chunk, (_, other) in sorted(against[n].items()):
+            if chunk not in own:
+                votes[-other] = votes.get(-other, 0) + 1
+        ranked = tuple(sorted(votes, key=lambda g: (-votes[g], g)))
+        asked = weighed[n] and not all(_bounds(chunks, key) for key in group)
+        silent = {v for u in own for v in beside.get(u, {})} - own - against[n].keys() if asked else set()
+        missed = sum(misses(v, group, chunks, beside, settings.looks) for v in silent)
+        out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked, missed))
+    return out
+
+
+def without_missed(
+    before: Mapping[Key, int], groups: Sequence[Sequence[Key]], evidence: Sequence[Evidence], shown: Sequence[bool]
+) -> dict[Key, int]:
+    """The ids of before without those of things that others looked at and missed, and that lie within no other: they
+    were never there, so that no thing goes on with their id.
+    """
+    gone = {
+        key
+        for group, e, show in zip(groups, evidence, shown, strict=True)
+        if e.missed and not show and not e.within
+        for key in group
+    }
+    return {key: n for key, n in before.items() if key not in gone}
+
+
+def _bounds(chunks: Mapping[int, ChunkShapes], key: Key) -> bool:
+    """Whether a local instance is a surface that bounds the room, of which each chunk sees what it sees."""
+    chunk = chunks.get(key[0])
+    return chunk is not None and bool(chunk.structure[int(np.searchsorted(chunk.local_id, key[1]))])
+
+
+def _frames_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes]) -> set[tuple[int, int]]:
+    """(session id, Frame.index) of the frames in which a group is seen."""
+    seen: set[tuple[int, int]] = set()
+    for chunk_id, local_id in group:
+        if chunk_id in chunks:
+            shapes = chunks[chunk_id]
+            at = int(np.searchsorted(shapes.local_id, local_id))
+            seen.update((shapes.session_id, f) for f in shapes.frames[at].tolist())
+    return seen
+
+
+def contested(
+    groups: Sequence[Sequence[Key]],
+    chunks: Mapping[int, ChunkShapes],
+    S_world_chunk: Mapping[int, Sim3],
+    unit: float,
+    settings: EvidenceSettings,
+    near: Ints | None = None,
+) -> dict[int, tuple[Ints, NDArray[np.bool_]]]:
+    """The points of each chunk that it alone gives to a thing, while several chunks give their place to another one.
+
+    Only things that at least three chunks found lose points so: a chair's back that one chunk took for table. Returns
+    by chunk which points were asked about and whether they are dropped, (M,) each; with `near` (keys of cells, see
+    `claim_cells`) only those that lie there are, and every local instance with points there must be in a group.
+    """
+    names = sorted(chunks)
+    number = {k: n for n, k in enumerate(names)}
+    group = [np.full(len(chunks[k].local_id), -1, np.int64) for k in names]
+    large = np.array([*(len({k for k, _ in g}) >= 3 for g in groups), False], dtype=bool)
+    for n, members in enumerate(groups):
+        for chunk_id, local_id in members:
+            if chunk_id in number:
+                group[number[chunk_id]][int(np.searchsorted(chunks[chunk_id].local_id, local_id))] = n
+    cells = [claim_cells(chunks[k], S_world_chunk[k], unit, settings) for k in names]
+    asked = [np.arange(len(c)) if near is None else np.flatnonzero(_among(c, near)) for c in cells]
+    owner = np.concatenate([g[chunks[k].owner[a]] for g, k, a in zip(group, names, asked, strict=True)])
+    chunk = np.concatenate([np.full(len(a), n) for n, a in enumerate(asked)])
+    drop = np.zeros(len(owner), dtype=bool)
+    if len(owner):
+        _, place = np.unique(np.concatenate([c[a] for c, a in zip(cells, asked, strict=True)]), return_inverse=True)
+        claim, at = np.unique(place * (len(groups) + 1) + owner, return_inverse=True)
+        pairs = np.unique(at * len(names) + chunk)
+        count = np.bincount(pairs // len(names), minlength=len(claim))
+        most = np.zeros(int(place.max()) + 1, np.int64)
+        np.maximum.at(most, claim // (len(groups) + 1), count)
+        drop = large[owner] & (count[at] == 1) & (most[place] >= settings.claims)
+    split = np.cumsum([len(a) for a in asked])[:-1]
+    return {k: (a, d) for k, a, d in zip(names, asked, np.split(drop, split), strict=True)}
+
+
+def claim_cells(chunk: ChunkShapes, S_world_chunk: Sim3, unit: float, settings: EvidenceSettings) -> Ints:
+    """Key of the cell in which each representative point of a chunk lies. Shape (R,)."""
+    cell = np.floor(S_world_chunk.apply(chunk.points) / (settings.claim_m * unit)).astype(np.int64) + (1 << 20)
+    c = np.clip(cell, 0, (1 << 21) - 1)
+    return np.asarray(c[:, 0] << 42 | c[:, 1] << 21 | c[:, 2])
+
+
+def _among(keys: Ints, wanted: Ints) -> NDArray[np.bool_]:
+    """Whether each key is one of the wanted ones, which ascend."""
+    if len(wanted) == 0:
+        return np.zeros(len(keys), dtype=bool)
+    at = np.minimum(np.searchsorted(wanted, keys), len(wanted) - 1)
+    return np.asarray(wanted[at] == keys)

@@ -1,0 +1,246 @@
+"""What things are called by detectors and by discoverers with class names: votes kept for local instances.
+
+Votes are log odds that add up, kept in the key-value table for each chunk and each source, so that labels follow
+whatever becomes of the groups, and a source that looks again replaces what it said itself and nothing else. An
+operator's word always wins, a name that an operator took away stays away, and structure is never named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from list3r.memory.constraints import Key
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+
+_CLASSES = "label classes"
+"""Key of the classes that each source knows; there as soon as one has voted."""
+PRIOR_ODDS = math.log(0.02 / 0.98)
+"""Log odds that a thing is of a given class before anything is seen: some fifty kinds of things stand in rooms."""
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What was seen of a local instance, or of several together."""
+
+    missed: float
+    """Log odds that every class loses for all frames that looked; a class has them back for those that found it."""
+    classes: Mapping[str, tuple[float, float]]
+    """By class: in how many pictures it was found (weighted), and the log odds that they add up to."""
+    looks: float = 0.0
+    """In how many pictures it was looked at (weighted); 0 where nobody counted."""
+
+    def __add__(self, other: Votes) -> Votes:
+        names = sorted({*self.classes, *other.classes})
+        zero = (0.0, 0.0)
+        return Votes(
+            self.missed + other.missed,
+            {n: _plus(self.classes.get(n, zero), other.classes.get(n, zero)) for n in names},
+            self.looks + other.looks,
+        )
+
+
+@dataclass(frozen=True)
+class LabelSettings:
+    """When votes make a label."""
+
+    min_found: float = 1.2
+    """Independent pictures in which the class was found, weighted by how well they see the thing: one is not enough."""
+    min_confidence: float = 0.5
+    """Probability of the class."""
+    likeness: float = 0.4
+    """Correlation of what a detector says in two pictures of one thing: n pictures say as much as n / (1 + likeness
+    (n - 1)) of different things would, never more than 1 / likeness. Chosen on redkitchen: from 0.25 to 0.5 mugs, table
+    and four chairs keep their names, the fifth chair and one magazine come and go.
+    """
+    always_wrong: float = 0.03
+    """A detector may be wrong in the same way in every picture; no label is surer than one less this."""
+
+
+@dataclass(frozen=True)
+class DetectedLabel:
+    """A label and where it comes from."""
+
+    label: str
+    confidence: float
+    """Probability of the class, in [0, 1]."""
+    found: float
+    """Independent pictures in which it was found, weighted."""
+    detector: str
+    """Who found it, by name, with commas between several."""
+
+
+def put_votes(
+    store: Store, chunk_id: int, source: str, votes: Mapping[int, Votes], class_names: Iterable[str] | None = None
+) -> None:
+    """Keep what a source saw of a chunk, instead of what the same one saw before. Call inside `transaction()`.
+
+    `class_names` are the classes that it knows, where that is a closed list: it says nothing against others.
+    """
+    rows = {
+        str(n): [
+            round(v.missed, 4),
+            {c: [round(a, 4), round(b, 4)] for c, (a, b) in v.classes.items()},
+            round(v.looks, 4),
+        ]
+        for n, v in sorted(votes.items())
+    }
+    store.set_value(_key(chunk_id), {**store.get_value(_key(chunk_id), {}), source: rows})
+    known = store.get_value(_CLASSES, {})
+    names = None if class_names is None else sorted(class_names)
+    if source not in known or known[source] != names:
+        store.set_value(_CLASSES, {**known, source: names})
+
+
+def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
+    """What a discoverer with class names says of a local instance, from its names and scores on the anchors.
+
+    A score is taken for the probability of the class; anchors that follow one another see nearly the same view with the
+    same mistakes, so each has half a voice.
+    """
+    classes: dict[str, tuple[float, float]] = {}
+    looks = 0.0
+    for name, score in names:
+        looks += 0.5
+        p = min(max(score, 0.02), 0.98)
+        classes[name] = _plus(classes.get(name, (0.0, 0.0)), (0.5, 0.5 * (math.log(p / (1.0 - p)) - PRIOR_ODDS)))
+    return Votes(0.0, classes, looks)
+
+
+def votes_of(store: Store, chunk_id: int) -> dict[str, dict[int, Votes]]:
+    """By source, its votes by local id; nothing where none looked at the chunk."""
+    told: dict[str, dict[str, Any]] = store.get_value(_key(chunk_id), {})
+    return {
+        source: {
+            int(n): Votes(missed, {c: (a, b) for c, (a, b) in got.items()}, *looks)
+            for n, (missed, got, *looks) in rows.items()  # before looks were counted there were two
+        }
+        for source, rows in told.items()
+    }
+
+
+def decide(
+    votes: Mapping[str, Votes],
+    known: Mapping[str, Collection[str] | None] | None = None,
+    settings: LabelSettings | None = None,
+) -> tuple[str, float, float] | None:
+    """(class, its probability, frames in which it was found), None where no class is likely enough.
+
+    `votes` are those of each source, `known` the classes that each knows, None or absent for one that speaks of every
+    class. The classes exclude one another and all of them may be wrong, which has the odds of 1.
+    """
+    s = settings or LabelSettings()
+    odds: dict[str, float] = {}
+    found: dict[str, float] = {}
+    for name in sorted({c for v in votes.values() for c in v.classes}):
+        said = [_said(v, name, (known or {}).get(source), s.likeness) for source, v in sorted(votes.items())]
+        odds[name] = PRIOR_ODDS + sum(evidence for _, evidence in said)
+        found[name] = sum(pictures for pictures, _ in said)
+    if not odds:
+        return None
+    top = max(0.0, *odds.values())
+    total = math.exp(-top) + sum(math.exp(v - top) for v in odds.values())
+    best = min(odds, key=lambda c: (-odds[c], c))
+    confidence = (1.0 - s.always_wrong) * math.exp(odds[best] - top) / total
+    return (best, confidence, found[best]) if confidence >= s.min_confidence and found[best] >= s.min_found else None
+
+
+def _said(votes: Votes, name: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:
+    """Pictures in which a source found a class, and its log odds for it; one that it does not know is not missed."""
+    found, got = votes.classes.get(name, (0.0, 0.0))
+    missed = votes.missed if known is None or name in known else 0.0
+    return found, (got - missed) / (1.0 + likeness * max(votes.looks - 1.0, 0.0))
+
+
+def detected_labels(store: Store) -> dict[int, DetectedLabel]:
+    """The labels that instances have from detectors and discoverers, by id."""
+    rows: dict[str, list[Any]] = store.get_value("detected labels", {})
+    return {int(n): DetectedLabel(str(r[0]), float(r[1]), float(r[2]), str(r[3])) for n, r in rows.items()}
+
+
+def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str, Any]:
+    """Who gave an instance its label and how sure that is, for JSON; nothing for one without a label."""
+    if instance.label is None:
+        return {}
+    if detected is None:
+        return {"label_source": "operator", "label_confidence": 1.0}
+    return {"label_source": detected.detector, "label_confidence": round(detected.confidence, 4)}
+
+
+def apply_labels(
+    store: Store, settings: LabelSettings | None = None, written: Collection[int] | None = None
+) -> dict[int, DetectedLabel]:
+    """Name the instances by what detectors saw of them; what was named so before and is not any more loses its name.
+
+    `written` are the ids that were written anew or are gone since, where only those need it; the labels of those are
+    returned. Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was
+    derived.
+    """
+    known = store.get_value(_CLASSES)
+    if known is None:
+        return {}
+    before: dict[str, list[Any]] = store.get_value("detected labels", {})
+    instances = store.instances() if written is None else store.instances_of(sorted(written))
+    home = _home(store, None if written is None else [i.id for i in instances])
+    votes = {chunk_id: votes_of(store, chunk_id) for chunk_id in sorted({k for k, _ in home})}
+    spoken = _named_by_operators(store, home)
+    members: dict[int, list[Key]] = {}
+    for key, n in home.items():
+        members.setdefault(n, []).append(key)
+    out: dict[int, DetectedLabel] = {}
+    changed: dict[int, str | None] = {}
+    for i in instances:
+        if i.id in spoken:
+            continue
+        label = None if i.structure is not None else _label(members.get(i.id, ()), votes, known, settings)
+        if label is not None:
+            out[i.id] = label
+        text = None if label is None else label.label
+        if i.label != text and (text is not None or str(i.id) in before):
+            changed[i.id] = text
+    store.set_labels(changed)
+    rows = {} if written is None else {n: row for n, row in before.items() if int(n) not in written}
+    rows |= {str(n): [d.label, round(d.confidence, 4), round(d.found, 2), d.detector] for n, d in out.items()}
+    if rows != before:
+        store.set_value("detected labels", dict(sorted(rows.items(), key=lambda row: int(row[0]))))
+    return out
+
+
+def _home(store: Store, ids: Iterable[int] | None) -> dict[Key, int]:
+    """Which instance each local instance belongs to, of all instances or of some."""
+    rows = store.observations() if ids is None else [o for n in ids for o in store.observations(n)]
+    return {(o.chunk_id, o.local_id): o.instance_id for o in rows}
+
+
+def _label(
+    keys: Iterable[Key],
+    votes: Mapping[int, Mapping[str, Mapping[int, Votes]]],
+    known: Mapping[str, Collection[str] | None],
+    settings: LabelSettings | None,
+) -> DetectedLabel | None:
+    total: dict[str, Votes] = {}
+    for chunk_id, local_id in sorted(keys):
+        for source, found in votes.get(chunk_id, {}).items():
+            if local_id in found:
+                total[source] = total.get(source, Votes(0.0, {})) + found[local_id]
+    chosen = decide(total, known, settings)
+    if chosen is None:
+        return None
+    name, confidence, pictures = chosen
+    return DetectedLabel(name, confidence, pictures, ", ".join(s for s in sorted(total) if name in total[s].classes))
+
+
+def _named_by_operators(store: Store, home: Mapping[Key, int]) -> Collection[int]:
+    """Instances of which an operator said what they are called, or that they are called nothing."""
+    return {home[k] for keys, _ in store.constraints().labels for k in keys if k in home}
+
+
+def _plus(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
+    return a[0] + b[0], a[1] + b[1]
+
+
+def _key(chunk_id: int) -> str:
+    return f"label votes {chunk_id}"

@@ -1,0 +1,101 @@
+"""What consolidation writes: instances as records, the merge log, overlaps of chunks as blobs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.description.colors import color_words, main_color
+from list3r.memory.description.describe import describe
+from list3r.memory.geometry import Sim3
+from list3r.memory.library.derivation import Thing
+from list3r.memory.library.identities import Identities
+from list3r.memory.library.rules import World
+from list3r.memory.overlap.pair_scores import Key, PairScores
+from list3r.memory.records import Instance, MergeDecision
+from list3r.memory.relations.bodies import Body
+from list3r.memory.store.store import Store
+
+_SCORES = np.dtype(
+    [("i", "<i4"), ("j", "<i4"), ("i_on_j", "<f8"), ("j_on_i", "<f8"), ("shared", "<i4"), ("frame_iou", "<f8")]
+)
+
+
+def pack_scores(p: PairScores) -> bytes:
+    """Scores of a pair of chunks as one blob."""
+    out: NDArray[np.void] = np.zeros(len(p.i), _SCORES)
+    for name in _SCORES.names or ():
+        out[name] = getattr(p, name)
+    return out.tobytes()
+
+
+def unpack_scores(blob: bytes) -> PairScores:
+    """The inverse of `pack_scores`."""
+    found = np.frombuffer(blob, _SCORES)
+    i, j, shared = (found[name].astype(np.int64) for name in ("i", "j", "shared"))
+    return PairScores(i, j, found["i_on_j"].copy(), found["j_on_i"].copy(), shared, found["frame_iou"].copy())
+
+
+def record_of(
+    thing: Thing, label: str | None, times: Mapping[tuple[int, int], float], world: World, *, metric: bool
+) -> Instance:
+    """The record of a thing, where its chunks are settled."""
+    body: Body = thing.body
+    seen = [times[f] for f in thing.frames if f in times] or [0.0]
+    name, rgb = main_color(thing.swatches, world.light)
+    color = color_words(thing.swatches, world.light)
+    words = describe(thing.shape, color, body.box.size, world.unit, metric=metric, structure=body.structure)
+    words = words if thing.resting else f"moving {words}"
+    return Instance(
+        id=body.id,
+        label=label,
+        description=words,
+        center=body.box.center,
+        aabb=body.aabb,
+        box=body.box,
+        confidence=body.confidence,
+        observations=len(thing.frames),
+        first_seen_s=min(seen),
+        last_seen_s=max(seen),
+        state="present",
+        structure=body.structure,
+        color_rgb=rgb,
+        color_name=name,
+        component=body.component,
+        best_view=thing.best_view,
+        dynamic=thing.dynamic,
+    )
+
+
+def moved(instance: Instance, S: Sim3) -> Instance:
+    """The instance where its chunk lies to the last digit, not where it was settled; or the way back."""
+    by = S.apply(instance.center[None])[0] - instance.center
+    box = replace(instance.box, center=instance.box.center + by)
+    return replace(instance, center=instance.center + by, aabb=instance.aabb + by, box=box)
+
+
+def log_decisions(
+    store: Store, chunk_id: int, decisions: Sequence[MergeDecision], before: Mapping[Key, int], ids: Identities
+) -> None:
+    """Append what is new: unions that did not hold before, refusals never written, ids that retired or split."""
+    fresh = []
+    for d in decisions:
+        a, b = _key(d.a), _key(d.b)
+        held = d.kind == "merge" and a in before and before[a] == before.get(b)
+        if not held and not store.has_decided(d.kind, d.a, d.b):
+            fresh.append(d)
+    for old, new in ids.aliases:
+        reason = f"#{old} and #{new} are one thing; the older id stays"
+        fresh.append(MergeDecision("alias", f"#{old}", f"#{new}", {}, reason))
+    for old, new in ids.splits:
+        reason = f"what was #{old} is more than one thing; the larger part keeps the id"
+        fresh.append(MergeDecision("split", f"#{old}", f"#{new}", {}, reason))
+    store.log_decisions(chunk_id, fresh)
+
+
+def _key(name: str) -> Key:
+    chunk, local = name.split(":")
+    return int(chunk), int(local)

@@ -1,0 +1,192 @@
+"""Settings of consolidation, what it reports, and what holds for the whole of a memory while it grows."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from list3r.memory.change.detection import ChangeSettings
+from list3r.memory.constraints import Key
+from list3r.memory.description.colors import Reference
+from list3r.memory.library.derivation import DeriveSettings
+from list3r.memory.library.evidence import EvidenceSettings
+from list3r.memory.library.settling import SettlingSettings
+from list3r.memory.merging.moving import MovingSettings
+from list3r.memory.merging.settings import MergeSettings
+from list3r.memory.overlap.planes import place_planes
+from list3r.memory.overlap.summaries import Summaries, cameras_of, light_of, sample_of, world_unit
+from list3r.memory.records import ChunkRow
+from list3r.memory.relations.scene import RelationSettings
+from list3r.memory.relations.structure import StructureSettings
+from list3r.memory.store.store import Store
+from list3r.memory.world.gravity import floor_height
+
+_POSED = 80
+"""Posed frames from which it does not matter any more how many there are, see `EvidenceSettings.min_share`."""
+
+
+@dataclass(frozen=True)
+class ConsolidationSettings:
+    """How the library is derived from the chunks."""
+
+    merging: MergeSettings = field(default_factory=MergeSettings)
+    moving: MovingSettings = field(default_factory=MovingSettings)
+    derive: DeriveSettings = field(default_factory=DeriveSettings)
+    structure: StructureSettings = field(default_factory=StructureSettings)
+    relations: RelationSettings = field(default_factory=RelationSettings)
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
+    settling: SettlingSettings = field(default_factory=SettlingSettings)
+    changes: ChangeSettings = field(default_factory=ChangeSettings)
+    whole_chunks: int = 6
+    """Up to so many chunks the library is derived as a whole; then only what a chunk touches."""
+    whole_share: float = 0.3
+    """Nor is it when more than this share of the chunks has moved."""
+
+
+def settings_of(store: Store, settings: ConsolidationSettings | None) -> ConsolidationSettings:
+    """The settings for a memory: what no sensor measured is less exact."""
+    s = settings or ConsolidationSettings()
+    if store.get_value("scale_kind", "metric") == "metric":
+        return s
+    noise, band = s.relations.computed_noise_m, s.structure.computed_floor_band_m
+    return replace(
+        s,
+        relations=replace(s.relations, noise_m=max(s.relations.noise_m, noise)),
+        structure=replace(s.structure, floor_band_m=max(s.structure.floor_band_m, band)),
+    )
+
+
+@dataclass(frozen=True)
+class ConsolidationReport:
+    """What changed in the library."""
+
+    instances: int
+    """Things in the library now."""
+    structure: int
+    """Pieces of structure in it now."""
+    new: tuple[int, ...]
+    """Ids that appeared."""
+    merged: tuple[tuple[int, int], ...]
+    """(id that retired, id that it is an alias of)."""
+    hidden: int
+    """Groups of local instances that are not shown: seen too little, or fragments of a thing that is."""
+    written: frozenset[int] | None = None
+    """Ids that were written anew or are gone; None where all were."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What every thing of a memory is derived with. When it changes, all of them are derived anew."""
+
+    unit: float
+    """What a metre is in world units."""
+    light: Reference
+    floor: float | None
+    """Height of the floor; None where it was not seen or nobody knows which way is up."""
+    upright: bool
+    """Whether z is up, in the first component."""
+    first: int
+    """The first component."""
+    chunks: int
+    """Chunks when this was looked at."""
+    posed: int
+    """Posed frames, counted up to 80: fewer are asked of a thing in a short memory."""
+    space: str
+    """The embedding space of all chunks; empty where they have several."""
+    stamp: int
+    """Of the settings, and of where the graph's frame lies in the world."""
+    edits: int = 0
+    """The last edit of an operator that was obeyed."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For the key-value table."""
+        light = [self.light.white_l, *self.light.cast_ab]
+        plain = {k: v for k, v in vars(self).items() if k != "light"}
+        return {**plain, "light": light}
+
+    def near(self, other: World) -> bool:
+        """Whether what was derived with the other one holds: the light, the unit and the floor may differ a little."""
+        if (self.upright, self.first, self.posed, self.space, self.stamp) != (
+            other.upright,
+            other.first,
+            other.posed,
+            other.space,
+            other.stamp,
+        ):
+            return False
+        if (self.floor is None) != (other.floor is None) or abs(self.unit / other.unit - 1.0) > _UNIT:
+            return False
+        risen = 0.0 if self.floor is None or other.floor is None else abs(self.floor - other.floor)
+        cast = float(np.hypot(*np.subtract(self.light.cast_ab, other.light.cast_ab)))
+        lit = abs(self.light.white_l - other.light.white_l) <= _WHITE_L and cast <= _CAST
+        return lit and risen <= _FLOOR_M * self.unit
+
+
+_UNIT, _FLOOR_M = 0.02, 0.03
+_WHITE_L, _CAST = 3.0, 2.0
+"""Changes that do not turn one colour name into another for more than borderline cases."""
+
+
+def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s: ConsolidationSettings) -> World:
+    """What holds for the whole memory now; a sample of at most 64 chunks tells."""
+    first = min(c.component for c in chunks)
+    upright = _upright(store)
+    inside = [c for c in chunks if c.component == first]
+    unit = world_unit(chunks, summaries)
+    spaces = {store.feature_space(c.chunk_id) for c in sample_of(chunks)}
+    return World(
+        unit=unit,
+        light=light_of(chunks, summaries),
+        floor=_floor(store, inside, summaries, unit) if upright else None,
+        upright=upright,
+        first=first,
+        chunks=len(chunks),
+        posed=store.posed_count(_POSED),
+        space=spaces.pop() if len(spaces) == 1 else "",
+        stamp=_stamp(store, s),
+        edits=max((e.entry for e in store.edits()), default=0),
+    )
+
+
+def known_world(store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) -> World | None:
+    """What the library was derived with, where that still holds as far as can be told without looking at all."""
+    told = store.get_value("library")
+    if not told:
+        return None
+    white, a, b = told.pop("light")
+    world = World(light=Reference(white, (a, b)), **told)
+    now = (_upright(store), min(c.component for c in chunks), store.posed_count(_POSED), _stamp(store, s))
+    return world if (world.upright, world.first, world.posed, world.stamp) == now else None
+
+
+def _upright(store: Store) -> bool:
+    return bool(store.get_value("gravity", "unknown") != "unknown")
+
+
+def _floor(store: Store, inside: list[ChunkRow], summaries: Summaries, unit: float) -> float | None:
+    """0 where the world was laid on its floor, else the height at which the planes show one."""
+    estimate = store.get_value("gravity_estimate")
+    if estimate is not None:
+        return None if estimate["floor_height"] is None else 0.0
+    some = sample_of(inside)
+    cameras = cameras_of(store, some).translation
+    planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in some])
+    return floor_height(np.array([0.0, 0.0, 1.0]), planes, cameras, unit) if len(cameras) else None
+
+
+def _stamp(store: Store, s: ConsolidationSettings) -> int:
+    return zlib.crc32(repr((s, store.get_value("T_world_graph"), store.get_value("scale_kind"))).encode())
+
+
+def spoken_of(store: Store, since: int) -> frozenset[Key]:
+    """The local instances that edits after an entry speak of; an undo speaks of what it takes back."""
+    edits = {e.entry: e for e in store.edits()}
+    left = [e for n, e in edits.items() if n > since]
+    out: set[Key] = set()
+    while left:
+        edit = left.pop()
+        out.update(k for part in (*edit.parts, *(keys for _, _, keys in edit.before)) for k in part)
+        left += [edits[n] for n in (edit.target,) if n in edits]
+    return frozenset(out)

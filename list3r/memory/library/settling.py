@@ -1,0 +1,111 @@
+"""Where chunks lie for the purpose of consolidation: each graph trembles a little with every chunk that comes, and what
+is derived from a chunk need not be derived again for a millimetre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.overlap.summaries import ChunkSummary
+from list3r.memory.records import ChunkRow
+from list3r.memory.store.store import Store
+from list3r.memory.store.tables.library import SettledRow
+
+_FAR_M = 0.5
+"""Chunks whose points lie further apart than this share no thing."""
+
+
+@dataclass(frozen=True)
+class SettlingSettings:
+    """How far a chunk may move before what was derived from it is derived anew."""
+
+    move_m: float = 0.004
+    """A fraction of the noise of depth at arm's length and of the tolerance within which surfaces meet."""
+    turn_deg: float = 0.12
+    """The same at two metres."""
+    scale: float = 0.002
+
+
+@dataclass(frozen=True)
+class Settled:
+    """The chunks as consolidation sees them."""
+
+    chunks: list[ChunkRow]
+    """In the world, at their settled poses."""
+    S_graph_chunk: dict[int, Sim3]
+    """The same poses in the frame of the graph, which do not change when the world is turned upright."""
+    S_exact_settled: dict[int, Sim3]
+    """In the world: from where a chunk is settled to where it lies."""
+    moved: frozenset[int]
+    """Ids of the chunks that were not settled here before."""
+
+
+def settle(
+    store: Store,
+    summaries: Mapping[int, ChunkSummary],
+    settings: SettlingSettings | None = None,
+    among: Iterable[int] | None = None,
+) -> Settled:
+    """The settled poses of all chunks, or of those `among` them: the one kept in the store unless the chunk has moved
+    on or belongs to another component, then its own.
+
+    Writes to the table `settled`, so that a build that goes on takes up the same poses.
+    """
+    s = settings or SettlingSettings()
+    chunks = store.chunks() if among is None else [store.chunk(k) for k in sorted(among)]
+    T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+    T_graph_world = T_world_graph.inverse()
+    before = store.settled()
+    fresh: dict[int, SettledRow] = {}
+    graph: dict[int, Sim3] = {}
+    for c in chunks:
+        S_graph_chunk, row = T_graph_world @ c.S_world_chunk, before.get(c.chunk_id)
+        graph[c.chunk_id] = S_graph_chunk if row is None else row.S_graph_chunk
+        unit = float(S_graph_chunk.scale) * (1.0 if c.scale_kind == "metric" else summaries[c.chunk_id].unit)
+        if row is None or row.component != c.component or not _near(row.S_graph_chunk, S_graph_chunk, unit, s):
+            graph[c.chunk_id] = S_graph_chunk
+            extent = _extent(summaries[c.chunk_id], S_graph_chunk, 0.5 * _FAR_M * unit)
+            fresh[c.chunk_id] = SettledRow(c.component, S_graph_chunk, extent)
+    if fresh:
+        store.put_settled(fresh)
+    moved = [replace(c, S_world_chunk=T_world_graph @ graph[c.chunk_id]) for c in chunks]
+    return Settled(moved, graph, _corrections(chunks, moved), frozenset(fresh))
+
+
+def _corrections(exact: Sequence[ChunkRow], settled: Sequence[ChunkRow]) -> dict[int, Sim3]:
+    return {e.chunk_id: e.S_world_chunk @ s.S_world_chunk.inverse() for e, s in zip(exact, settled, strict=True)}
+
+
+def _near(a: Sim3, b: Sim3, unit: float, s: SettlingSettings) -> bool:
+    turn = np.arccos(np.clip((np.trace(a.rotation.T @ b.rotation) - 1.0) / 2.0, -1.0, 1.0))
+    moved = float(np.linalg.norm(a.translation - b.translation))
+    grown = abs(float(a.scale) / float(b.scale) - 1.0)
+    return bool(moved <= s.move_m * unit and np.degrees(turn) <= s.turn_deg and grown <= s.scale)
+
+
+def _extent(summary: ChunkSummary, S_graph_chunk: Sim3, slack: float) -> Array:
+    """Axis-aligned box of a chunk's points in the graph's frame, grown. Shape (2, 3)."""
+    if len(summary.shapes.points) == 0:
+        return np.array([[np.inf] * 3, [-np.inf] * 3])
+    p = S_graph_chunk.apply(summary.shapes.points)
+    return np.stack([p.min(axis=0) - slack, p.max(axis=0) + slack])
+
+
+def neighbours(
+    rows: Mapping[int, SettledRow], chunk_id: int, here: SettledRow | None = None, extents: Array | None = None
+) -> list[int]:
+    """Ids of the chunks of one component that lie near a chunk, itself among them, in order.
+
+    `here` is where the chunk lies, where that is not what `rows` says; `extents` are those of the rows, (N, 2, 3), for
+    who asks often.
+    """
+    ids = np.fromiter(rows, np.int64, len(rows))
+    extents = np.array([r.extent for r in rows.values()]) if extents is None else extents
+    here = here or rows[chunk_id]
+    meet = np.all((extents[:, 0] <= here.extent[1]) & (extents[:, 1] >= here.extent[0]), axis=1)
+    found = [int(k) for k in ids[meet] if rows[int(k)].component == here.component]
+    return sorted({chunk_id, *found})

@@ -1,0 +1,136 @@
+"""The memory as it was after an earlier session, for every question to be asked of.
+
+A connection of its own to the same file, in which temporary tables and views stand before those of the file: nothing
+is written, what sessions saw later is not there, and what they moved is where it was. Sizes and words are those of
+today. Relations among what has not changed since are those of the file; the others are told anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from list3r.memory.geometry import Array
+from list3r.memory.library.rules import settings_of
+from list3r.memory.maintenance.history import world_at
+from list3r.memory.records import Instance, Relation
+from list3r.memory.relations.bodies import Body
+from list3r.memory.relations.predicates import relations
+from list3r.memory.store.store import Store
+
+_BY_SESSION = ("sessions", "chunks", "frames", "events")
+_BY_CHUNK = ("keyframes", "local_instances", "supports", "placements", "bends")
+_REACH_M = 2.0
+"""How far from what has changed relations may have been others."""
+
+
+def store_at(store: Store, session_id: int) -> Store:
+    """A store to read, as it was after a session; close it like any other. Raises `OptionError` for no such session."""
+    with store.snapshot():
+        then, now = world_at(store, session_id), {i.id: i for i in store.instances()}
+        known = store.relations()
+        vertical = store.get_value("gravity", "unknown") != "unknown"
+    past = _PastStore.open(store.path)
+    try:
+        past.show(session_id, then)
+        changed = {i.id for i in then if _has_changed(i, now.get(i.id))}
+        past.relate([*_kept(known, then, changed), *_told_anew(past, then, changed, vertical)])
+    except BaseException:
+        past.close()
+        raise
+    return past
+
+
+class _PastStore(Store):
+    """A store whose tables end with a session. Checksums are those of the file's own rows, which were checked as they
+    were read to make it."""
+
+    def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        return rows
+
+    def show(self, session_id: int, instances: Sequence[Instance]) -> None:
+        """From now on only what was known after a session is read."""
+        self._checks = None
+        self.forget_rows()
+        made = dict(self._rows("SELECT name, sql FROM main.sqlite_master WHERE sql IS NOT NULL"))
+        self._database.execute("PRAGMA query_only=OFF")
+        for table in ("instances", "relations"):
+            self._database.execute(made[table].replace("CREATE TABLE", "CREATE TEMP TABLE", 1))
+        boxes = made["instance_boxes"].replace("VIRTUAL TABLE instance_boxes", "VIRTUAL TABLE temp.instance_boxes", 1)
+        self._database.execute(boxes)
+        self.put_instances(instances)
+        last = int(session_id)
+        chunks = f"(SELECT chunk_id FROM main.chunks WHERE session_id <= {last})"
+        ids = "(SELECT id FROM temp.instances)"
+        views = {t: f"session_id <= {last}" for t in _BY_SESSION} | {t: f"chunk_id IN {chunks}" for t in _BY_CHUNK}
+        views["edges"] = f"u IN {chunks} AND v IN {chunks}"
+        views["observations"] = f"chunk_id IN {chunks} AND instance IN {ids}"
+        views["embeddings"] = f"instance IN {ids}"
+        views["words"] = f"word = '' OR instance IN {ids}"
+        for table, condition in views.items():
+            self._database.execute(f"CREATE TEMP VIEW {table} AS SELECT * FROM main.{table} WHERE {condition}")
+        self._database.execute("PRAGMA query_only=ON")
+
+    def relate(self, found: Sequence[Relation]) -> None:
+        """The relations of that time."""
+        self._database.execute("PRAGMA query_only=OFF")
+        self.replace_relations(None, found)
+        self._database.execute("PRAGMA query_only=ON")
+
+
+def _has_changed(then: Instance, now: Instance | None) -> bool:
+    gone = now is not None and (now.state == "removed") != (then.state == "removed")
+    return now is None or gone or not np.array_equal(then.center, now.center)
+
+
+def _kept(known: Sequence[Relation], then: Sequence[Instance], changed: set[int]) -> list[Relation]:
+    """Relations among what was there then and has not changed since."""
+    same = {i.id for i in then} - changed
+    return [r for r in known if r.subject in same and r.object in same]
+
+
+def _told_anew(past: Store, then: Sequence[Instance], changed: set[int], vertical: bool) -> list[Relation]:
+    """Relations of what has changed since."""
+    out: list[Relation] = []
+    first = min((c.component for c in past.chunks()), default=0)
+    for component in sorted({i.component for i in then if i.id in changed}):
+        here = [i for i in then if i.component == component and i.state != "removed" and not i.dynamic]
+        moved = [i for i in here if i.id in changed]
+        near = [i for i in here if any(_gap(i.aabb, m.aabb) <= _REACH_M for m in moved)]
+        middle = np.mean([i.center for i in here], axis=0) if here else np.zeros(3)
+        bodies = [b for i in near if (b := _body(past, i, middle)) is not None]
+        told = settings_of(past, None).relations
+        found = relations(bodies, gravity_known=vertical and component == first, settings=told) if moved else []
+        out += [r for r in found if r.subject in changed or r.object in changed]
+    return out
+
+
+def _gap(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(np.maximum(0.0, np.maximum(a[0] - b[1], b[0] - a[1]))))
+
+
+def _body(past: Store, instance: Instance, middle: Array) -> Body | None:
+    """A thing as relations see it, from the surface that was known then."""
+    points = past.surface_points(instance.id).astype(np.float64)
+    slack = 1e-3 * float(np.linalg.norm(instance.aabb[1] - instance.aabb[0]))
+    points = points[np.all((points >= instance.aabb[0] - slack) & (points <= instance.aabb[1] + slack), axis=1)]
+    if len(points) == 0:
+        return None
+    points = points[:: max(1, len(points) // 2000)]
+    normal = None
+    if instance.structure is not None and len(points) > 3:
+        axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
+        normal = axis if (middle - points.mean(axis=0)) @ axis > 0 else -axis
+    return Body(
+        id=instance.id,
+        points=points,
+        rgb=np.zeros((len(points), 3), np.uint8),
+        box=instance.box,
+        aabb=instance.aabb,
+        normal=normal,
+        structure=instance.structure,
+        component=instance.component,
+        confidence=instance.confidence,
+    )

@@ -1,0 +1,70 @@
+"""The world as it was after an earlier session."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from list3r.memory.errors import OptionError
+from list3r.memory.records import ChangeEvent, Instance
+from list3r.memory.store.store import Store
+
+_STATES = {"seen_again": "present", "moved": "moved", "removed": "removed", "added": "added"}
+
+
+def world_at(store: Store, session_id: int) -> list[Instance]:
+    """The instances known after a session, by id, where they were then and in the state that they had then.
+
+    What was seen only later is left out; a thing that was moved later is where it was before. Sizes and words are those
+    of today, which rest on all that was ever seen of a thing. Raises `OptionError` for a session that there is not.
+    """
+    sessions = [s.session_id for s in store.sessions()]
+    if session_id not in sessions:
+        raise OptionError(f"{store.path} has no session {session_id}; it has {', '.join(map(str, sessions))}")
+    owner = {c.chunk_id: c.session_id for c in store.chunks()}
+    seen: dict[int, set[int]] = {}
+    for o in store.observations():
+        seen.setdefault(o.instance_id, set()).add(owner[o.chunk_id])
+    story: dict[int, list[ChangeEvent]] = {}
+    for event in store.events():
+        story.setdefault(event.instance_id, []).append(event)
+    latest = _latest(store, session_id)
+    out = []
+    for instance in store.instances():
+        told = story.get(instance.id, [])
+        known = seen.get(instance.id, set()) | {e.session_id for e in told}
+        if known and min(known) <= session_id:
+            state = _state(told, seen.get(instance.id, set()), session_id, latest.get(instance.component, session_id))
+            out.append(replace(_where(instance, told, session_id), state=state))
+    return out
+
+
+def _latest(store: Store, session_id: int) -> dict[int, int]:
+    """By component: the last session up to this one that saw it."""
+    out: dict[int, int] = {}
+    for c in store.chunks():
+        if c.session_id <= session_id:
+            out[c.component] = max(c.session_id, out.get(c.component, 0))
+    return out
+
+
+def _state(told: list[ChangeEvent], seen: set[int], session_id: int, latest: int) -> str:
+    before = [e for e in told if e.session_id <= session_id]
+    if before and before[-1].kind == "removed":
+        return "removed"
+    if before and before[-1].session_id == latest:
+        return _STATES[before[-1].kind]
+    return "present" if latest in seen else "unseen"
+
+
+def _where(instance: Instance, told: list[ChangeEvent], session_id: int) -> Instance:
+    """The instance where it was before the first move after the session."""
+    moves = [e for e in told if e.session_id > session_id and e.kind == "moved" and e.from_box is not None]
+    if not moves:
+        return instance
+    box = moves[0].from_box
+    assert box is not None
+    corners = box.corners()
+    aabb = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    return replace(instance, center=box.center, aabb=aabb, box=box)

@@ -1,0 +1,38 @@
+"""The merge log as people read it: all of it, or what concerns one instance."""
+
+from __future__ import annotations
+
+from list3r.memory.constraints import standing
+from list3r.memory.store.store import Store
+from list3r.memory.store.tables.edits import LogEntry
+
+
+def merge_log(store: Store, instance_id: int | None = None) -> list[LogEntry]:
+    """The log, oldest first; with an id, the entries that name it, an id that became it, or a part of it.
+
+    Raises `UnknownIdError` for an id that the memory does not hold.
+    """
+    entries = store.log_entries()
+    if instance_id is None:
+        return entries
+    current = store.resolve(instance_id)
+    names = {f"#{current}", *(f"#{old}" for old in store.aliases() if _becomes(store, old, current))}
+    names |= {f"{o.chunk_id}:{o.local_id}" for o in store.observations(current)}
+    edits = {e.entry for e in store.edits() if any(f"#{n}" in names for n, _, _ in e.before)}
+    return [e for e in entries if e.entry in edits or e.decision.a in names or e.decision.b in names]
+
+
+def states(store: Store) -> dict[int, str]:
+    """Of the entries that are edits: `stands` or `undone`."""
+    edits = store.edits()
+    holding = {e.entry for e in standing(edits)}
+    return {e.entry: "stands" if e.entry in holding else "undone" for e in edits}
+
+
+def _becomes(store: Store, old: int, current: int) -> bool:
+    aliases = store.aliases()
+    seen: set[int] = set()
+    while old in aliases and old not in seen:
+        seen.add(old)
+        old = aliases[old]
+    return old == current

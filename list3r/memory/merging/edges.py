@@ -1,0 +1,274 @@
+"""Which local instances are one thing: edges of overlap, joined best first (paper 3.3, with complete links)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.constraints import Constraints, Growing
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.merging.nodes import Nodes
+from list3r.memory.merging.settings import MergeSettings
+from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou, joined, pair_scores, score_all
+from list3r.memory.overlap.voxels import ChunkShapes, Ints
+from list3r.memory.records import MergeDecision
+
+__all__ = [
+    "Key",
+    "Links",
+    "MergeSettings",
+    "PairScores",
+    "box_iou",
+    "form_groups",
+    "links_of",
+    "merge_nodes",
+    "pair_scores",
+]
+
+NONE, SAME, PART, PLANE = -1, 0, 1, 2
+"""What two local instances that meet may be: nothing to each other, or one thing for one of three reasons."""
+_REASON = (
+    "two views of one thing: the surfaces cover each other",
+    "a partial view: its surface lies on that of the whole",
+    "two pieces of one plane that touch",
+)
+_APART_IOU = 0.02
+
+
+@dataclass(frozen=True)
+class Links:
+    """What argues for each of M pairs of local instances that meet being one thing."""
+
+    a: Ints
+    """Position of the first one: in its chunk, or among the nodes. Shape (M,)."""
+    b: Ints
+    """Of the second one, which comes later. Shape (M,)."""
+    kind: NDArray[np.int8]
+    """NONE, SAME, PART or PLANE. Shape (M,)."""
+    score: Array
+    """By which those that are not NONE are taken, the largest first. Shape (M,)."""
+    low: Array
+    """Share of the less covered one's surface that lies on the other. Shape (M,)."""
+    high: Array
+    """The same of the better covered one. Shape (M,)."""
+    cosine: Array
+    """Of the features. Shape (M,)."""
+    frame_iou: Array
+    """Mean IoU of their boxes in the frames that two chunks share; NaN where they share too few. Shape (M,)."""
+
+    @staticmethod
+    def join(parts: Sequence[tuple[int, int, Links]]) -> Links:
+        """Those of many pairs of chunks, each with the numbers of the first nodes of its two chunks."""
+        sizes = [len(p.a) for _, _, p in parts]
+        starts = [np.repeat(np.array([p[n] for p in parts], np.int64), sizes) for n in (0, 1)]
+        return Links(
+            starts[0] + joined([p.a for _, _, p in parts], np.int64),
+            starts[1] + joined([p.b for _, _, p in parts], np.int64),
+            joined([p.kind for _, _, p in parts], np.int8),
+            joined([p.score for _, _, p in parts], np.float64),
+            joined([p.low for _, _, p in parts], np.float64),
+            joined([p.high for _, _, p in parts], np.float64),
+            joined([p.cosine for _, _, p in parts], np.float64),
+            joined([p.frame_iou for _, _, p in parts], np.float64),
+        )
+
+    def among(self, number: Ints) -> Links:
+        """Those of which both nodes have a new number, which is -1 for the others."""
+        a, b = number[self.a], number[self.b]
+        kept = np.flatnonzero((a >= 0) & (b >= 0))
+        rest = (getattr(self, name)[kept] for name in ("kind", "score", "low", "high", "cosine", "frame_iou"))
+        return Links(a[kept], b[kept], *rest)
+
+    def told(self, n: int) -> dict[str, float]:
+        """The numbers of one pair, for the log."""
+        names = {"overlap": self.low, "containment": self.high, "cosine": self.cosine, "score": self.score}
+        if not np.isnan(self.frame_iou[n]):
+            names["frame_iou"] = self.frame_iou
+        return {name: round(float(values[n]), 3) for name, values in names.items()}
+
+
+def merge_nodes(
+    chunks: Sequence[ChunkShapes],
+    S_world_chunk: Mapping[int, Sim3],
+    cannot_link: Sequence[tuple[Key, Key]],
+    settings: MergeSettings | None = None,
+    pairs: Mapping[tuple[int, int], PairScores] | None = None,
+    word: Constraints | None = None,
+) -> tuple[list[list[Key]], list[MergeDecision]]:
+    """Group local instances into things.
+
+    All chunks given must share one frame of reference. `pairs` are scores already known, by chunk ids (u <= v). The
+    partition is the same in whatever order chunks and pairs are given: edges are taken best first, ties by key. Two
+    groups are joined unless a cannot-link pair would come together, or too many pairs across speak against it
+    (complete link), or the operator's `word` parts them. What that word holds together is joined afterwards, by
+    `Constraints.joined`, so that each half of it goes on attracting what looks like it. Returns the groups, each
+    sorted, ordered by their first member, and the decisions: one `merge` for each union, one `refuse` for each strong
+    edge that was not taken.
+    """
+    s = settings or MergeSettings()
+    chunks = sorted(chunks, key=lambda c: c.chunk_id)
+    tables = {c.chunk_id: Nodes.of([c], S_world_chunk) for c in chunks}
+    known = pairs if pairs is not None else score_all(chunks, S_world_chunk)
+    found = {
+        (u, v): links_of(tables[u], tables[v], p, s)
+        for (u, v), p in sorted(known.items())
+        if u in tables and v in tables
+    }
+    return form_groups(tables, found, None, cannot_link, s, word)
+
+
+def form_groups(
+    tables: Mapping[int, Nodes],
+    links: Mapping[tuple[int, int], Links],
+    region: Collection[Key] | None,
+    cannot_link: Sequence[tuple[Key, Key]],
+    settings: MergeSettings,
+    word: Constraints | None = None,
+) -> tuple[list[list[Key]], list[MergeDecision]]:
+    """The same as `merge_nodes`, from links of pairs of chunks that are known; of a `region` only, where one is given.
+
+    `tables` are the local instances of each chunk.
+    """
+    if not tables:
+        return [], []
+    nodes = Nodes.join([tables[k] for k in sorted(tables)])
+    start = nodes.start
+    every = Links.join([(start[u], start[v], x) for (u, v), x in links.items()])
+    if region is not None:
+        inside = np.array([k in region for k in nodes.keys], bool)
+        every = every.among(np.where(inside, np.cumsum(inside) - 1, -1))
+        nodes = nodes.only(region)
+    growing = None if word is None or not word else word.growing()
+    return _join(nodes, every, _enemies(nodes, cannot_link), settings, growing)
+
+
+# ---------------------------------------------------------------------------------------------- the evidence
+
+
+def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
+    """What argues for the local instances of two chunks that meet being one thing; `u` and `v` may be one chunk."""
+    a, b, inside = p.i, p.j, u.keys[:1] == v.keys[:1]
+    low, high = np.minimum(p.i_on_j, p.j_on_i), np.maximum(p.i_on_j, p.j_on_i)
+    cosine = np.einsum("ij,ij->i", u.feature[a], v.feature[b]).astype(float)
+    across = np.full(len(a), not inside)
+    enough = (p.shared >= s.min_shared_frames) & across
+    larger, smaller = np.maximum(u.size[a], v.size[b]), np.minimum(u.size[a], v.size[b])
+    alike = larger < s.max_size_ratio * smaller
+    one_mask, apart = enough & (p.frame_iou >= s.same_mask_iou), enough & (p.frame_iou < _APART_IOU)
+    coplanar = u.coplanar(a, b, s.max_angle_deg, v)
+    both_structure, one_structure = u.structure[a] & v.structure[b], u.structure[a] ^ v.structure[b]
+    same = (low >= s.min_overlap) & (high >= s.min_containment) & (~one_structure | (low >= 0.5) & coplanar)
+    same |= one_mask & alike & (high >= 0.2) & ~one_structure
+    same &= across | (low >= s.min_containment)
+    cut = np.where(p.i_on_j >= p.j_on_i, u.truncated[a], v.truncated[b])
+    color = np.linalg.norm((u.lab[a] - v.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
+    part = (high >= s.part_containment) & (color <= s.max_part_color) & ~one_structure & across
+    part &= (cut >= s.min_truncated) | (coplanar & (smaller / np.maximum(larger, 1e-12) >= s.min_part_size))
+    piece = both_structure & coplanar & (high >= 0.05)
+    base = np.sqrt(low * high)
+    score = np.where(same, 0.5 + 0.5 * base, np.where(part, 0.3 + 0.2 * high, 0.2 + 0.2 * high))
+    score += np.where(one_mask & alike, 0.5 * p.frame_iou, 0.0)
+    wanted = (same | part | piece) & (cosine >= s.min_cosine) & ~(apart & ~both_structure)
+    kind = np.where(wanted, np.where(same, SAME, np.where(part, PART, PLANE)), NONE).astype(np.int8)
+    frame_iou = np.where(enough, p.frame_iou, np.nan)
+    return Links(a, b, kind, np.round(score, 6).astype(np.float64), low, high, cosine, frame_iou)
+
+
+# ---------------------------------------------------------------------------------------------- the decision
+
+
+def _enemies(t: Nodes, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]]:
+    at = {key: n for n, key in enumerate(t.keys)}
+    out: list[set[int]] = [set() for _ in t.keys]
+    for a, b in cannot_link:
+        if a in at and b in at:
+            out[at[a]].add(at[b])
+            out[at[b]].add(at[a])
+    return out
+
+
+class _Overlaps:
+    """How far pairs of nodes overlap, both ways."""
+
+    def __init__(self, links: Links, count: int) -> None:
+        code = links.a * count + links.b
+        order = np.argsort(code, kind="stable")
+        self._count, self._code, self._low = count, code[order], links.low[order]
+
+    def of(self, x: Ints, y: Ints) -> Array:
+        """Of pairs of nodes; 0 for those that do not meet. Shapes (P,) -> (P,)."""
+        if len(self._code) == 0:
+            return np.zeros(len(x))
+        code = np.minimum(x, y) * self._count + np.maximum(x, y)
+        at = np.minimum(np.searchsorted(self._code, code), len(self._code) - 1)
+        return np.asarray(np.where(self._code[at] == code, self._low[at], 0.0))
+
+
+def _join(
+    t: Nodes, links: Links, enemies: list[set[int]], s: MergeSettings, word: Growing | None = None
+) -> tuple[list[list[Key]], list[MergeDecision]]:
+    group = list(range(len(t.keys)))
+    members = {n: [n] for n in group}
+    low, high = t.low.copy(), t.high.copy()
+    foes = {n: set(enemies[n]) for n in group}
+    overlaps = _Overlaps(links, len(t.keys))
+    decisions: list[MergeDecision] = []
+    refused: set[tuple[int, int]] = set()
+    edges = np.flatnonzero(links.kind != NONE)
+    edges = edges[np.lexsort((links.b[edges], links.a[edges], -links.score[edges]))]
+    for n, x, y in zip(edges.tolist(), links.a[edges].tolist(), links.b[edges].tolist(), strict=True):
+        if group[x] == group[y]:
+            continue
+        a, b = sorted((group[x], group[y]))
+        if (a, b) in refused:
+            continue
+        against = word.objection(t.keys[a], t.keys[b]) if word is not None else ""
+        span = float((np.maximum(high[a], high[b]) - np.minimum(low[a], low[b])).max())
+        if not against and span > s.most_span_m * max(t.unit[a], t.unit[b]):
+            against = f"together they would reach over {span:.0f} m"
+        against = against or _objection(t, members[a], members[b], foes[a], overlaps, s)
+        name_a, name_b = _name(t.keys[x]), _name(t.keys[y])
+        if against:
+            refused.add((a, b))
+            decisions.append(MergeDecision("refuse", name_a, name_b, links.told(n), against))
+            continue
+        decisions.append(MergeDecision("merge", name_a, name_b, links.told(n), _REASON[links.kind[n]]))
+        if word is not None:
+            word.join(t.keys[a], t.keys[b])
+        moved = members.pop(b)
+        members[a] = sorted(members[a] + moved)
+        low[a], high[a] = np.minimum(low[a], low[b]), np.maximum(high[a], high[b])
+        foes[a] |= foes.pop(b)
+        for m in moved:
+            group[m] = a
+        refused = {pair for pair in refused if a not in pair and b not in pair}
+    groups = sorted([t.keys[n] for n in ns] for ns in members.values())
+    return groups, decisions
+
+
+def _objection(t: Nodes, a: list[int], b: list[int], foes_of_a: set[int], overlaps: _Overlaps, s: MergeSettings) -> str:
+    """Why two groups must stay apart, or nothing."""
+    seen_apart = foes_of_a.intersection(b)
+    if seen_apart:
+        return f"{_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
+    one, other = (np.array(ns)[t.truncated[ns] < s.min_truncated] for ns in (a, b))
+    left, right = (x.ravel() for x in np.meshgrid(one, other, indexing="ij"))
+    whole = np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
+    compared = np.flatnonzero(whole & ~t.coplanar(left, right, s.max_angle_deg))
+    if len(compared) == 0:
+        return ""
+    x, y = left[compared], right[compared]
+    smaller, larger = np.minimum(t.size[x], t.size[y]), np.maximum(t.size[x], t.size[y])
+    offset = np.linalg.norm(t.center[x] - t.center[y], axis=1)
+    apart = (overlaps.of(x, y) < 0.1) & (offset > s.max_center_offset * smaller)
+    apart &= larger < s.max_size_ratio * smaller
+    if apart.sum() > s.max_conflicts * len(compared):
+        return f"{int(apart.sum())} of {len(compared)} pairs of whole views lie apart"
+    return ""
+
+
+def _name(key: Key) -> str:
+    return f"{key[0]}:{key[1]}"

@@ -1,0 +1,100 @@
+"""What merging asks about local instances."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.overlap.pair_scores import Key
+from list3r.memory.overlap.voxels import ChunkShapes, Ints
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Local instances in one numbering, world coordinates: what merging asks about them."""
+
+    keys: list[Key]
+    start: dict[int, int]
+    center: Array
+    size: Array
+    plane: Array
+    truncated: Array
+    structure: NDArray[np.bool_]
+    feature: NDArray[np.float32]
+    tolerance: Array
+    unit: Array
+    lab: Array
+    low: Array
+    high: Array
+    """Corners of the boxes of their points, world. Shape (N, 3) each."""
+
+    @staticmethod
+    def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> Nodes:
+        keys: list[Key] = []
+        start, center, size, plane, tolerance, unit, low, high = {}, [], [], [], [], [], [], []
+        for c in chunks:
+            lower, upper = c.spans(S_world_chunk[c.chunk_id])
+            low.append(lower)
+            high.append(upper)
+            placed = S_world_chunk[c.chunk_id]
+            start[c.chunk_id] = len(keys)
+            keys += [(c.chunk_id, int(n)) for n in c.local_id]
+            center.append(placed.apply(c.center))
+            size.append(c.size * float(placed.scale))
+            normal = c.plane[:, :3] @ placed.rotation.T
+            plane.append(np.column_stack([normal, c.plane[:, 3] * float(placed.scale) - normal @ placed.translation]))
+            tolerance.append(np.full(len(c.local_id), 2.0 * c.grain * float(placed.scale)))
+            unit.append(np.full(len(c.local_id), c.unit * float(placed.scale)))
+        features = [c.feature for c in chunks if len(c.local_id)]
+        return Nodes(
+            keys,
+            start,
+            np.concatenate(center) if center else np.zeros((0, 3)),
+            np.concatenate(size) if size else np.zeros(0),
+            np.concatenate(plane) if plane else np.zeros((0, 4)),
+            np.concatenate([c.truncated for c in chunks]) if chunks else np.zeros(0),
+            np.concatenate([c.structure for c in chunks]) if chunks else np.zeros(0, bool),
+            np.concatenate(features) if features else np.zeros((0, 1), np.float32),
+            np.concatenate(tolerance) if tolerance else np.zeros(0),
+            np.concatenate(unit) if unit else np.zeros(0),
+            np.concatenate([c.lab for c in chunks]) if chunks else np.zeros((0, 3)),
+            np.concatenate(low) if low else np.zeros((0, 3)),
+            np.concatenate(high) if high else np.zeros((0, 3)),
+        )
+
+    @staticmethod
+    def join(parts: Sequence[Nodes]) -> Nodes:
+        """Those of several chunks, in the order of the chunks."""
+        start: dict[int, int] = {}
+        count = 0
+        for p in parts:
+            start |= {chunk: count + at for chunk, at in p.start.items()}
+            count += len(p.keys)
+        features = [p.feature for p in parts if len(p.keys)]
+        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
+        feature = np.concatenate(features) if features else np.zeros((0, 1), np.float32)
+        return Nodes(keys=[k for p in parts for k in p.keys], start=start, feature=feature, **joined)
+
+    def only(self, keys: Collection[Key]) -> Nodes:
+        """Some of them."""
+        at = np.array([n for n, k in enumerate(self.keys) if k in keys], np.int64)
+        chosen: dict[str, Any] = {name: getattr(self, name)[at] for name in (*_COLUMNS, "feature")}
+        return Nodes(keys=[self.keys[n] for n in at], start={}, **chosen)
+
+    def coplanar(self, a: Ints, b: Ints, angle_deg: float, other: Nodes | None = None) -> NDArray[np.bool_]:
+        """Whether pairs of flat nodes lie in one plane; false where one is not flat. `b` are of the `other` table."""
+        other = other or self
+        one, two = self.plane[a], other.plane[b]
+        cosine = np.einsum("ij,ij->i", one[:, :3], two[:, :3])
+        off_b = np.abs(np.einsum("ij,ij->i", one[:, :3], other.center[b]) + one[:, 3])
+        off_a = np.abs(np.einsum("ij,ij->i", two[:, :3], self.center[a]) + two[:, 3])
+        near = np.maximum(off_a, off_b) <= 2.0 * np.maximum(self.tolerance[a], other.tolerance[b])
+        return np.asarray((cosine > np.cos(np.radians(angle_deg))) & near)
+
+
+_COLUMNS = ("center", "size", "plane", "truncated", "structure", "tolerance", "unit", "lab", "low", "high")

@@ -1,0 +1,80 @@
+"""Flat surfaces of the chunks, the evidence for which way is up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.store.tables.local_instances import LocalNode
+
+
+@dataclass(frozen=True)
+class Planes:
+    """P flat surfaces in the frame of the pose graph."""
+
+    normal: Array
+    """Unit normals, towards the cameras that saw them. Shape (P, 3)."""
+    center: Array
+    """Centroids. Shape (P, 3)."""
+    area: Array
+    """Area of the convex hull of the support in the plane, square units. Shape (P,)."""
+    points: Array
+    """A sample of all support points, of what is flat and what is not. Shape (N, 3)."""
+    owner: NDArray[np.int64]
+    """Plane of each point, -1 for points of what is not flat. Shape (N,)."""
+
+
+def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
+    """The flat local instances of one chunk, and at most about `sample` points of each local instance; its frame."""
+    normals: list[Array] = []
+    centers, areas, points, owner = [], [], [], []
+    for node in nodes:
+        p = node.support.points.astype(np.float64)
+        if len(p) == 0:
+            continue
+        points.append(p[:: max(1, len(p) // sample)])
+        owner.append(np.full(len(points[-1]), -1 if node.plane is None else len(normals)))
+        if node.plane is None:
+            continue
+        normal = node.plane[:3] / max(float(np.linalg.norm(node.plane[:3])), 1e-12)
+        normals.append(normal)
+        centers.append(p.mean(axis=0))
+        areas.append(planar_area(p, normal))
+    return Planes(
+        np.array(normals).reshape(-1, 3),
+        np.array(centers).reshape(-1, 3),
+        np.array(areas, dtype=np.float64),
+        np.concatenate(points) if points else np.zeros((0, 3)),
+        np.concatenate(owner) if owner else np.zeros(0, np.int64),
+    )
+
+
+def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
+    """The planes of several chunks in one frame: each with its `S_graph_chunk`."""
+    if not parts:
+        return Planes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+    start = np.cumsum([0, *(len(p.area) for p, _ in parts)])
+    return Planes(
+        np.concatenate([p.normal @ S.rotation.T for p, S in parts]),
+        np.concatenate([S.apply(p.center) for p, S in parts]),
+        np.concatenate([p.area * float(S.scale) ** 2 for p, S in parts]),
+        np.concatenate([S.apply(p.points) for p, S in parts]),
+        np.concatenate([np.where(p.owner < 0, -1, p.owner + n) for (p, _), n in zip(parts, start, strict=False)]),
+    )
+
+
+def planar_area(points: Array, normal: Array) -> float:
+    """Area of the convex hull of points seen along a normal, square units; 0 for fewer than three."""
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    first = np.cross(normal, helper)
+    first /= np.linalg.norm(first)
+    flat = points @ np.stack([first, np.cross(normal, first)], axis=1)
+    try:
+        return float(ConvexHull(flat).volume)
+    except (QhullError, ValueError):
+        return 0.0

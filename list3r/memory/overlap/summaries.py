@@ -1,0 +1,209 @@
+"""What merging and gravity look at, derived once from each chunk and kept as long as the store is open."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.overlap.planes import Planes, chunk_planes
+from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes
+from list3r.memory.records import ChunkRow, MotionTrack
+from list3r.memory.store.store import Store
+
+ROOM_DEPTH_M = 2.0
+"""How far things are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
+
+
+_COLORS = 1000
+"""Points of a chunk whose colours tell the light."""
+
+
+@dataclass(frozen=True)
+class ChunkSummary:
+    """One chunk without its masks and most of its points; chunk coordinates."""
+
+    shapes: ChunkShapes
+    planes: Planes
+    cannot_link: NDArray[np.int32]
+    """Pairs of local ids. Shape (P, 2)."""
+    unit: float
+    """What a metre is in chunk units: 1 for a metric chunk."""
+    lab: Array
+    """Colours of a sample of all its points, CIE L*a*b*. Shape (C, 3)."""
+    motions: dict[int, MotionTrack | None]
+    """The local instances that move, by local id, and where they were; what bounds a room never does."""
+
+
+_KEPT_BYTES = 48 << 20
+"""Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
+with chunks. Of a chunk with 12 things it takes 0.2 MB, of one with 50 a megabyte."""
+_SAMPLED = 64
+"""Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
+_cache: WeakKeyDictionary[Store, _Kept] = WeakKeyDictionary()
+
+
+class _Kept:
+    """Summaries that were asked for last."""
+
+    def __init__(self) -> None:
+        self._rows: OrderedDict[int, tuple[int, int, ChunkSummary]] = OrderedDict()
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def get(self, chunk_id: int, checksum: int) -> ChunkSummary | None:
+        """The summary of a chunk, where it is kept and the chunk is still the same."""
+        found = self._rows.get(chunk_id)
+        if found is None or found[0] != checksum:
+            return None
+        self._rows.move_to_end(chunk_id)
+        return found[2]
+
+    def put(self, chunk_id: int, checksum: int, summary: ChunkSummary) -> None:
+        """Keep one, and let go of what was not asked for longest."""
+        self._bytes -= self._rows.pop(chunk_id, (0, 0, summary))[1]
+        size = _bytes_of(summary)
+        self._rows[chunk_id] = (checksum, size, summary)
+        self._bytes += size
+        while self._bytes > _KEPT_BYTES and len(self._rows) > 1:
+            self._bytes -= self._rows.popitem(last=False)[1][1]
+
+
+def _bytes_of(summary: ChunkSummary) -> int:
+    """What the arrays of a summary take, about."""
+    parts: list[object] = [summary.cannot_link, summary.lab]
+    for value in (*vars(summary.shapes).values(), *vars(summary.planes).values()):
+        parts += value if isinstance(value, tuple) else [value]
+    return sum(p.nbytes + 100 for p in parts if isinstance(p, np.ndarray))
+
+
+class Summaries(Mapping[int, ChunkSummary]):
+    """The summaries of chunks by id, derived when first asked for.
+
+    They depend on what the chunks measured, not on where they are placed.
+    """
+
+    def __init__(self, store: Store, settings: ShapeSettings | None = None) -> None:
+        self._store = store
+        self._settings = settings
+        self._ids = [c.chunk_id for c in store.chunks()]
+        self._known = _cache.setdefault(store, _Kept())
+        self._checked: dict[int, int] = {}
+
+    def __getitem__(self, chunk_id: int) -> ChunkSummary:
+        if chunk_id not in self._checked:
+            self._checked[chunk_id] = self._store.node_checksum(chunk_id)
+        found = self._known.get(chunk_id, self._checked[chunk_id])
+        if found is None:
+            found = _summary(self._store, self._store.chunk(chunk_id), self._settings)
+            self._known.put(chunk_id, self._checked[chunk_id], found)
+        return found
+
+    @property
+    def metre(self) -> float | None:
+        """What a metre is where the chunks lie now, of a memory whose scale was anchored; None where nobody knows."""
+        metres = self._store.get_value("metres_per_graph_unit")
+        if metres is None:
+            return None
+        scale = Sim3.from_matrix(self._store.get_value("T_world_graph", np.eye(4).tolist())).scale
+        return float(scale) / float(metres)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._ids)
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+
+class SomeSummaries(Mapping[int, ChunkSummary]):
+    """The summaries of some chunks, for who goes through all of them; `metre` is what a metre is in world units."""
+
+    def __init__(self, known: Mapping[int, ChunkSummary], chunk_ids: Iterable[int], metre: float) -> None:
+        self._of, self._ids, self.metre = known, sorted(chunk_ids), metre
+
+    def __getitem__(self, chunk_id: int) -> ChunkSummary:
+        return self._of[chunk_id]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._ids)
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+
+def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> Summaries:
+    """The summaries of all chunks by id."""
+    return Summaries(store, settings)
+
+
+def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:
+    """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is told by them."""
+    step = max(1, -(-len(chunks) // _SAMPLED))
+    return list(chunks[::step])
+
+
+def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> ChunkSummary:
+    nodes = store.local_nodes([chunk.chunk_id])
+    planes = chunk_planes(nodes)
+    unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
+    shapes = chunk_shapes(
+        nodes,
+        chunk.image_size,
+        unit,
+        settings,
+        chunk_id=chunk.chunk_id,
+        session_id=chunk.session_id,
+        samples=None if chunk.scale_kind == "metric" else store.frame_samples(chunk.chunk_id),
+    )
+    lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
+    moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
+    motions = {n: store.motion_track(chunk.chunk_id, n) for n in moves}
+    return ChunkSummary(shapes, planes, store.cannot_links(chunk.chunk_id), unit, lab, motions)
+
+
+def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
+    centers = [k.T_chunk_cam[:3, 3] for k in store.keyframes(chunk.chunk_id)] or [np.zeros(3)]
+    if len(planes.points) == 0:
+        return 1.0
+    distance = np.linalg.norm(planes.points[:, None] - np.array(centers)[None], axis=2)
+    return max(float(np.median(distance)) / ROOM_DEPTH_M, 1e-9)
+
+
+def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> float:
+    """What a metre is in world units: 1 for a metric memory, what an anchor says, or what the distances tell."""
+    known = getattr(summaries, "metre", None)
+    if known is not None:
+        return float(known)
+    if all(c.scale_kind == "metric" and float(c.S_world_chunk.scale) == 1.0 for c in chunks):
+        return 1.0
+    units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in sample_of(chunks)]
+    return float(np.median(units)) if units else 1.0
+
+
+def light_of(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> Reference:
+    """The light of a memory, from the colours of its chunks."""
+    return scene_reference(np.concatenate([summaries[c.chunk_id].lab for c in sample_of(chunks)] or [np.zeros((0, 3))]))
+
+
+def cameras_of(store: Store, chunks: Sequence[ChunkRow]) -> Sim3:
+    """Poses `S_world_cam` of all posed frames of these chunks, batched over frames."""
+    placed = {c.chunk_id: c.S_world_chunk for c in chunks}
+    frames = [f for c in chunks for f in store.frames_of(c) if f.state == "posed"]
+    if not frames:
+        return Sim3(np.ones(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    T_chunk_cam: Array = np.array([f.T_chunk_cam for f in frames])
+    owner = [placed[f.chunk_id] for f in frames]
+    S_world_chunk = Sim3(
+        np.array([float(S.scale) for S in owner]),
+        np.array([S.rotation for S in owner]),
+        np.array([S.translation for S in owner]),
+    )
+    return S_world_chunk @ Sim3(np.ones(len(frames)), T_chunk_cam[:, :3, :3], T_chunk_cam[:, :3, 3])

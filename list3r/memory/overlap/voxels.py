@@ -1,0 +1,311 @@
+"""Local instances as the occupied cells of adaptive grids: what overlap is measured on.
+
+A surface of a chunk is known to the alignment error of the chunk and to the noise of its depth, so two supports are
+compared within a tolerance: each instance is entered in a grid of half the tolerance, grown by the tolerance. The
+coverage of all instances of one chunk by all of another is then one sparse product. The grid is adaptive: fine for
+what is small or densely sampled, coarser (by powers of two) where the support points lie far apart.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.description.colors import lab_from_rgb
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.records import FrameSamples
+from list3r.memory.store.tables.local_instances import LocalNode
+
+Ints = NDArray[np.int64]
+
+LEVELS = 5
+"""Grids, each twice as coarse as the one before."""
+_BITS, _HALF = 20, 1 << 19
+_SPAN = range(-2, 3)
+_REACH = np.array(
+    [
+        i * (1 << 2 * _BITS) + j * (1 << _BITS) + k
+        for i in _SPAN
+        for j in _SPAN
+        for k in _SPAN
+        if i * i + j * j + k * k <= 4
+    ],
+    dtype=np.int64,
+)
+"""What to add to a key to get the cells whose centres lie within two cells: the tolerance."""
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """How exactly surfaces of two chunks are expected to meet."""
+
+    tolerance_m: float = 0.03
+    """Distance within which two surfaces are the same one: residual drift between chunks plus depth noise."""
+    crowd: float = 1.2
+    """Support points in an occupied cell, on average, that a grid must have to be filled by the points."""
+    max_points: int = 250
+    """Representative points of one instance, one from each occupied cell."""
+    border_px: float = 3.0
+    """A box that comes this near to the border of what is seen is cut by it."""
+    blind: float = 0.1
+    """Up to this share of the image's width and height may be blind at each border, where depth does not cover colour;
+    what is seen ends where no box of the chunk goes further."""
+
+
+@dataclass(frozen=True)
+class ChunkShapes:
+    """The N local instances of one chunk, in chunk coordinates."""
+
+    chunk_id: int
+    session_id: int
+    local_id: Ints
+    """Shape (N,)."""
+    points: Array
+    """Representative support points, R of them over all instances. Shape (R, 3)."""
+    rgb: NDArray[np.uint8]
+    """Their colours. Shape (R, 3)."""
+    owner: Ints
+    """Instance (0 to N - 1) of each point, ascending. Shape (R,)."""
+    occupied: Ints
+    """Keys of the occupied cells, by instance. Shape (C,)."""
+    occupied_owner: NDArray[np.int32]
+    """Instance of each occupied cell, ascending. Shape (C,)."""
+    level: Ints
+    """Grid of each instance. Shape (N,)."""
+    grain: float
+    """Edge of the finest cells, chunk units."""
+    unit: float
+    """What a metre is in chunk units."""
+    center: Array
+    """Middle of the trimmed extents. Shape (N, 3)."""
+    size: Array
+    """Diagonal of the trimmed extents, chunk units. Shape (N,)."""
+    cell_count: Ints
+    """Occupied cells of the instance's own grid. Shape (N,)."""
+    plane: Array
+    """(n, d), NaN for what is not flat. Shape (N, 4)."""
+    truncated: Array
+    """Share of its frames in which the border of what is seen cuts it, by mask area, in [0, 1]. Shape (N,)."""
+    lab: Array
+    """Median colour, CIE L*a*b*. Shape (N, 3)."""
+    seen: Array
+    """Part of the image in which anything is seen, xyxy, px, see `seen_xyxy`. Shape (4,)."""
+    structure: NDArray[np.bool_]
+    """Shape (N,)."""
+    stability: Array
+    """Shape (N,)."""
+    feature: NDArray[np.float32]
+    """Shape (N, D)."""
+    frames: tuple[Ints, ...]
+    """Frame.index of the visible frames of each."""
+    boxes_xyxy: tuple[NDArray[np.float32], ...]
+    """Boxes in those frames, px. Shape (V, 4) each."""
+    areas_px: tuple[NDArray[np.int32], ...]
+    """Shape (V,) each."""
+    visible_fraction: tuple[NDArray[np.float32], ...]
+    """Shape (V,) each."""
+    samples: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Where depth was computed in every third frame: ascending keys of frame and pixel; none of a sensor. (S,)."""
+    sample_owner: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
+
+    def spans(self, S_world_chunk: Sim3) -> tuple[Array, Array]:
+        """Corners of the boxes of the instances' points, world; the origin of the chunk for those without any.
+        Shape (N, 3) each.
+        """
+        low = np.tile(S_world_chunk.translation, (len(self.local_id), 1)).astype(np.float64)
+        high = low.copy()
+        if len(self.points):
+            p = S_world_chunk.apply(self.points)
+            first = np.flatnonzero(np.diff(self.owner, prepend=-1))
+            low[self.owner[first]] = np.minimum.reduceat(p, first)
+            high[self.owner[first]] = np.maximum.reduceat(p, first)
+        return low, high
+
+
+def chunk_shapes(
+    nodes: Sequence[LocalNode],
+    image_size: tuple[int, int],
+    unit: float = 1.0,
+    settings: ShapeSettings | None = None,
+    *,
+    chunk_id: int,
+    session_id: int = 1,
+    samples: FrameSamples | None = None,
+) -> ChunkShapes:
+    """Enter the local instances of one chunk in their grids.
+
+    `image_size` is (height, width); `unit` is what a metre is in chunk units; `samples` are given for computed depth.
+    """
+    s = settings or ShapeSettings()
+    nodes = sorted(nodes, key=lambda n: n.local_id)
+    grain = 0.5 * s.tolerance_m * unit
+    points, rgb, owner, cells = [], [], [], []
+    seen = seen_xyxy([n.boxes_xyxy for n in nodes], image_size, s.blind)
+    level = np.zeros(len(nodes), np.int64)
+    count = np.zeros(len(nodes), np.int64)
+    center, size = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
+    for n, node in enumerate(nodes):
+        p = node.support.points.astype(np.float64)
+        if len(p) == 0:
+            continue
+        low, high = np.quantile(p, [0.02, 0.98], axis=0)
+        center[n], size[n] = (low + high) / 2, float(np.linalg.norm(high - low))
+        level[n], occupied, first = _own_grid(p, grain, s.crowd, at_least=2 if node.structure else 0)
+        count[n] = len(occupied)
+        cells.append(_key(occupied, int(level[n])))
+        chosen = first[:: max(1, -(-len(first) // s.max_points))]
+        points.append(p[chosen])
+        rgb.append(node.support.rgb[chosen])
+        owner.append(np.full(len(chosen), n))
+    sampled, sample_owner = _sampled(samples or FrameSamples.empty(), [n.local_id for n in nodes])
+    return ChunkShapes(
+        chunk_id=chunk_id,
+        session_id=session_id,
+        local_id=np.array([n.local_id for n in nodes], np.int64),
+        points=np.concatenate(points) if points else np.zeros((0, 3)),
+        rgb=np.concatenate(rgb) if rgb else np.zeros((0, 3), np.uint8),
+        owner=_stack(owner, np.int64),
+        occupied=_stack(cells, np.int64),
+        occupied_owner=np.repeat(np.flatnonzero(count), [len(c) for c in cells]).astype(np.int32),
+        level=level,
+        grain=grain,
+        unit=unit,
+        center=center,
+        size=size,
+        cell_count=count,
+        plane=np.array([np.full(4, np.nan) if n.plane is None else n.plane for n in nodes]).reshape(-1, 4),
+        truncated=np.array([_truncated(n, seen, s.border_px) for n in nodes]),
+        lab=np.array(
+            [np.median(lab_from_rgb(n.support.rgb[:: max(1, len(n.support.rgb) // 200)]), axis=0) for n in nodes]
+        ).reshape(-1, 3),
+        seen=seen,
+        structure=np.array([n.structure for n in nodes], bool),
+        stability=np.array([n.stability for n in nodes]),
+        feature=np.array([n.feature for n in nodes], np.float32) if nodes else np.zeros((0, 0), np.float32),
+        frames=tuple(n.frames for n in nodes),
+        boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
+        areas_px=tuple(n.areas_px for n in nodes),
+        visible_fraction=tuple(n.visible_fraction for n in nodes),
+        samples=sampled,
+        sample_owner=sample_owner,
+    )
+
+
+SAMPLED_FRAMES = 3
+"""Every how many frames samples are kept."""
+PIXEL_BITS = 24
+
+
+def _sampled(samples: FrameSamples, local_id: Sequence[int]) -> tuple[Ints, NDArray[np.int32]]:
+    """Keys of the samples of every third frame, ascending, and the instance of each."""
+    kept = np.flatnonzero((samples.frame % SAMPLED_FRAMES == 0) & (samples.confidence > 0))
+    keys = samples.frame[kept] << PIXEL_BITS | samples.pixel[kept].astype(np.int64)
+    place = {n: k for k, n in enumerate(local_id)}
+    owner = np.array([place.get(n, -1) for n in samples.instance[kept].tolist()], np.int32)
+    order = np.argsort(keys, kind="stable")
+    return np.asarray(keys[order], np.int64), owner[order]
+
+
+def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) -> Array:
+    """Share of each source instance's points that lie on each target instance. Shape (N_source, N_target).
+
+    On means within the tolerance of the target's support and, where the target is flat, of its plane.
+    """
+    shape = (len(source.local_id), len(target.local_id))
+    if len(source.points) == 0 or len(target.occupied) == 0:
+        return np.zeros(shape)
+    cells, cell_owner = _grown(target)
+    p = S_target_source.apply(source.points)
+    hits = np.zeros(shape[0] * shape[1])
+    for level in np.unique(target.level):
+        keys = _key(np.floor(p / (target.grain * 2.0**level)).astype(np.int64), int(level))
+        start, stop = np.searchsorted(cells, keys, "left"), np.searchsorted(cells, keys, "right")
+        times = stop - start
+        which = np.repeat(np.arange(len(p)), times)
+        offset = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
+        at = cell_owner[np.repeat(start, times) + offset]
+        plane = target.plane[at]
+        off = np.abs(np.einsum("ij,ij->i", p[which], plane[:, :3]) + plane[:, 3])
+        on = ~(off > 2.0 * target.grain)
+        hits += np.bincount(source.owner[which[on]] * shape[1] + at[on], minlength=len(hits))
+    total = np.bincount(source.owner, minlength=shape[0])
+    return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
+
+
+_KEPT_BYTES = 16 << 20
+_known: OrderedDict[int, tuple[ChunkShapes, Ints, NDArray[np.int32]]] = OrderedDict()
+"""The grown cells of the chunks compared last, as many as there is room for: they take more memory than all else of a
+chunk."""
+
+
+def _grown(shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
+    """Keys of the cells within the tolerance of each instance, ascending, and their instances. Shape (G,) each."""
+    found = _known.get(id(shapes))
+    if found is None or found[0] is not shapes:
+        start = np.searchsorted(shapes.occupied_owner, np.arange(len(shapes.local_id) + 1))
+        parts = [_distinct((shapes.occupied[i:j, None] + _REACH).ravel()) for i, j in pairwise(start)]
+        keys = _stack(parts, np.int64)
+        owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+        order = np.argsort(keys, kind="stable")
+        found = _known[id(shapes)] = (shapes, keys[order], owner[order])
+        held = sum(k.nbytes + n.nbytes for _, k, n in _known.values())
+        while held > _KEPT_BYTES and len(_known) > 1:
+            _, k, n = _known.popitem(last=False)[1]
+            held -= k.nbytes + n.nbytes
+    _known.move_to_end(id(shapes))
+    return found[1], found[2]
+
+
+def _distinct(keys: Ints) -> Ints:
+    """Keys in order, each once: what `np.unique` returns, in a twentieth of the time."""
+    keys = np.sort(keys)
+    first = np.ones(len(keys), bool)
+    np.not_equal(keys[1:], keys[:-1], out=first[1:])
+    return np.asarray(keys[first])
+
+
+def _own_grid(points: Array, grain: float, crowd: float, at_least: int) -> tuple[int, Ints, Ints]:
+    """The finest level whose cells the points fill: (level, occupied cells (M, 3), one point of each (M,))."""
+    for level in range(at_least, LEVELS):
+        cell = np.floor(points / (grain * 2.0**level)).astype(np.int64)
+        _, first = np.unique(_key(cell, 0), return_index=True)
+        if len(points) >= crowd * len(first) or level == LEVELS - 1:
+            break
+    return level, cell[first], first
+
+
+def _key(cells: Ints, level: int) -> Ints:
+    c = np.clip(cells + _HALF, 0, 2 * _HALF - 1)
+    return np.asarray(level << 3 * _BITS | c[:, 0] << 2 * _BITS | c[:, 1] << _BITS | c[:, 2], dtype=np.int64)
+
+
+def seen_xyxy(boxes: Sequence[NDArray[np.float32]], image_size: tuple[int, int], blind: float) -> Array:
+    """The part of the image in which anything is seen: its borders, or further in by at most the share `blind` where
+    no box reaches them. Boxes xyxy of shape (V, 4) each, (height, width) -> (4,).
+    """
+    height, width = image_size
+    image = np.array([0.0, 0.0, width - 1.0, height - 1.0])
+    reached = [b for b in boxes if len(b)]
+    if not reached:
+        return image
+    every = np.concatenate(reached).astype(np.float64)
+    found = np.concatenate([every[:, :2].min(axis=0), every[:, 2:].max(axis=0)])
+    inset = blind * np.array([width, height, width, height])
+    return np.asarray(np.where(np.abs(found - image) <= inset, found, image))
+
+
+def _truncated(node: LocalNode, seen: Array, border: float) -> float:
+    b = node.boxes_xyxy
+    cut = (b[:, :2] <= seen[:2] + border).any(axis=1) | (b[:, 2:] >= seen[2:] - border).any(axis=1)
+    weight = node.areas_px.astype(np.float64)
+    return float(weight[cut].sum() / max(float(weight.sum()), 1.0))
+
+
+def _stack(parts: Sequence[NDArray[np.int64]], dtype: type) -> NDArray[np.int64]:
+    return np.concatenate(parts).astype(dtype) if parts else np.zeros(0, dtype)

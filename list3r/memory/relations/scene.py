@@ -1,0 +1,261 @@
+"""What relations are computed on: bodies with what is measured of them and between them, each once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from list3r.memory.geometry import Array
+from list3r.memory.relations.bodies import Body, neighbours_of
+from list3r.memory.relations.symmetry import round_axis, turned
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class RelationSettings:
+    """Decision boundaries. Metres are turned into units of a relative memory by what a metre is there."""
+
+    noise_m: float = 0.015
+    """Standard deviation of a height or gap: depth noise and drift between chunks."""
+    computed_noise_m: float = 0.03
+    """The same where depth was computed from colour: 2 % at 1.5 m, alike over a thing and other in each chunk."""
+    contact_m: float = 0.035
+    """A thing may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
+    contact_per_height: float = 0.12
+    """More of it for tall things, whose thin legs are seldom seen."""
+    hidden_feet: float = 0.6
+    """A thing that stands on nothing and touches no wall stands on the floor if its lowest visible point is nearer to
+    it than this share of its longest edge: legs under a table are often not seen."""
+    hidden_feet_m: float = 0.8
+    """And nearer than this."""
+    least_base: float = 0.25
+    """Least area of the surface under a thing over the thing's own footprint: a floor does not stand on table legs."""
+    enclosed_deg: float = 75.0
+    """A container goes round a thing but for at most this: the back and arms of a sofa leave more."""
+    inside: float = 0.8
+    """Share of a thing's points inside its container's box."""
+    hollow: float = 0.5
+    """Share of the surface over the middle of an open container that lies well below its rim, where it is seen."""
+    overhead: float = 0.4
+    """Share of a thing's points that have something over them, to be under it."""
+    most_wider: float = 3.0
+    """A container that holds a thing by its sides alone, without the thing being inside its box, is at most this much
+    wider than the thing: a bowl, not a sofa with arms."""
+    around: float = 0.4
+    """Share of directions in which such a container has a side: of a bowl, only the far half is often seen."""
+    uneven: float = 0.35
+    """Deviation of the distances to those sides over their mean."""
+    open_m: float = 0.8
+    """Longest edge of such a container."""
+    above_m: float = 1.5
+    """Higher than this over something is no longer said to be above it."""
+    covering_m: float = 0.06
+    """What lies on the floor and is lower than this is a rug: things stand on it or near it, not next to it."""
+    next_to_m: tuple[float, float] = (0.1, 0.4)
+    """Gap between surfaces: half the mean size of the two, within these."""
+    near_m: tuple[float, float] = (0.15, 0.4)
+    """The same for near."""
+    sure: float = 0.65
+    """Least confidence of near and next_to: a gap that is measured at the bound is as likely beyond it, and is one of
+    the many that lie there."""
+    grain: float = 0.3
+    """The nearest points of two surfaces lie further apart than the surfaces, as surfaces are sampled, less what the
+    noise of the points makes up for: by this share of the spacing of the coarser one's points."""
+    attached_m: float = 0.05
+
+
+class Measured:
+    """What was measured between pairs of bodies before, by their stamps: a run computes only what is new."""
+
+    def __init__(self, known: dict[tuple[object, ...], object] | None = None) -> None:
+        self._known = known or {}
+        self.used: dict[tuple[object, ...], object] = {}
+
+    def get(self, what: str, a: Body, b: Body, compute: Callable[[], T]) -> T:
+        """The measure `what` of a and b, computed if it is new."""
+        if not (a.stamp and b.stamp):
+            return compute()
+        key = (what, a.stamp, b.stamp, a.structure, b.structure)
+        if key not in self.used:
+            self.used[key] = self._known[key] if key in self._known else compute()
+        return cast(T, self.used[key])
+
+
+Found = tuple[int, int, float, float]
+"""Subject and object by position, confidence, margin."""
+Held = tuple[int, float, float]
+"""Object by position, confidence, margin."""
+Sure = tuple[float, float]
+"""Confidence, margin."""
+
+
+class Scene:
+    """Bodies with what is derived from them once."""
+
+    def __init__(
+        self, bodies: Sequence[Body], unit: float, settings: RelationSettings, measured: Measured, *, upright: bool
+    ) -> None:
+        self.bodies = bodies
+        self._upright = upright
+        self._measured = measured
+        self.unit = unit
+        self.s = settings
+        self._trees: dict[int, cKDTree] = {}
+        self._plans: dict[int, Plan] = {}
+        self._surfaces: dict[int, Surface] = {}
+        low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
+        high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
+        gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
+        self.box_gap = np.linalg.norm(gap, axis=2)
+        component = np.array([b.component for b in bodies])
+        self.box_gap[component[:, None] != component[None]] = np.inf
+        self.low, self.high = low, high
+        self.foot = low[:, 2].copy()
+        """Where each body ends below; down to the floor for what stands on it."""
+        self.covering = np.zeros(len(bodies), dtype=bool)
+        """Whether each body is a rug."""
+        self.size = np.array([b.size for b in bodies])
+        self.thing = np.array([b.structure is None for b in bodies], dtype=bool)
+
+    def tree(self, n: int) -> cKDTree:
+        """KD-tree of a body's points."""
+        if n not in self._trees:
+            self._trees[n] = cKDTree(self.bodies[n].points)
+        return self._trees[n]
+
+    def measure(self, what: str, a: int, b: int, compute: Callable[[Scene, int, int], T]) -> T:
+        """A measure of two bodies, from memory where it is known."""
+        return self._measured.get(what, self.bodies[a], self.bodies[b], lambda: compute(self, a, b))
+
+    def touch(self, a: int, b: int) -> float:
+        """Distance of a few hundred points of the smaller body to the nearest of the other."""
+        return self.measure("touch", min(a, b), max(a, b), _touch)
+
+    def gap(self, a: int, b: int) -> float:
+        """Distance between surfaces."""
+        return self.measure("upright gap" if self._upright else "gap", min(a, b), max(a, b), _gap)
+
+    def surface(self, n: int) -> Surface:
+        """What is known of a body's surface: its points, and for what is round its hidden sides too."""
+        if n not in self._surfaces:
+            points = self.bodies[n].points
+            axis = self.measure("axis", n, n, _axis) if self._upright and self.thing[n] else None
+            if axis is not None:
+                points = turned(points[:: -(-len(points) // _TURNED)], axis)
+            tree = self.tree(n) if axis is None else cKDTree(points)
+            away = neighbours_of(points[:: max(1, len(points) // 100)], tree, min(_COMPANY + 1, len(points)))[0]
+            grain, company = np.median(away[:, min(1, away.shape[1] - 1)]), np.median(away[:, -1])
+            self._surfaces[n] = Surface(points, tree, float(grain), float(company))
+        return self._surfaces[n]
+
+    def plan(self, n: int) -> Plan:
+        """A body as it is seen from above."""
+        if n not in self._plans:
+            points = self.bodies[n].points
+            sample = points[:: -(-len(points) // _SAMPLE)]
+            self._plans[n] = Plan(sample, cKDTree(sample[:, :2]), spacing_of(sample))
+        return self._plans[n]
+
+
+def _touch(scene: Scene, a: int, b: int) -> float:
+    small, large = sorted((a, b), key=lambda n: (len(scene.bodies[n].points), n))
+    return float(neighbours_of(scene.plan(small).points, scene.tree(large))[0].min())
+
+
+def _axis(scene: Scene, a: int, _: int) -> Array | None:
+    return round_axis(scene.bodies[a].points, scene.s.noise_m * scene.unit)
+
+
+def _gap(scene: Scene, a: int, b: int) -> float:
+    """Of the nearest points that keep company; a reading amidst the edge between two things is no surface."""
+    small, large = sorted((scene.surface(a), scene.surface(b)), key=lambda s: len(s.points))
+    near = _nearest(small.points, large.tree)
+    away, at = neighbours_of(small.points[near], large.tree, min(_COMPANY, large.tree.n))
+    keeps = _in_company(small, near)[:, None] & _in_company(large, at.ravel()).reshape(at.shape)
+    gap = float(away[keeps].min() if keeps.any() else away.min())
+    return max(0.0, gap - scene.s.grain * max(small.grain, large.grain))
+
+
+def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
+    """Positions of the few dozen points that are nearest to those of a tree; looks first where its box is near."""
+    at_least = np.linalg.norm(np.maximum(0.0, np.maximum(tree.mins - points, points - tree.maxes)), axis=1)
+    order = np.argsort(at_least, kind="stable")
+    away = np.sort(neighbours_of(points[order[: 2 * _NEAR]], tree)[0][:, 0])
+    asked = order[at_least[order] <= away[min(_NEAR, len(away)) - 1]]
+    found = neighbours_of(points[asked], tree)[0][:, 0]
+    return np.asarray(asked[np.argsort(found, kind="stable")[:_NEAR]])
+
+
+def _in_company(surface: Surface, at: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether points of a surface have others about them as is usual for it."""
+    away = neighbours_of(surface.points[at], surface.tree, min(_COMPANY + 1, surface.tree.n))[0][:, -1]
+    return np.asarray(away <= 2.0 * surface.company)
+
+
+_COMPANY, _NEAR, _TURNED = 4, 32, 250
+_SAMPLE = 200
+"""Points that stand for a body where its outline matters, not its detail."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points of a surface."""
+
+    points: Array
+    tree: cKDTree
+    grain: float
+    """Typical distance of a point from the nearest other."""
+    company: float
+    """And from the fourth."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    points: Array
+    tree: cKDTree
+    spacing: float
+
+
+def certainty(margin: float, noise: float) -> float:
+    """How likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
+    return 1.0 / (1.0 + math.exp(-min(1.7 * margin / max(noise, 1e-12), 700.0)))
+
+
+def wall_touched(scene: Scene, a: int) -> tuple[float, int] | None:
+    """The wall that a thing touches: (gap, position), the nearest one."""
+    limit = scene.s.attached_m * scene.unit
+    walls = [
+        (scene.touch(a, b), b)
+        for b, other in enumerate(scene.bodies)
+        if other.structure in ("wall", "plane") and scene.box_gap[a, b] < limit
+    ]
+    return min(walls) if walls and min(walls)[0] < limit else None
+
+
+def contact_of(scene: Scene, a: int) -> float:
+    height = float(scene.bodies[a].box.size[2])
+    return scene.s.contact_m * scene.unit + scene.s.contact_per_height * min(height, scene.unit)
+
+
+def spacing_of(points: Array) -> float:
+    """Typical distance between neighbouring points of a layer."""
+    if len(points) < 3:
+        return 0.0
+    sample = points[:: max(1, len(points) // 100)]
+    return float(np.median(neighbours_of(sample, cKDTree(points), 2)[0][:, 1]))
+
+
+def hull_under(point: Array, xy: Array) -> tuple[float, float]:
+    """How far a point lies outside the convex hull of others in the plane, 0 inside, and the area of the hull."""
+    try:
+        hull = ConvexHull(xy)
+    except (QhullError, ValueError):
+        return float(np.linalg.norm(xy - point, axis=1).min()), 0.0
+    return float(max(0.0, (hull.equations[:, :2] @ point + hull.equations[:, 2]).max())), float(hull.volume)

@@ -1,0 +1,122 @@
+"""What bounds the room rather than standing in it: floor, ceiling, walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from list3r.memory.geometry import Array
+from list3r.memory.relations.bodies import Body
+
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """Sizes of rooms."""
+
+    level_deg: float = 15.0
+    """A surface this near to level or upright counts as that."""
+    thickness_m: float = 0.12
+    """A thing thicker than this is not a surface,"""
+    thickness: float = 0.04
+    """nor one thicker than this share of its second longest edge: depth noise grows with the room."""
+    floor_band_m: float = 0.12
+    """Level surfaces this near to the floor, and no thicker, are floor,"""
+    computed_floor_band_m: float = 0.2
+    """and this near where depth was computed: rooms bend, and up is known to two degrees."""
+    min_area_m2: float = 0.25
+    wall_height_m: float = 1.2
+    wall_width_m: float = 0.8
+    depth_m: float = 0.8
+    """How far behind a surface something still tells that it does not bound the room."""
+    behind: float = 0.1
+    """Share of the points before and behind a bounding surface that may lie just behind it."""
+    under_ceiling: float = 0.02
+    """Share of the points near a ceiling that may lie above it."""
+    near_m: float = 3.0
+    """What lies further from a surface has no say."""
+
+
+def classify_structure(
+    bodies: Sequence[Body],
+    floor_height: float | None,
+    eye_level: Callable[[Body], float],
+    unit: float,
+    settings: StructureSettings | None = None,
+    around: Sequence[Body] | None = None,
+) -> list[str | None]:
+    """floor, ceiling, wall, plane or None for each body; z must be up.
+
+    `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
+    saw a body (90 % of them are below); `unit` is what a metre is in world units. A floor is level and lies at the
+    floor; a ceiling is level, above the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing
+    lies behind it. A smaller surface that the chunks flagged and that has nothing behind it is `plane`. A table top or
+    a cabinet front stands in the room and is none of these. What lies near a body decides, so `around` may be all
+    bodies (the default: those given) or those within `near_m`.
+    """
+    s = settings or StructureSettings()
+    known = bodies if around is None else around
+    cloud = [b.points[:: max(1, len(b.points) // 100)] for b in known]
+    box = np.array([b.aabb for b in known]).reshape(-1, 2, 3)
+    out: list[str | None] = []
+    for b in bodies:
+        if b.normal is None:
+            out.append(None)
+            continue
+        gap = np.maximum(box[:, 0] - b.aabb[1], b.aabb[0] - box[:, 1]).max(axis=1)
+        near = np.concatenate([cloud[n] for n in np.flatnonzero(gap <= s.near_m * unit)])
+        out.append(_classify(b, floor_height, eye_level, near, unit, s))
+    return out
+
+
+def flagged_only(bodies: Sequence[Body]) -> list[str | None]:
+    """Without gravity: `plane` for what the chunks took for structure in the main, else None."""
+    return ["plane" if b.flagged > 0.5 else None for b in bodies]
+
+
+def _classify(
+    body: Body,
+    floor_height: float | None,
+    eye_level: Callable[[Body], float],
+    cloud: Array,
+    unit: float,
+    s: StructureSettings,
+) -> str | None:
+    if body.normal is None:
+        return None
+    along = body.points @ body.normal
+    thickness = float(np.ptp(np.quantile(along, [0.1, 0.9])))
+    edges = np.sort(body.box.size)
+    height, most = float(np.median(body.points[:, 2])), max(s.thickness_m * unit, s.thickness * edges[1])
+    level = abs(body.normal[2]) > np.cos(np.radians(s.level_deg))
+    low = level and floor_height is not None and abs(height - floor_height) < s.floor_band_m * unit
+    most = max(most, s.floor_band_m * unit) if low else most
+    if thickness > most or edges[1] * edges[2] < s.min_area_m2 * unit**2:
+        return None
+    if level:
+        if low:
+            return "floor"
+        above = body.normal[2] < 0 and height > eye_level(body) + 0.2 * unit
+        if above and (cloud[:, 2] > height + 0.1 * unit).mean() < s.under_ceiling:
+            return "ceiling"
+        return None
+    if not _bounds(body, cloud, unit, s):
+        return None
+    if abs(body.normal[2]) < np.sin(np.radians(s.level_deg)):
+        wide = float(max(body.box.size[0], body.box.size[1]))
+        tall = float(body.box.size[2])
+        if tall >= s.wall_height_m * unit and wide >= s.wall_width_m * unit:
+            return "wall"
+    return "plane" if body.flagged > 0.5 else None
+
+
+def _bounds(body: Body, cloud: Array, unit: float, s: StructureSettings) -> bool:
+    """Whether (nearly) nothing stands just behind the surface; what lies further back may be another room."""
+    assert body.normal is not None
+    depth = float(np.median(body.points @ body.normal)) - cloud @ body.normal
+    just_behind = (depth > 0.15 * unit) & (depth < s.depth_m * unit)
+    across = cloud - np.outer(cloud @ body.normal, body.normal)
+    own = body.points - np.outer(body.points @ body.normal, body.normal)
+    inside = np.all((across >= own.min(axis=0)) & (across <= own.max(axis=0)), axis=1)
+    return float((just_behind & inside).sum()) <= s.behind * max(float(inside.sum()), 1.0)

@@ -1,0 +1,284 @@
+"""What a thing stands on and what it is in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from list3r.memory.geometry import Array
+from list3r.memory.relations.bodies import Body, neighbours_of
+from list3r.memory.relations.scene import (
+    Found,
+    Held,
+    Scene,
+    Sure,
+    certainty,
+    contact_of,
+    hull_under,
+    spacing_of,
+    wall_touched,
+)
+
+# ---------------------------------------------------------------------------------------------- on
+
+
+def supports(scene: Scene, taken: set[int]) -> list[Found]:
+    """Each thing on at most one other: the one whose surface it touches best."""
+    out = []
+    holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.bodies], dtype=bool)
+    for a, body in enumerate(scene.bodies):
+        if a in taken or body.structure is not None:
+            continue
+        best: Held | None = None
+        reach = contact_of(scene, a) + 0.05 * scene.unit
+        middle = body.points[:, :2].mean(axis=0)
+        aside = np.maximum(scene.low[:, :2] - middle, middle - scene.high[:, :2]).max(axis=1)
+        near = holds & (scene.box_gap[a] <= reach) & (scene.low[:, 2] <= scene.low[a, 2] + reach)
+        near &= aside <= 0.25 * scene.unit
+        near[a] = False
+        for b in np.flatnonzero(near).tolist():
+            found = scene.measure("on", a, b, _stands_on)
+            if found is not None and (best is None or found[0] > best[1]):
+                best = (b, *found)
+        if best is not None:
+            out.append((a, *best))
+    on = {a: b for a, b, _, _ in out}
+    base = [float(np.prod(b.box.size[:2])) for b in scene.bodies]
+    return [f for f in out if not (on.get(f[1]) == f[0] and (base[f[0]], f[0]) > (base[f[1]], f[1]))]
+
+
+def on_hidden_feet(scene: Scene, held: set[int]) -> list[Found]:
+    """Things that must stand on the floor or on the thing under them, for nothing else holds them, though their feet
+    were not seen.
+    """
+    s = scene.s
+    out = []
+    floors = [n for n, b in enumerate(scene.bodies) if b.structure == "floor"]
+    for a, body in enumerate(scene.bodies):
+        if a in held or body.structure is not None or wall_touched(scene, a) is not None:
+            continue
+        z = body.points[:, 2]
+        limit = min(s.hidden_feet * body.size, s.hidden_feet_m * scene.unit)
+        gaps = []
+        for b in floors:
+            aside = np.maximum(scene.low[b, :2] - body.box.center[:2], body.box.center[:2] - scene.high[b, :2]).max()
+            if np.isfinite(scene.box_gap[a, b]) and aside <= 0.25 * scene.unit:
+                near = neighbours_of(body.box.center[None, :2], scene.plan(b).tree, min(12, len(scene.plan(b).points)))[
+                    1
+                ]
+                gaps.append((float(np.quantile(z, 0.01) - np.median(scene.plan(b).points[near[0], 2])), b))
+        gaps += [(gap, b) for gap, b in _beneath(scene, a) if gap < 0.25 * scene.unit]
+        if gaps and 0.0 <= min(gaps)[0] < limit:
+            gap, b = min(gaps)
+            out.append((a, b, 0.8 * (1.0 - 0.5 * gap / limit), limit - gap))
+    return out
+
+
+def _beneath(scene: Scene, a: int) -> list[tuple[float, int]]:
+    """(clearance, position) of the things wholly below a that have a surface under its middle and are wide enough to
+    bear it.
+    """
+    middle, bottom = scene.bodies[a].box.center[:2], float(np.quantile(scene.bodies[a].points[:, 2], 0.01))
+    below = scene.thing & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
+    slack = 0.25 * scene.unit
+    below &= np.all((scene.low[:, :2] - slack <= middle) & (scene.high[:, :2] + slack >= middle), axis=1)
+    base = float(np.prod(scene.bodies[a].box.size[:2]))
+    out = []
+    for b in np.flatnonzero(below).tolist():
+        plan = scene.plan(b)
+        if float(np.prod(scene.bodies[b].box.size[:2])) < 0.5 * base:
+            continue
+        distance, at = neighbours_of(middle[None], plan.tree, min(6, len(plan.points)))
+        if distance[0, 0] < max(0.05 * scene.unit, 3.0 * plan.spacing):
+            out.append((bottom - float(np.max(plan.points[at[0], 2])), b))
+    return out
+
+
+def _stands_on(scene: Scene, a: int, b: int) -> Sure | None:
+    """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
+    subject, other = scene.bodies[a], scene.bodies[b]
+    z = subject.points[:, 2]
+    bottom, tolerance = float(np.quantile(z, 0.01)), contact_of(scene, a)
+    sink = scene.s.contact_m * scene.unit + 0.5 * scene.s.contact_per_height * min(float(np.ptp(z)), scene.unit)
+    layer = other.points[(other.points[:, 2] > bottom - tolerance) & (other.points[:, 2] < bottom + sink)]
+    if len(layer) < 3:
+        return None
+    middle = subject.points[:, :2].mean(axis=0)
+    aside = np.maximum(layer[:, :2].min(axis=0) - middle, middle - layer[:, :2].max(axis=0)).max()
+    if aside > 0.25 * scene.unit:
+        return None
+    spacing = spacing_of(layer)
+    hold = max(0.02 * scene.unit, min(spacing, 0.25 * scene.unit))
+    outside, area = hull_under(middle, layer[:, :2])
+    if outside > hold or area < scene.s.least_base * float(np.prod(subject.box.size[:2])):
+        return None
+    radius = 0.5 * float(np.linalg.norm(subject.box.size[:2])) + max(0.06 * scene.unit, 2.0 * spacing)
+    around = layer[np.linalg.norm(layer[:, :2] - middle, axis=1) < radius]
+    if len(around) < 3:
+        return None
+    distance = neighbours_of(around[:, :2], cKDTree(subject.points[:, :2]))[0][:, 0]
+    close = around[np.argsort(distance, kind="stable")[:24]]
+    surface = float(np.median(close[:, 2]))
+    if float((z > surface - 0.7 * sink).mean()) < 0.6:
+        return None
+    gap = bottom - surface
+    margin = tolerance - gap if gap >= 0 else sink + gap
+    if margin < 0:
+        return None
+    noise = scene.s.noise_m * scene.unit
+    below = float((other.points[:, 2] <= float(np.median(z))).mean()) if other.structure is None else 1.0
+    confidence = certainty(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, around)
+    return confidence, margin
+
+
+def _steady(subject: Body, around: Array) -> float:
+    """1 where the surface is seen all round the thing's middle, less where only on one side of it: what lies beside
+    a thing on a table is as high as the table, to the noise, but does not go round it.
+    """
+    away = around[:, :2] - subject.points[:, :2].mean(axis=0)
+    sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 8).astype(int) % 8)
+    return 0.6 + 0.4 * min(1.0, len(sectors) / 7)
+
+
+# ---------------------------------------------------------------------------------------------- in
+
+
+def containments(scene: Scene) -> list[Found]:
+    """Each thing in at most one container, the smallest that encloses it."""
+    out = []
+    for a, body in enumerate(scene.bodies):
+        if body.structure is not None:
+            continue
+        volume = float(np.prod(body.box.size))
+        holders = [
+            (float(np.prod(scene.bodies[b].box.size)), b)
+            for b in np.flatnonzero(scene.thing & (scene.box_gap[a] == 0.0)).tolist()
+            if a != b and volume <= 0.7 * float(np.prod(scene.bodies[b].box.size))
+        ]
+        for _, b in sorted(holders):
+            found = scene.measure("in", a, b, _held_inside)
+            if found is not None:
+                out.append((a, b, *found))
+                break
+    return out
+
+
+def _held_inside(scene: Scene, a: int, b: int) -> Sure | None:
+    """Whether a is in b: inside its box, with b's sides round it or b's boards under and over it, or down in an open
+    container whose sides go round it as far as they are seen. A seat or a table top holds nothing so.
+    """
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    local = (subject.points - holder.box.center) @ holder.box.rotation
+    inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
+    sides = _sides_round(scene, a, b)
+    width = float(np.min(subject.box.size[:2]))
+    if inside >= scene.s.inside:
+        enclosed = np.radians(scene.s.enclosed_deg)
+        if sides.open_rad <= enclosed and _rests_on(scene, a, b):
+            return inside * (1.0 - sides.open_rad / (4 * np.pi)), 0.5 * (enclosed - sides.open_rad) * width
+        covered = _between_boards(scene, a, b, walled=sides.share > 0.5 and sides.open_rad < np.pi)
+        if covered is not None:
+            return 0.9 * inside, covered
+    if sides.share < scene.s.around and _is_hollow(scene, b):
+        sides = _sides_round(scene, a, b, sunk=True)
+    if sides.share >= scene.s.around and sides.uneven < scene.s.uneven and _down_in(scene, a, b):
+        return 0.5 + 0.5 * min(sides.share, 0.8), (sides.share - scene.s.around) * width
+    return None
+
+
+@dataclass(frozen=True)
+class _Sides:
+    """Where round a thing its holder has a surface."""
+
+    share: float
+    """Share of the directions in which there is one."""
+    uneven: float
+    """How far they are from being equally far away: the deviation of their distances over the mean."""
+    open_rad: float
+    """The widest angle without any. One flat side leaves at least a half circle."""
+
+
+def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> _Sides:
+    """b's surfaces round a at a's height, above a's lowest part.
+
+    Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too, of which
+    the farthest are the rim.
+    """
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
+    noise = 2.5 * scene.s.noise_m * scene.unit
+    brim = low - noise if sunk else low + max(0.3 * (high - low), noise)
+    z = holder.points[:, 2]
+    sides = holder.points[(z > brim) & (z < max(high, brim) + 0.3 * (high - low))]
+    away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
+    away = away[np.linalg.norm(away, axis=1) > 0.25 * float(np.min(subject.box.size[:2]))]
+    if len(away) == 0:
+        return _Sides(0.0, np.inf, 2 * np.pi)
+    angle = np.sort(np.arctan2(away[:, 1], away[:, 0]) % (2 * np.pi))
+    sector = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0 * 12).astype(int) % 12
+    distance = np.linalg.norm(away, axis=1)
+    side = np.max if sunk else np.min
+    reach = np.array([side(distance[sector == n]) for n in np.unique(sector)])
+    opening = float(np.max(np.diff(angle, append=angle[0] + 2 * np.pi)))
+    return _Sides(len(reach) / 12, float(reach.std() / reach.mean()), opening)
+
+
+def _is_hollow(scene: Scene, b: int) -> bool:
+    """Whether b is seen to be open above: over its middle most of its surface lies below its rim."""
+    seen = _within(scene, b)
+    return seen is not None and seen >= scene.s.hollow
+
+
+def _within(scene: Scene, b: int) -> float | None:
+    """Share of the surface over the middle of b that lies well below its rim; None where hardly any is seen."""
+    holder = scene.bodies[b]
+    aside = np.abs((holder.points - holder.box.center) @ holder.box.rotation)[:, :2]
+    z = holder.points[np.all(aside < 0.3 * holder.box.size[:2], axis=1), 2]
+    depth = max(2.0 * scene.s.noise_m * scene.unit, 0.25 * float(holder.box.size[2]))
+    return float((z < _rim(scene, b) - depth).mean()) if len(z) >= 10 else None
+
+
+def _rim(scene: Scene, b: int) -> float:
+    return float(np.quantile(scene.bodies[b].points[:, 2], 0.97))
+
+
+def _rests_on(scene: Scene, a: int, b: int) -> bool:
+    low, high = np.quantile(scene.bodies[a].points[:, 2], [0.03, 0.97])
+    return int((scene.bodies[b].points[:, 2] < low + 0.3 * (high - low)).sum()) >= 3
+
+
+def _between_boards(scene: Scene, a: int, b: int, *, walled: bool) -> float | None:
+    """How far the board over a is above it, where b has surfaces both under a and over it: a shelf.
+
+    Where b is not round a on more than one side (`walled`), what is over a's border alone is no board: a headboard
+    rises behind a pillow.
+    """
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
+    noise = 2.0 * scene.s.noise_m * scene.unit
+    aside = np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2]
+    half = subject.box.size[:2] / 2
+    within = np.all(aside <= half + noise, axis=1)
+    inner = within if walled else np.all(aside <= 0.5 * half, axis=1)
+    z = holder.points[:, 2]
+    under = z[within & (z < low + noise) & (z > low - contact_of(scene, a) - noise)]
+    over = z[inner & (z > high + noise)]
+    return float(over.min() - high - noise) if len(under) >= 2 and len(over) >= 2 else None
+
+
+def _down_in(scene: Scene, a: int, b: int) -> bool:
+    """Whether a sits below the rim of an open container not much wider than it, over the container's middle."""
+    subject, holder = scene.bodies[a], scene.bodies[b]
+    width, noise = float(np.max(subject.box.size[:2])), scene.s.noise_m * scene.unit
+    footprints = float(np.prod(subject.box.size[:2])) / max(float(np.prod(holder.box.size[:2])), 1e-12)
+    wide = float(np.max(holder.box.size[:2])) > scene.s.most_wider * width
+    if wide or footprints > 0.8 or holder.size > scene.s.open_m * scene.unit:
+        return False
+    seen, bottom = _within(scene, b), float(np.quantile(subject.points[:, 2], 0.03))
+    deep = bottom <= _rim(scene, b) - max(noise, 0.25 * float(subject.box.size[2]))
+    if not deep or bottom < scene.low[b, 2] - 2.0 * noise or (seen is not None and seen < scene.s.hollow):
+        return False
+    outside, _ = hull_under(subject.points[:, :2].mean(axis=0), holder.points[:, :2])
+    return outside <= 0.25 * width

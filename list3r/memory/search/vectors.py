@@ -1,0 +1,253 @@
+"""A FAISS index over the embeddings of a store: derived when first asked for, kept with the store, never stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from list3r.memory.errors import OptionError, SpaceMismatchError
+from list3r.memory.search.vector_cells import Cells, cache_file, cell_count, sample_size
+from list3r.memory.store.store import Store
+
+if TYPE_CHECKING:
+    import faiss
+
+_EXACT = 30_000
+"""Up to so many vectors all are compared; more are looked up in an inverted file."""
+_PROBED = 64
+"""Cells looked into for a question, at least; twice as many whenever too few of what they hold passes the filters."""
+_LOOKED_AT = 10_000
+"""Vectors that the cells hold together, at least: small cells part what is alike more often."""
+_RANKED = 64
+"""Candidates of the inverted file, at least, that are compared exactly with what the store holds."""
+_REBUILD = 0.1
+"""Share of the vectors that may have changed before the index is built anew."""
+
+_indices: WeakKeyDictionary[Store, dict[str, VectorIndex]] = WeakKeyDictionary()
+_spaces: WeakKeyDictionary[Store, tuple[int, list[str]]] = WeakKeyDictionary()
+
+
+@dataclass
+class VectorIndex:
+    """Search by cosine over the vectors of one named space.
+
+    Small memories are compared in full. Large ones keep half-precision copies in an inverted file, and the best of
+    those are compared again with the vectors in the store, so scores are exact at any size. What the store has changed
+    since the index was built is compared in full, too; what another process changed makes it be built anew.
+    """
+
+    space: str
+    """`model@revision/dim`."""
+    dimension: int
+    count: int
+    """Vectors in `index`."""
+    index: faiss.Index
+    _made_of: int
+    """State of the file as other processes left it."""
+    _seen: int
+    """How many of the store's own changes `index` holds."""
+    _stamp: object = None
+    _fresh: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
+    """Ids and unit vectors of what has changed."""
+    _stale: frozenset[int] = field(default_factory=frozenset)
+    """Ids whose vectors in `index` no longer count."""
+
+    @staticmethod
+    def of(store: Store, space: str | None = None) -> VectorIndex:
+        """The index of a store's embeddings, of the named space or of the only one.
+
+        Raises `SpaceMismatchError` for a space the memory does not hold, `OptionError` when it holds none or several
+        and none was named.
+        """
+        chosen = _chosen_space(store, space)
+        stamp = store.state_stamp()
+        held = _indices.setdefault(store, {})
+        found = held.get(chosen)
+        if found is None or found._made_of != stamp[0] or not found._caught_up(store, stamp):
+            held.pop(chosen, None)
+            found = held[chosen] = _build(store, chosen, stamp)
+        return found
+
+    def _caught_up(self, store: Store, stamp: tuple[int, int, bool]) -> bool:
+        """Take in what the store has changed since; False when that is so much that building anew is better."""
+        if stamp == self._stamp:
+            return True
+        changed = sorted(set(store.vectors_touched[self._seen :]))
+        if len(changed) > max(1000, _REBUILD * self.count):
+            return False
+        ids, vectors = store.embeddings_of(self.space, changed)
+        if len(ids) and vectors.shape[1] != self.dimension:
+            return False
+        self._fresh = (ids, _unit(vectors)) if len(ids) else None
+        self._stale, self._stamp = frozenset(changed), stamp
+        return True
+
+    def search(
+        self, store: Store, vector: ArrayLike, k: int, passing: Callable[[Sequence[int]], set[int]] | None = None
+    ) -> list[tuple[int, float]]:
+        """The k most alike: (instance id, cosine), best first, ties by id. `vector` has shape (D,).
+
+        `passing` says which of some ids may answer; it is asked about as few as it takes.
+        """
+        query = self._checked(vector)
+        width, probed = max(4 * k, _RANKED), max(_PROBED, -(-_LOOKED_AT * cell_count(self.count) // max(self.count, 1)))
+        while True:
+            found = self._ranked(store, query, width, probed)
+            kept = _first(found, k, passing)
+            if len(kept) >= k or width >= self.count:
+                return kept
+            width = min(8 * width, self.count)
+            probed = self.count if width == self.count else 2 * probed
+
+    def _ranked(self, store: Store, query: NDArray[np.float32], width: int, probed: int) -> list[tuple[int, float]]:
+        """The best `width` or so of the index and all that has changed, by exact cosine."""
+        score, at = _ask(self.index, query, min(width, self.count), probed)
+        found = [(int(n), float(s)) for n, s in zip(at, score, strict=True) if n >= 0 and int(n) not in self._stale]
+        if self.count > _EXACT:
+            ids, vectors = store.embeddings_of(self.space, [n for n, _ in found])
+            found = list(zip(ids.tolist(), (_unit(vectors) @ query).tolist(), strict=True)) if len(ids) else []
+        if self._fresh is not None:
+            found += zip(self._fresh[0].tolist(), (self._fresh[1] @ query).tolist(), strict=True)
+        return sorted(found, key=lambda x: (-x[1], x[0]))
+
+    def vector(self, store: Store, instance_id: int) -> NDArray[np.float32]:
+        """The vector of an instance. Raises `OptionError` when it has none in this space."""
+        ids, vectors = store.embeddings_of(self.space, [instance_id])
+        if len(ids) == 0:
+            raise OptionError(f"instance {instance_id} has no vector in the space {self.space}")
+        return np.asarray(vectors[0])
+
+    def _checked(self, vector: ArrayLike) -> NDArray[np.float32]:
+        query = np.asarray(vector, dtype=np.float32).ravel()
+        if len(query) != self.dimension:
+            raise SpaceMismatchError(
+                f"a vector of {len(query)} numbers cannot be compared in the space {self.space}, "
+                f"which has {self.dimension}"
+            )
+        length = float(np.linalg.norm(query))
+        if not np.isfinite(length) or length == 0.0:
+            raise OptionError("the vector to compare with must be finite and not zero")
+        return np.asarray(query / length)
+
+
+def _first(
+    found: Sequence[tuple[int, float]], k: int, passing: Callable[[Sequence[int]], set[int]] | None
+) -> list[tuple[int, float]]:
+    """The first k that pass."""
+    if passing is None:
+        return list(found[:k])
+    kept: list[tuple[int, float]] = []
+    start, width = 0, k + 2
+    while start < len(found) and len(kept) < k:
+        part = found[start : start + width]
+        allowed = passing([i for i, _ in part])
+        kept += [f for f in part if f[0] in allowed]
+        start, width = start + width, 4 * width
+    return kept[:k]
+
+
+def _chosen_space(store: Store, space: str | None) -> str:
+    made_of = store.state_stamp()[0]
+    if store not in _spaces or _spaces[store][0] != made_of or store.spaces_touched - set(_spaces[store][1]):
+        _spaces[store] = (made_of, store.embedding_spaces())
+    spaces = _spaces[store][1]
+    if space is None:
+        if len(spaces) != 1:
+            held = f"several embedding spaces ({', '.join(spaces)}); name one" if spaces else "no embeddings"
+            raise OptionError(f"{store.path} holds {held}")
+        return spaces[0]
+    if space not in spaces:
+        raise SpaceMismatchError(
+            f"vectors of the space {space} cannot be compared with those of {store.path}, which holds: "
+            f"{', '.join(spaces) or 'none'}"
+        )
+    return space
+
+
+def _build(store: Store, space: str, stamp: tuple[int, int, bool]) -> VectorIndex:
+    """Read all vectors once, a batch at a time."""
+    import faiss
+
+    count = store.embedding_count(space)
+    index, total = _flat(store, space) if count <= _EXACT else _inverted(store, space, count)
+    if index is None:
+        index = faiss.IndexIDMap(faiss.IndexFlatIP(1))
+    return VectorIndex(space, int(index.d), total, index, stamp[0], len(store.vectors_touched), stamp)
+
+
+def _flat(store: Store, space: str) -> tuple[Any, int]:
+    """All vectors as they are, and how many; no index where there are none."""
+    import faiss
+
+    index: Any = None
+    total = 0
+    for ids, vectors in store.embedding_batches(space):
+        if index is None:
+            index = faiss.IndexIDMap(faiss.IndexFlatIP(vectors.shape[1]))
+        index.add_with_ids(_unit(vectors), ids)
+        total += len(ids)
+    return index, total
+
+
+def _inverted(store: Store, space: str, count: int) -> tuple[Any, int]:
+    """All vectors in half precision, in cells that are learned on a sample or were kept since they were."""
+    import faiss
+
+    pointer: Any = faiss.swig_ptr
+    place = cache_file(store.path, space)
+    dimension = next(store.embedding_batches(space, 1))[1].shape[1]
+    cells = Cells.load(place, dimension, count)
+    while True:
+        if cells is None:
+            cells = Cells.learned(_unit(store.embedding_sample(space, sample_size(count))), count)
+        index, quantizer = _empty(cells, dimension)
+        total = 0
+        for ids, vectors in store.embedding_batches(space):
+            unit = _unit(vectors)
+            placed = cells.of(quantizer, ids, unit)
+            index.add_core(len(ids), pointer(unit), pointer(ids), pointer(placed))
+            total += len(ids)
+        if not cells.outdated:
+            cells.save(place)
+            return index, total
+        cells = None
+
+
+def _empty(cells: Cells, dimension: int) -> tuple[Any, Any]:
+    """An inverted file without vectors, and the index of its cells."""
+    import faiss
+
+    quantizer = faiss.IndexFlatIP(dimension)
+    quantizer.add(cells.centroids)
+    index = faiss.IndexIVFScalarQuantizer(
+        quantizer, dimension, len(cells.centroids), faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT
+    )
+    index.by_residual = False
+    index.train(cells.centroids)  # half precision needs no training; this says that the cells are there
+    return index, quantizer
+
+
+def _ask(
+    index: Any, query: NDArray[np.float32], width: int, probed: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    import faiss
+
+    if width == 0:
+        return np.zeros(0, np.float32), np.zeros(0, np.int64)
+    if not hasattr(index, "nprobe"):
+        score, at = index.search(query[None], width)
+        return score[0], at[0]
+    options: Any = faiss.SearchParametersIVF()
+    options.nprobe = probed
+    score, at = index.search(query[None], width, params=options)
+    return score[0], at[0]
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.ascontiguousarray(vectors / np.maximum(length, 1e-12), dtype=np.float32)

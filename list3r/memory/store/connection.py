@@ -1,0 +1,308 @@
+"""One memory file: opening, migrating, transactions and the key-value table."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.store.checksums import Sums
+from list3r.memory.store.codec import checksum, from_json, to_json
+from list3r.memory.store.file import (
+    connected,
+    explained,
+    identified,
+    migrate,
+    migrated_copy,
+    use_write_ahead_log,
+    write_empty,
+)
+from list3r.memory.store.lock import WriterLock, lock_path
+from list3r.memory.store.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, unbelieved
+from list3r.memory.store.schema import SCHEMA_VERSION
+from list3r.memory.store.word_index import WordIndex, up_to_date, write_words
+
+
+class Connection:
+    """The file and its transactions; the verbs of the store stand on it.
+
+    One object may be used by several threads; a snapshot or a transaction of one keeps the others waiting.
+    """
+
+    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
+        self.path = path
+        self._database = database
+        self._lock = lock
+        self._followers = () if lock is None else (WordIndex(database), Sums(database))
+        """What follows the rows that a transaction changes; in this order as it commits."""
+        self._checks = ReadChecks(database) if _size(database) <= WHOLE_BYTES else None
+        self._writing = False
+        self._guard = threading.RLock()
+        self.rollbacks = 0
+        """How often something written was taken back: an id may then stand for something else."""
+        self.unsettled = 0
+        """How often a chunk was unsettled, see `memory.library_verbs`."""
+
+    @property
+    def writable(self) -> bool:
+        """Whether this is the one connection that may write."""
+        return self._lock is not None
+
+    @classmethod
+    def create(cls, path: str | Path) -> Self:
+        """A new, empty memory, open for writing. Raises `MemoryFileError` when the path is taken or not writable.
+
+        The file appears under its name only when it is whole.
+        """
+        path = Path(path)
+        if not path.parent.is_dir():
+            raise MemoryFileError(f"the folder {path.parent} does not exist; create it first")
+        if path.exists():
+            raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
+        lock = WriterLock(path.resolve())
+        new = path.resolve().with_name(f"{path.resolve().name}-new")
+        try:
+            if path.exists():
+                raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
+            remove_memory(new)
+            write_empty(path, new)
+            new.rename(path.resolve())
+            return cls._connect(path, lock)
+        except BaseException:
+            remove_memory(new)
+            lock.release()
+            raise
+
+    @classmethod
+    def open(cls, path: str | Path, *, writable: bool = False) -> Self:
+        """An existing memory. Raises `MemoryFileError` for anything else, and for a memory of a newer schema.
+
+        A memory of an older schema is migrated where it lies, or, where it may not be written or another process
+        writes it, in a copy that ends with the connection. Nothing in the file is executed: a trigger or view, or
+        anything else that the schema does not have, is refused.
+        """
+        path = Path(path)
+        if not path.exists():
+            raise MemoryFileError(f"{path} does not exist; make it with `list3r build SOURCE -m {path}`")
+        if path.is_dir():
+            raise MemoryFileError(f"{path} is a folder, not a memory file")
+        if not path.is_file():
+            raise MemoryFileError(f"{path} is a device or pipe, not a memory file")
+        if not writable:
+            return cls._open_to_read(path)
+        try:
+            return cls._connect(path, WriterLock(path.resolve()))
+        except FAILURES as error:
+            raise MemoryFileError(explained(path, error)) from error
+
+    @classmethod
+    def _open_to_read(cls, path: Path) -> Self:
+        try:
+            try:
+                database, version = _identified_reader(path)
+            except sqlite3.OperationalError as error:
+                if getattr(error, "sqlite_errorname", "") not in _UNFINISHED or not _writable_now(cls, path):
+                    raise
+                database, version = _identified_reader(path)
+            if version < SCHEMA_VERSION:
+                database.close()
+                database = connected(path, "ro") if _writable_now(cls, path) else migrated_copy(path)
+            database.execute("PRAGMA query_only=ON")
+            return cls(path, database, None)
+        except FAILURES as error:
+            raise MemoryFileError(explained(path, error)) from error
+
+    @classmethod
+    def _connect(cls, path: Path, lock: WriterLock) -> Self:
+        database: sqlite3.Connection | None = None
+        try:
+            database = connected(path, "rw")
+            version = identified(path, database)
+            if version < SCHEMA_VERSION:
+                migrate(database, version)
+            use_write_ahead_log(database)
+            opened = cls(path, database, lock)
+            if not up_to_date(database):
+                with opened.transaction():
+                    write_words(database)
+            opened._rows("SELECT 1 FROM memory LIMIT 1")  # the first read of a new log ends what holds off checkpoints
+            return opened
+        except BaseException as error:
+            if database is not None:
+                database.close()
+            lock.release()
+            if isinstance(error, FAILURES):
+                raise MemoryFileError(explained(path, error)) from error
+            raise
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the one file, release the lock. A second call does nothing."""
+        if self._lock is not None:
+            with contextlib.suppress(sqlite3.Error):
+                if any(follower.pending for follower in self._followers):
+                    with self.transaction():
+                        pass
+            for statement in ("wal_checkpoint(TRUNCATE)", "journal_mode=DELETE"):
+                with contextlib.suppress(sqlite3.Error):
+                    self._database.execute(f"PRAGMA {statement}").fetchall()
+        self._database.close()
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        found = self._damage() if isinstance(error, Exception) and not isinstance(error, List3rError | OSError) else []
+        self.close()
+        if found:
+            raise MemoryFileError(_damaged(self.path, found[0])) from error
+
+    def _damage(self) -> list[str]:
+        """What explains that something read could not be understood."""
+        return []
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All that is written inside is written together or not at all. Not re-entrant."""
+        with self._guard:
+            try:
+                self._database.execute("BEGIN IMMEDIATE")
+                self._writing = True
+                try:
+                    yield
+                    for follower in self._followers:
+                        follower.write()
+                except BaseException:
+                    self._roll_back()
+                    raise
+                self._database.execute("COMMIT")
+            except sqlite3.Error as error:
+                self._roll_back()
+                raise MemoryFileError(explained(self.path, error)) from error
+            finally:
+                self._writing = False
+
+    def _roll_back(self) -> None:
+        self.rollbacks += 1
+        for follower in self._followers:
+            follower.forget()
+        if self._database.in_transaction:
+            self._database.execute("ROLLBACK")
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All that is read inside belongs to one state of the memory, whatever a writer commits meanwhile."""
+        with self._guard:
+            if self._database.in_transaction:
+                yield
+                return
+            self._rows("BEGIN")
+            try:
+                yield
+            finally:
+                if self._database.in_transaction:
+                    with contextlib.suppress(sqlite3.DatabaseError):  # nothing was written; damage was met on the way
+                        self._database.execute("ROLLBACK")
+
+    def get_value(self, key: str, default: Any = None) -> Any:
+        """A value of the key-value table, decoded from JSON.
+
+        Keys in use: `scale_kind`, `scale_source`, `gravity` (known, estimated, unknown), `T_world_graph` (4x4),
+        `gravity_estimate` (up and floor in the graph's frame, see `memory.gravity`), `library` (what all things are
+        derived with, see `memory.library_rules`), `tale` (what stands of changes between sessions, see `memory.tale`),
+        `feature_space`, `last_id`, `created_by`.
+        """
+        rows = self._rows("SELECT value FROM memory WHERE key = ?", (key,))
+        return from_json(rows[0][0], f"the value {key} of {self.path}") if rows else default
+
+    def set_value(self, key: str, value: object) -> None:
+        """Set a value of the key-value table; anything JSON holds."""
+        self._database.execute("INSERT OR REPLACE INTO memory VALUES (?, ?)", (key, to_json(value)))
+
+    def drop_value(self, key: str) -> None:
+        """Forget a value of the key-value table, if there is one."""
+        self._database.execute("DELETE FROM memory WHERE key = ?", (key,))
+
+    def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        try:
+            rows = self._database.execute(query, arguments).fetchall()
+            if self._checks is not None and self._checks.pending and not self._writing:
+                found = self._checks.found()
+                if found is not None:
+                    raise MemoryFileError(_damaged(self.path, found))
+            return rows
+        except FAILURES as error:
+            raise MemoryFileError(explained(self.path, error)) from error
+
+    def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
+        if self._checks is None and not self._writing:
+            try:
+                bad = unbelieved(self._database, table, rows)
+            except FAILURES as error:
+                raise MemoryFileError(explained(self.path, error)) from error
+            if bad:
+                raise MemoryFileError(_damaged(self.path, f"{table} {bad[0]}: the row is not as it was written"))
+        return rows
+
+    def _own_crc_believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """Rows that begin with two keys and a count and end with blobs and their checksum: that is compared where the
+        table is not checked as a whole.
+        """
+        if self._checks is None and not self._writing:
+            for row in rows:
+                if checksum(*(blob if isinstance(blob, bytes) else b"" for blob in row[3:-1])) != row[-1]:
+                    name = f"{table} {row[0]}:{row[1]}"
+                    raise MemoryFileError(_damaged(self.path, f"{name}: the checksum does not match"))
+        return rows
+
+
+_UNFINISHED = ("SQLITE_READONLY_ROLLBACK", "SQLITE_READONLY_RECOVERY", "SQLITE_CANTOPEN", "SQLITE_READONLY")
+"""What a reader meets where a killed writer left a journal that only a writer may undo."""
+
+
+def remove_memory(path: Path) -> None:
+    """Delete a memory file and what lies beside it while it is written."""
+    for part in (path, *(Path(f"{path}{end}") for end in ("-wal", "-shm", "-journal")), lock_path(path)):
+        part.unlink(missing_ok=True)
+
+
+def _damaged(path: Path, found: str) -> str:
+    return f"{path} is damaged ({found}); `list3r repair {path}` saves what is sound"
+
+
+def _size(database: sqlite3.Connection) -> int:
+    """Bytes of a database, what is only in its log included."""
+    pages = [database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")]
+    return int(pages[0]) * int(pages[1])
+
+
+def _identified_reader(path: Path) -> tuple[sqlite3.Connection, int]:
+    """A connection for reading, and the schema version of what it reads."""
+    database = connected(path, "ro")
+    try:
+        return database, identified(path, database)
+    except BaseException:
+        database.close()
+        raise
+
+
+def _writable_now(kind: type[Connection], path: Path) -> bool:
+    """Open for writing and close, which migrates and recovers a file; False where that may not be now."""
+    if not (os.access(path, os.W_OK) and path.stat().st_mode & 0o222):
+        return False
+    try:
+        kind.open(path, writable=True).close()
+    except MemoryFileError:
+        return False
+    return True

@@ -1,0 +1,140 @@
+"""What is read is checked first, so that a flipped byte is an error and no wrong answer.
+
+In files of up to `WHOLE_BYTES` a table is checked as a whole when it is first read: its pages and indices, the sums of
+its rows and blobs, and, for what is derived, what it was derived from. That takes about as long as reading it, once for
+each connection. In larger ones rows of instances and relations (`unbelieved`) and the surfaces of things are checked
+one by one as they are read; the rest, and rows that are missing, by `verify` alone.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, own_crc_wrong, row_crc, summed_tables
+from list3r.memory.store.word_index import expected_words, up_to_date
+
+WHOLE_BYTES = 128 * 2**20
+"""Half a second of checking, at the most."""
+FAILURES = (sqlite3.Error, UnicodeError)
+"""What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
+GEOMETRY_BYTES = 24 * 8
+_PARTS = 500
+"""Parts of the sums that are asked for in one statement."""
+BOXES = "instance_boxes"
+WORDS = "words"
+
+
+class ReadChecks:
+    """Knows which tables a connection has read, and which of them are sound."""
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database = database
+        self._checked: set[str] = set()
+        self._read: set[str] = set()
+        self._busy = False
+        self._known = {*summed_tables(), BOXES, WORDS}
+        database.set_authorizer(self._note)
+
+    def _note(self, action: int, table: str | None, *_: str | None) -> int:
+        if action == sqlite3.SQLITE_READ and table is not None and not self._busy:
+            name = BOXES if table.startswith(BOXES) else table
+            if name in self._known and name not in self._checked:
+                self._read.add(name)
+        return sqlite3.SQLITE_OK
+
+    @property
+    def pending(self) -> bool:
+        """Whether a table was read that was not checked."""
+        return bool(self._read)
+
+    def found(self) -> str | None:
+        """The first damage of the tables that were read since the last call; outside of what is not committed yet."""
+        names = sorted(self._read)
+        self._read.clear()
+        self._busy, opened = True, not self._database.in_transaction
+        text_factory, self._database.text_factory = self._database.text_factory, any_text
+        try:
+            if opened:
+                self._database.execute("BEGIN")
+            for name in names:
+                for text in damage_of(self._database, name):
+                    return text
+                self._checked.add(name)
+            return None
+        except FAILURES as error:
+            return str(error)
+        finally:
+            self._database.text_factory = text_factory
+            if opened and self._database.in_transaction:
+                self._database.execute("ROLLBACK")
+            self._busy = False
+
+
+def damage_of(database: sqlite3.Connection, name: str, *, pages: bool = True) -> Iterator[str]:
+    """Every damage of one table: pages and indices (unless known to be sound), sums, and what it agrees with."""
+    if name == BOXES:
+        yield from bad_boxes(database)
+        return
+    if pages:
+        for (text,) in database.execute(f"PRAGMA integrity_check('{name}')"):
+            yield from (f"SQLite: {text}",) if text != "ok" else ()
+    if name == WORDS:
+        yield from bad_words(database)
+        return
+    if name in OWN_CRC:
+        yield from map(str, own_crc_wrong(database, name, summed_tables()[name].key))
+    yield from map(str, bad_rows_of(database, summed_tables()[name]))
+
+
+def bad_boxes(database: sqlite3.Connection) -> Iterator[str]:
+    """Where the R*Tree is broken or not what the instances say."""
+    for (text,) in database.execute(f"SELECT rtreecheck('{BOXES}')"):
+        yield from (f"{BOXES}: {text}",) if text != "ok" else ()
+    boxes = {row[0]: row[1:] for row in database.execute(f"SELECT * FROM {BOXES}")}
+    for instance, geometry in database.execute("SELECT id, geometry FROM instances ORDER BY id"):
+        box = boxes.pop(instance, None)
+        if box is None or not _holds(geometry, (*box[0::2], *box[1::2])):
+            yield f"{BOXES} {instance}: the box is not that of the instance"
+    yield from (f"{BOXES}: id {instance} is not in instances" for instance in boxes)
+
+
+def bad_words(database: sqlite3.Connection) -> Iterator[str]:
+    """Where the table of words is not what the instances are called; that of another program is left aside."""
+    if up_to_date(database):
+        held = set(database.execute("SELECT word, instance, weight FROM words WHERE word != ''"))
+        for instance in sorted({row[1] for row in held ^ set(expected_words(database))}, key=str):
+            yield f"words: those of instance {instance} are not what it is called"
+
+
+def unbelieved(database: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """Ids of those of some whole rows of a table, the id first, that its checksums do not know."""
+    parts = sorted({int(row[0]) >> 4 for row in rows})
+    known: dict[int, list[bytes]] = {}
+    for start in range(0, len(parts), _PARTS):
+        some = parts[start : start + _PARTS]
+        query = f"SELECT part, crcs FROM sums WHERE name = ? AND part IN ({','.join('?' * len(some))})"
+        for part, crcs in database.execute(query, (table, *some)):
+            held = crcs if isinstance(crcs, bytes) else b""
+            known[part] = [held[k : k + 4] for k in range(0, len(held) - 4, 4)]
+    return [row[0] for row in rows if row_crc(row) not in known.get(int(row[0]) >> 4, ())]
+
+
+def any_text(text: bytes) -> str:
+    """Text of a file that may be damaged."""
+    return text.decode("utf-8", "surrogateescape")
+
+
+def _holds(geometry: object, box: tuple[float, ...]) -> bool:
+    """Whether a box of the R*Tree (lower, upper corner) is that of an instance, rounded outwards to 32 bits."""
+    if not isinstance(geometry, bytes) or len(geometry) != GEOMETRY_BYTES:
+        return False
+    lower, upper = np.frombuffer(geometry, "<f8")[3:9].reshape(2, 3)
+    low, high = np.array(box[:3]), np.array(box[3:])
+    if not np.isfinite([lower, upper, low, high]).all():
+        return True
+    slack = 2.4e-7 * np.maximum(np.abs([lower, upper]), 1e-30)
+    return bool(((low <= lower) & (lower - low <= slack[0]) & (high >= upper) & (high - upper <= slack[1])).all())

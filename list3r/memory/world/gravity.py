@@ -1,0 +1,229 @@
+"""Which way is up: the big planes of a memory and the way its cameras were held."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from list3r.memory.geometry import Array, Sim3, rotation_exp
+from list3r.memory.overlap.planes import Planes, place_planes
+from list3r.memory.overlap.summaries import cameras_of, chunk_summaries, sample_of, world_unit
+from list3r.memory.store.store import Store
+
+
+@dataclass(frozen=True)
+class GravitySettings:
+    """When the evidence is enough."""
+
+    plane_area_m2: float = 0.05
+    """Planes smaller than this have no vote."""
+    level_deg: float = 12.0
+    """A plane this near to level (or to upright) counts as a floor or table (or as a wall)."""
+    max_camera_tilt_deg: float = 65.0
+    """Between up and the cameras' mean up: a camera that looks down at a table is tilted by 30 to 60 degrees."""
+    max_roll_deg: float = 20.0
+    """Median roll of the cameras about their line of sight: people hold a camera level."""
+    max_spread_deg: float = 6.0
+    """RMS of the voting planes about the direction found."""
+    min_level_area_m2: float = 0.15
+    """Level surface that must have been seen."""
+    floor_area_m2: float = 0.25
+    """Smallest visible patch that can be the floor."""
+    floor_below: float = 0.03
+    """Share of all other support points that may lie under the floor."""
+    floor_depth_m: float = 0.1
+    """What lies this much under it is under the floor: depth noise at the far end of a room is as large."""
+    floor_camera_height_m: float = 0.8
+    """A level surface that the cameras come nearer to than this is a table, not the floor."""
+    settled_deg: float = 0.4
+    """An estimate that differs by less from the one before is not worth moving the world for."""
+    settled_m: float = 0.02
+    """The same for the height of the floor."""
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Up in the frame of the pose graph, and how sure."""
+
+    status: str
+    """known, estimated or unknown."""
+    up: Array
+    """Unit vector; the cameras' mean up where unknown. Shape (3,)."""
+    spread_deg: float
+    """RMS angle of the level and upright planes about `up`; infinite without planes."""
+    camera_tilt_deg: float
+    """Between `up` and the mean up of the cameras."""
+    level_area: float
+    """Area of the level planes that agree, square units."""
+    floor_height: float | None
+    """Of the floor along `up`, from the origin of the frame; None where no floor was seen."""
+    reason: str
+    """One sentence."""
+
+
+def gravity_from_planes(
+    planes: Planes, S_graph_cam: Sim3, unit: float = 1.0, settings: GravitySettings | None = None
+) -> Gravity:
+    """Up from planes and cameras.
+
+    `S_graph_cam` holds the poses of the colour cameras, batched over F frames; `unit` is what a metre is in the
+    graph's units (1 for a metric memory). Candidates are the normals of planes seen from above: floors and tables, not
+    ceilings, for a wall seen by a camera that looks down and a ceiling seen by one that looks up are the same picture.
+    A candidate wins by the area of the planes that are level or upright with respect to it, among those that the
+    cameras allow: people hold a camera level, so its x axis is level too, and its up is never far from up. The winner
+    is refined on the planes that agree with it by reweighted least squares, to which level planes give one direction
+    and walls a plane of directions.
+    """
+    s = settings or GravitySettings()
+    if len(S_graph_cam.rotation) == 0:
+        return Gravity("unknown", np.array([0.0, 0.0, 1.0]), np.inf, 0.0, 0.0, None, "no camera was placed")
+    camera_up = -S_graph_cam.rotation[:, :, 1]
+    mean_up = camera_up.mean(axis=0)
+    mean_up /= max(float(np.linalg.norm(mean_up)), 1e-12)
+    unknown = Gravity("unknown", mean_up, np.inf, 0.0, 0.0, None, "no level surface agrees with the cameras")
+    big = planes.area >= s.plane_area_m2 * unit**2
+    normals, areas = planes.normal[big], planes.area[big]
+    candidates = normals[_camera_allows(normals, S_graph_cam, mean_up, s)]
+    if len(candidates) == 0:
+        return unknown
+    votes = _votes(candidates, normals, areas, s)
+    up = _refine(candidates[int(np.argmax(votes))], normals, areas, s)
+    level = np.abs(normals @ up) > np.cos(np.radians(s.level_deg))
+    upright = np.abs(normals @ up) < np.sin(np.radians(s.level_deg))
+    off = np.where(
+        level, np.arccos(np.clip(np.abs(normals @ up), 0, 1)), np.arcsin(np.clip(np.abs(normals @ up), 0, 1))
+    )
+    agree = level | upright
+    weight = np.sqrt(areas[agree])
+    spread = float(np.degrees(np.sqrt((weight * off[agree] ** 2).sum() / weight.sum()))) if agree.any() else np.inf
+    tilt = float(np.degrees(np.arccos(np.clip(up @ mean_up, -1, 1))))
+    level_area = float(areas[level].sum())
+    enough = level_area >= s.min_level_area_m2 * unit**2 and spread <= s.max_spread_deg
+    if not enough or not _camera_allows(up[None], S_graph_cam, mean_up, s)[0]:
+        return Gravity("unknown", up, spread, tilt, level_area, None, unknown.reason)
+    floor = floor_height(up, planes, S_graph_cam.translation, unit, s)
+    reason = f"{int(level.sum())} level and {int(upright.sum())} upright planes agree within {spread:.1f} degrees"
+    return Gravity("estimated", up, spread, tilt, level_area, floor, reason)
+
+
+def _camera_allows(up: Array, S_graph_cam: Sim3, mean_up: Array, s: GravitySettings) -> Array:
+    """Which directions the cameras' tilt and roll allow. Shape (C, 3) -> (C,)."""
+    level_axis = S_graph_cam.rotation[:, :, 0]
+    roll = np.degrees(np.median(np.abs(np.arcsin(np.clip(up @ level_axis.T, -1, 1))), axis=1))
+    tilt = np.degrees(np.arccos(np.clip(up @ mean_up, -1, 1)))
+    return np.asarray((roll <= s.max_roll_deg) & (tilt <= s.max_camera_tilt_deg))
+
+
+def _votes(candidates: Array, normals: Array, areas: Array, s: GravitySettings) -> Array:
+    """Area that is level with respect to each candidate, plus half of what is upright. Shape (C,)."""
+    along = np.abs(candidates @ normals.T)
+    width = np.radians(s.level_deg)
+    level = np.exp(-0.5 * (np.arccos(np.clip(along, 0, 1)) / (width / 2)) ** 2)
+    upright = np.exp(-0.5 * (np.arcsin(np.clip(along, 0, 1)) / (width / 2)) ** 2)
+    return np.asarray((level + 0.5 * upright) @ np.sqrt(areas))
+
+
+def _refine(up: Array, normals: Array, areas: Array, s: GravitySettings) -> Array:
+    """The direction that level planes point along and upright planes are perpendicular to, reweighted (Cauchy)."""
+    limit = np.radians(s.level_deg)
+    for _ in range(12):
+        along = np.clip(np.abs(normals @ up), 0, 1)
+        off_level, off_upright = np.arccos(along), np.arcsin(along)
+        width = np.radians(2.0)
+        level = np.where(off_level < limit, 1.0 / (1.0 + (off_level / width) ** 2), 0.0) * np.sqrt(areas)
+        upright = np.where(off_upright < limit, 1.0 / (1.0 + (off_upright / width) ** 2), 0.0) * np.sqrt(areas)
+        scatter = (normals * (level - upright)[:, None]).T @ normals
+        values, vectors = np.linalg.eigh(scatter)
+        found = vectors[:, int(np.argmax(values))]
+        up = found if found @ up >= 0 else -found
+    return np.asarray(up)
+
+
+def floor_height(
+    up: Array, planes: Planes, camera_centers: Array, unit: float = 1.0, settings: GravitySettings | None = None
+) -> float | None:
+    """Height along `up` of the lowest level surface that faces up and has (nearly) everything above it.
+
+    None where no floor was seen. `camera_centers` has shape (F, 3), in the frame of the planes.
+    """
+    s = settings or GravitySettings()
+    facing = planes.normal @ up > np.cos(np.radians(s.level_deg))
+    floor = facing & (planes.area >= s.floor_area_m2 * unit**2)
+    if not floor.any() or len(planes.points) == 0:
+        return None
+    heights = planes.center[floor] @ up
+    lowest = heights < heights.min() + 0.08 * unit
+    height = float(np.average(heights[lowest], weights=planes.area[floor][lowest]))
+    others = ~np.isin(planes.owner, np.flatnonzero(floor)[lowest])
+    below = float((planes.points[others] @ up < height - s.floor_depth_m * unit).mean()) if others.any() else 0.0
+    camera = float(np.quantile(camera_centers @ up, 0.05)) - height
+    if below > s.floor_below or camera < s.floor_camera_height_m * unit:
+        return None
+    return height
+
+
+def estimate_gravity(
+    store: Store,
+    S_graph_chunk: Mapping[int, Sim3] | None = None,
+    components: Mapping[int, int] | None = None,
+    settings: GravitySettings | None = None,
+) -> Gravity:
+    """Up in the frame in which chunks lie by `S_graph_chunk` (the default: as they are placed), from the chunks of the
+    first component (see `ChunkRow.component`), or 64 of them in a long memory.
+
+    Call it inside a transaction; `world_from_graph` then gives what stands the chunks upright. An estimate that still
+    agrees with the one before within `settled_deg` gives way to that one, so that the world does not tremble with every
+    chunk.
+    """
+    s = settings or GravitySettings()
+    chunks = store.chunks()
+    if S_graph_chunk is None or components is None:
+        S_graph_chunk = {c.chunk_id: c.S_world_chunk for c in chunks}
+        components = {c.chunk_id: c.component for c in chunks}
+    if not chunks:
+        return Gravity("unknown", np.array([0.0, 0.0, 1.0]), np.inf, 0.0, 0.0, None, "the memory is empty")
+    component = min(components[k] for k in S_graph_chunk)
+    summaries = chunk_summaries(store)
+    rows = sample_of([c for c in chunks if components[c.chunk_id] == component])
+    inside = [replace(c, component=component, S_world_chunk=S_graph_chunk[c.chunk_id]) for c in rows]
+    planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in inside])
+    unit = world_unit(inside, summaries)
+    if summaries.metre is not None:
+        unit *= float(inside[0].S_world_chunk.scale) / float(rows[0].S_world_chunk.scale)
+    found = gravity_from_planes(planes, cameras_of(store, inside), unit, s)
+    settled = _settled(found, store.get_value("gravity_estimate"), unit, s)
+    if settled is found and found.status != "unknown":
+        store.set_value("gravity_estimate", {"up": found.up.tolist(), "floor_height": found.floor_height})
+    return settled
+
+
+def _settled(found: Gravity, before: dict[str, Any] | None, unit: float, s: GravitySettings) -> Gravity:
+    """The estimate before where it holds still, else the one found now."""
+    if found.status == "unknown" or before is None or (before["floor_height"] is None) != (found.floor_height is None):
+        return found
+    up = np.array(before["up"])
+    turned = float(np.degrees(np.arccos(np.clip(up @ found.up, -1.0, 1.0))))
+    risen = 0.0 if found.floor_height is None else abs(found.floor_height - before["floor_height"])
+    if turned > s.settled_deg or risen > s.settled_m * unit:
+        return found
+    return replace(found, up=up, floor_height=before["floor_height"])
+
+
+def world_from_graph(gravity: Gravity) -> Sim3:
+    """T_world_graph: the smallest rotation that turns up to z, with the floor at z = 0 where it was seen.
+
+    The identity where gravity is unknown, so that a memory without it lives in the frame of its first camera.
+    """
+    if gravity.status == "unknown":
+        return Sim3.identity()
+    z = np.array([0.0, 0.0, 1.0])
+    axis = np.cross(gravity.up, z)
+    sine, cosine = float(np.linalg.norm(axis)), float(gravity.up @ z)
+    if sine < 1e-12:
+        axis = np.array([1.0, 0.0, 0.0]) if cosine < 0 else z
+    rotation = rotation_exp(axis / np.linalg.norm(axis) * np.arctan2(sine, cosine))
+    height = 0.0 if gravity.floor_height is None else gravity.floor_height
+    return Sim3(np.ones(()), rotation, np.array([0.0, 0.0, -height]))

@@ -1,0 +1,98 @@
+"""Before the chunks: the camera of a source that does not say all of it, estimated once and kept in the memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from list3r.frames.base import Camera, SourceInfo
+from list3r.frames.options import SourceOptions
+from list3r.frames.registration.rig import resized
+from list3r.frames.source import open_source
+from list3r.memory.store.store import Store
+from list3r.reconstruction.registry import entry
+
+_SILENT_ON_DISTORTION = ("images", "video")
+"""Kinds of source that say nothing of their lens but what the user does."""
+
+
+def with_camera(
+    store: Store,
+    session: int,
+    source: str | Path,
+    options: SourceOptions,
+    model: str,
+    info: SourceInfo,
+    look: Callable[[str, int, int], None] | None = None,
+) -> SourceOptions:
+    """The options with the camera that was estimated for a session, for models that leave that to a stage of its own.
+
+    It is estimated once: an interrupted session goes on with the same.
+    """
+    known = store.get_value(camera_key(session))
+    if known is None:
+        known = estimated_camera(source, options, model, info, look)
+        if known is None:
+            return options
+        with store.transaction():
+            store.set_value(camera_key(session), known)
+    return told_camera(options, known)
+
+
+def estimated_camera(
+    source: str | Path,
+    options: SourceOptions,
+    model: str,
+    info: SourceInfo,
+    look: Callable[[str, int, int], None] | None = None,
+) -> dict[str, Any] | None:
+    """`intrinsics` and `distortion` of pictures as stored, with `notes`; None where the source or the model says them.
+
+    `look` hears ("camera", windows of the video done, in all).
+    """
+    module = entry(model).calibration
+    told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
+    if not module or (info.camera is not None and told):
+        return None
+    with threadpool_limits(1):
+        progress = None if look is None else (lambda done, total: look("camera", done, total))
+        calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
+        opened, size = open_source(source, options), _stored_size(source, options)
+        height, width = opened.info.image_size or size
+        found = calibrate(opened, progress=progress, stored_px=max(size) / max(height, width))
+    return {"notes": list(found.notes), **_as_stored(found.camera, size)}
+
+
+def told_camera(options: SourceOptions, known: dict[str, Any]) -> SourceOptions:
+    """The options with a camera that was estimated."""
+    return replace(options, intrinsics=tuple(known["intrinsics"]), distortion=tuple(known["distortion"]))
+
+
+def camera_notes(store: Store, session: int) -> tuple[str, ...]:
+    """What the user should know of the camera that was estimated."""
+    known: dict[str, Any] = store.get_value(camera_key(session), {})
+    return tuple(known.get("notes", ()))
+
+
+def _stored_size(source: str | Path, options: SourceOptions) -> tuple[int, int]:
+    """(height, width) of pictures as stored, which may be larger than the frames handed out."""
+    whole = open_source(source, replace(options, max_side=0)).info
+    assert whole.image_size is not None
+    return whole.image_size
+
+
+def _as_stored(camera: Camera, size: tuple[int, int]) -> dict[str, list[float]]:
+    """Intrinsics and distortion for pictures of that (height, width)."""
+    full = resized(camera, size)
+    assert full is not None
+    return {"intrinsics": [full.fx, full.fy, full.cx, full.cy], "distortion": list(camera.distortion)}
+
+
+def camera_key(session: int) -> str:
+    """Where the camera of a session is kept in the key-value table."""
+    return f"camera {session}"

@@ -1,0 +1,289 @@
+"""What a build and an update do alike: make the settings definite, plan a session's chunks, add them in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from list3r.frames.base import SourceInfo
+from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
+from list3r.frames.chunking.cuts import find_cuts
+from list3r.frames.chunking.pace import depth_step
+from list3r.frames.source import SourceOptions, check_bad_share, open_source
+from list3r.instances.registry import check_choice
+from list3r.memory.errors import OptionError
+from list3r.memory.records import ChunkResult
+from list3r.memory.store.store import Store
+from list3r.models.cards import find_card
+from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
+from list3r.models.licences import DEFAULT_PROFILE
+from list3r.models.presets import Selection
+from list3r.pipeline.calibration import camera_key, camera_notes, with_camera
+from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
+from list3r.pipeline.joint_windows import joint_windows
+from list3r.pipeline.mapping import AssociationSettings, add_chunk, place_chunks
+from list3r.pipeline.workers import OrderedPool, default_workers
+from list3r.reconstruction.registry import MODELS, entry
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all) at the start and after every chunk."""
+Look = Callable[[str, int, int], None]
+"""Called with (what is looked for, done, in all) while a video is looked at before its chunks."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A video to work on, and how."""
+
+    source: str | Path
+    options: SourceOptions
+    settings: BuildSettings
+    info: SourceInfo
+    workers: int | None
+    """Processes; None for as many as are usual."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The chunks of a session."""
+
+    session: int
+    spans: list[ChunkSpan]
+    done: set[int]
+    """Numbers of the spans that an earlier run finished."""
+    tasks: list[ChunkTask]
+    """What is left to do, in order."""
+
+    def fresh_frames(self) -> int:
+        """Frames that this run works on, each counted once."""
+        fresh = sum(s.stop - s.start for s in self.spans if s.index not in self.done)
+        shared = sum(max(0, a.stop - b.start) for a, b in pairwise(self.spans) if b.index not in self.done)
+        return max(0, fresh - shared)
+
+
+def prepare(
+    source: str | Path,
+    options: SourceOptions | None,
+    settings: BuildSettings | None,
+    workers: int | None,
+    licence: str = DEFAULT_PROFILE,
+) -> Job:
+    """Open a source and make everything definite that was left open. Raises `SourceError` and `OptionError`."""
+    options = options or SourceOptions()
+    info = open_source(source, options).info
+    settings = resolve_settings(settings or BuildSettings(poses="auto"), info)
+    check_buildable(info, settings)
+    if workers is not None and workers < 1:
+        raise OptionError(f"--workers {workers}: at least 1 process is needed")
+    return Job(source, options, with_weights(settings, licence), info, workers)
+
+
+def plan_session(
+    store: Store, session: int, job: Job, look: Look | None = None, debug_dir: str | Path | None = None
+) -> Plan:
+    """The chunks of a session, and of those the ones that are not in the memory yet."""
+    count = job.info.frame_count
+    cuts = _cuts(store, session, job, look)
+    step = _depth_step(store, session, job, look)
+    spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
+    done = {c.index for c in store.chunks(session)}
+    options = with_camera(store, session, job.source, job.options, job.settings.reconstruction, job.info, look)
+    tasks = []
+    for span in spans:
+        if span.index not in done:
+            where = None if debug_dir is None else str(debug_dir)
+            tasks.append(
+                ChunkTask(str(job.source), options, span, job.settings, where, shot_of(span, cuts, count), step)
+            )
+    return Plan(session, spans, done, tasks)
+
+
+def add_chunks(
+    store: Store,
+    job: Job,
+    plan: Plan,
+    progress: Progress | None = None,
+    *,
+    library: bool = True,
+    added: Callable[[ChunkResult], None] | None = None,
+) -> None:
+    """Work on the chunks side by side and add them in order, with one thread, so that sums are those of any machine.
+
+    Without `library` they are only placed. `added` hears of every part that came into the memory.
+    Raises `SourceError` when more than half of the frames cannot be decoded.
+    """
+    if not plan.tasks:
+        return
+    first, session, count = plan.tasks[0], plan.session, job.info.frame_count
+    debug_dir = None if first.debug_dir is None else Path(first.debug_dir)
+    bad = {index for s, index, _ in store.bad_frames() if s == session}
+    if progress is not None:
+        progress(len(store.frames(session)), count)
+    known = {c.index for c in store.chunks(session)}
+    pool = OrderedPool(process_parts, min(job.workers or usual_workers(job.settings), len(plan.tasks)))
+    joint = joint_windows(store, session, first, pool)
+    try:
+        with threadpool_limits(1):
+            for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):
+                found = [row for part in results for row in part.bad_frames]
+                bad.update(index for index, _ in found)
+                check_bad_share(len(bad), count, found[0][1] if found else "")
+                for part in (p for p in results if p.index not in known):
+                    add_chunk(store, session, part, joint, library=library, debug_dir=debug_dir)
+                    _note_lost(store, session, part)
+                    if added is not None:
+                        added(part)
+                if progress is not None:
+                    progress(task.span.stop, count)
+    finally:
+        pool.stop()
+
+
+MOST_DEPTH_EVERY = 8
+"""Chunks are so many times as long, and their pictures are held in memory."""
+_MOST_REASONS = 5
+"""Chunks that were lost of which is said why."""
+
+
+def take_back(store: Store, session: int) -> None:
+    """Leave the memory as it was before a session that is not in the library yet."""
+    placed = any(f.state == "posed" for f in store.frames(session))
+    with store.transaction():
+        for name in (*(_name(store, session, what) for what in ("lost", "cuts", "depth step")), camera_key(session)):
+            store.drop_value(name)
+        store.drop_session(session)
+        if placed:
+            place_chunks(store, nodes=AssociationSettings().nodes)
+
+
+def lost_reasons(store: Store, session: int) -> list[str]:
+    """Why the camera could not be followed through chunks of a session, one sentence each, the first few."""
+    return list(store.get_value(_name(store, session, "lost"), []))[:_MOST_REASONS]
+
+
+def shot_cuts(store: Store, session: int) -> list[int]:
+    """Positions before which the video of a session jumps."""
+    return list(store.get_value(_name(store, session, "cuts"), []))
+
+
+def settled_notes(store: Store, session: int) -> tuple[str, ...]:
+    """What the user should know of what was settled before the chunks: the camera, and which frames get depth."""
+    notes = camera_notes(store, session)
+    step = store.get_value(_name(store, session, "depth step"), 1)
+    if step == 1:
+        return notes
+    nth = {2: "2nd", 3: "3rd"}.get(step, f"{step}th")
+    asked = any(s.session_id == session and s.settings.get("depth_every") for s in store.sessions())
+    why = "as asked" if asked else "the picture moves slowly"
+    return (*notes, f"{why}: depth and things are from every {nth} frame (--depth-every 1 takes all)")
+
+
+def _depth_step(store: Store, session: int, job: Job, look: Look | None) -> int:
+    """From every how many frames depth is computed, settled once; 1 for models that take it from elsewhere."""
+    if not entry(job.settings.reconstruction).thins:
+        return 1
+    name = _name(store, session, "depth step")
+    known: int | None = store.get_value(name)
+    if known is None:
+        known = job.settings.depth_every
+        if known is None:
+            scan = None if look is None else (lambda done, total: look("pace", done, total))
+            begun = store.chunks(session)  # by a version that took all frames
+            source, length = open_source(job.source, job.options), job.settings.chunks.length
+            known = 1 if begun else depth_step(source, length, progress=scan)
+        with store.transaction():
+            store.set_value(name, known)
+    return known
+
+
+def _name(store: Store, session: int, what: str) -> str:
+    """Where something about a session is kept; of the first one without its number, as it always was."""
+    sessions = store.sessions()
+    return what if sessions and sessions[0].session_id == session else f"{what} {session}"
+
+
+def _note_lost(store: Store, session: int, result: ChunkResult) -> None:
+    """Keep why the camera could not be followed through a chunk."""
+    if result.lost_reason:
+        name = _name(store, session, "lost")
+        with store.transaction():
+            store.set_value(name, [*store.get_value(name, []), result.lost_reason])
+
+
+def _cuts(store: Store, session: int, job: Job, look: Look | None) -> tuple[int, ...]:
+    """Where the video jumps, found once; given poses know where the camera is on either side."""
+    if job.settings.poses == "given":
+        return ()
+    name = _name(store, session, "cuts")
+    known = store.get_value(name)
+    if known is None:
+        scan = None if look is None else (lambda done, total: look("cuts", done, total))
+        begun = store.chunks(session)  # by a version that did not look for any
+        known = [] if begun else list(find_cuts(open_source(job.source, job.options), progress=scan))
+        with store.transaction():
+            store.set_value(name, known)
+    return tuple(known)
+
+
+def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:
+    """Settings with `auto` replaced by what the source offers."""
+    poses, reconstruction = settings.poses, settings.reconstruction
+    if poses == "auto":
+        poses = "given" if info.has_poses else "estimate"
+    if reconstruction == "auto":
+        reconstruction = "rgbd" if info.has_depth or "sfm" not in MODELS else "sfm"
+    return replace(settings, poses=poses, reconstruction=reconstruction)
+
+
+def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
+    """Raise an error that names the fix when the source cannot be built with the settings."""
+    if settings.poses not in ("given", "estimate"):
+        raise OptionError(f"--poses {settings.poses} is not known; choose estimate, given or auto")
+    model, every = entry(settings.reconstruction), settings.depth_every
+    if every is not None and not 1 <= every <= MOST_DEPTH_EVERY:
+        raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; --every takes fewer frames at all")
+    if every is not None and every > 1 and not model.thins:
+        raise OptionError(
+            f"--depth-every is of models that compute depth from colour (sfm), not of {settings.reconstruction}; leave "
+            "it out, or thin the frames with --every"
+        )
+    if model.needs_depth and not info.has_depth:
+        raise OptionError(
+            f"{info.path} has no depth, and {settings.reconstruction} reconstructs from RGB-D only; "
+            "give a folder in the 7-Scenes, TUM or Replica layout"
+        )
+    if model.needs_camera and info.camera is None:
+        raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
+    if settings.poses == "given" and not info.has_poses:
+        raise OptionError(f"{info.path} has no poses; use --poses estimate")
+    check_choice(settings.discovery, settings.tracking, settings.features)
+    if settings.device not in ("auto", "cpu"):  # looking for a GPU takes seconds
+        from list3r.models.pretrained import pick_device
+
+        pick_device(settings.device)
+
+
+def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:
+    """The settings with the weights of every network named by their commit, fetched where they are not in the cache.
+
+    Raises `OptionError` for what the licence profile forbids, when a package is missing, or when weights can be had
+    neither from the disk nor from the hub.
+    """
+    chosen = Selection(settings.reconstruction, settings.discovery, settings.tracking, settings.features)
+    known = dict(settings.instance_weights)
+    asked = {name: known[key] for name in PARTS_OF_OPTIONS if (key := f"{name}/{getattr(chosen, name)}") in known}
+    if settings.weights is not None:
+        asked["reconstruction"] = settings.weights
+    found = pinned_weights(chosen, asked, licence)
+    weights = found.pop("reconstruction", None)
+    known |= {f"{name}/{getattr(chosen, name)}": where for name, where in found.items()}
+    return replace(settings, weights=weights, instance_weights=tuple(sorted(known.items())))
+
+
+def usual_workers(settings: BuildSettings) -> int:
+    """Processes unless more are asked for: one where networks run, whose weights each process would hold once more."""
+    return 1 if settings.instance_weights or find_card(settings.reconstruction, "geometry") else default_workers()

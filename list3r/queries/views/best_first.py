@@ -1,0 +1,117 @@
+"""The nearest of very many things: boxes from the R*Tree in growing surroundings, surfaces of those that can win."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+from list3r.queries.match import Filters
+from list3r.queries.views.surfaces import STRAY
+
+_MOST = 300
+"""More boxes than this in the first surroundings: smaller ones will do."""
+
+_AMPLE = 1.25
+"""The first surroundings reach this much further than the k-th nearest of late: most questions are answered in one."""
+
+_reached: WeakKeyDictionary[Store, float] = WeakKeyDictionary()
+"""How far the k-th nearest lay, over the last questions."""
+
+
+def nearest_first(
+    store: Store,
+    aabb: NDArray[np.float64],
+    k: int,
+    measure: Callable[[Instance], float],
+    *,
+    filters: Filters,
+    leave_out: int | None = None,
+    component: int | None = None,
+    limit: float | None = None,
+    touch: float = 0.0,
+) -> list[tuple[float, Instance]]:
+    """The k instances with the smallest `measure`, by it and then by id; nothing further than `limit`.
+
+    `measure` must be at least the gap between an instance's box and `aabb` (2, 3), or `touch` less than that. So the
+    search ends when the surroundings that were looked at are as wide as the k-th best is far.
+    """
+    bounds = store.world_bounds()
+    if bounds is None:
+        return []
+    touch += STRAY * float(np.linalg.norm(bounds[1] - bounds[0]))
+    whole = float(np.linalg.norm(np.maximum(np.abs(bounds - aabb[0]), np.abs(bounds - aabb[1])).max(axis=0))) + 1.0
+    farthest = whole if limit is None else min(limit + touch, whole)
+    usual = _reached.get(store)
+    reach = min(_spacing(store, bounds, k) if usual is None else _AMPLE * usual, farthest)
+    measured: dict[int, tuple[float, Instance] | None] = {}
+    shrinking = 4
+    while True:
+        most = _MOST + k if shrinking else -1
+        ids, boxes = store.boxes_in_box(
+            aabb[0] - reach,
+            aabb[1] + reach,
+            structure=filters.structure,
+            min_confidence=filters.min_confidence,
+            state=filters.stored_state,
+            component=component,
+            limit=most,
+        )
+        if len(ids) == most:
+            reach, shrinking = 0.5 * reach, shrinking - 1
+            continue
+        shrinking = 0
+        best = _measure(store, ids, box_gaps(boxes, aabb), k, measure, filters, leave_out, touch, measured)
+        worst = best[k - 1][0] + touch if len(best) >= k else np.inf
+        if worst <= reach or reach >= farthest:
+            if len(best) >= k:
+                _reached[store] = 0.5 * (worst if usual is None else usual) + 0.5 * max(worst, 1e-6)
+            return [(d, i) for d, i in best[:k] if limit is None or d <= limit]
+        reach = min(worst if np.isfinite(worst) else 2.0 * reach, farthest)
+
+
+def _measure(
+    store: Store,
+    ids: NDArray[np.int64],
+    gaps: NDArray[np.float64],
+    k: int,
+    measure: Callable[[Instance], float],
+    filters: Filters,
+    leave_out: int | None,
+    touch: float,
+    measured: dict[int, tuple[float, Instance] | None],
+) -> list[tuple[float, Instance]]:
+    """The best so far, in order, after looking at the surfaces of whatever could be among them."""
+    best = sorted((m for m in measured.values() if m is not None), key=lambda m: (m[0], m[1].id))[:k]
+    order = np.lexsort((ids, gaps))
+    start, width = 0, k + 2
+    while start < len(order):
+        part = order[start : start + width]
+        if len(best) >= k and gaps[part[0]] > best[k - 1][0] + touch + 1e-9:
+            break
+        fresh = [int(ids[n]) for n in part if int(ids[n]) not in measured and int(ids[n]) != leave_out]
+        gap = dict(zip(ids[part].tolist(), gaps[part].tolist(), strict=True))
+        for i in store.instances_of(fresh):
+            if len(best) >= k and gap[i.id] > best[k - 1][0] + touch + 1e-9:
+                continue
+            measured[i.id] = (measure(i), i) if filters.passes(i) else None
+            if (found := measured[i.id]) is not None:
+                best = sorted([*best, found], key=lambda m: (m[0], m[1].id))[:k]
+        start, width = start + width, 2 * width
+    return best
+
+
+def box_gaps(boxes: NDArray[np.float64], aabb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances of boxes (N, 2, 3) from a box (2, 3), 0 where they meet. Shape (N,)."""
+    apart = np.maximum(0.0, np.maximum(boxes[:, 0] - aabb[1], aabb[0] - boxes[:, 1]))
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
+
+
+def _spacing(store: Store, bounds: NDArray[np.float64], k: int) -> float:
+    """A first guess of how far the k-th nearest lies: as if all ids ever given were spread over the world."""
+    side = np.maximum(bounds[1] - bounds[0], 1e-3)
+    return float(np.cbrt(np.prod(side) * k / max(store.next_id(), 1)))

@@ -1,0 +1,133 @@
+"""What a question can be about, in a memory that holds too much to look at all of it.
+
+The index of words tells who bears the words of a phrase, and the stored relations which of those stand as they should;
+only these are loaded. In a memory of up to `EVERYTHING` things all are looked at, to the same answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+from list3r.queries.grammar import Clause, Phrase
+from list3r.queries.match import checked_instance
+from list3r.queries.views.viewpoint import VIEWPOINT
+
+EVERYTHING = 5_000
+"""Up to so many instances all are looked at."""
+_MOST_BEARING = 300_000
+"""Ids that bear the words of one phrase, at the most."""
+_MOST = 5_000
+"""Instances that are loaded for one phrase, at the most."""
+_SAMPLE = 1_000
+"""Instances that tell how large things are, and what they are called."""
+_KEPT = 20
+"""Of a phrase of which nothing stands as it should: enough to say so."""
+
+
+@dataclass
+class Gathered:
+    """Ids to look at."""
+
+    ids: set[int] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
+    """What was left out."""
+    _bearing: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
+    sample: list[int] = field(default_factory=list)
+    """Some of all things, spread evenly."""
+
+    def bearing(self, store: Store, words: tuple[str, ...]) -> list[int]:
+        """Ids that bear all of some words, the best first."""
+        if words not in self._bearing:
+            found = store.bearing(words, _MOST_BEARING + 1)
+            if len(found) > _MOST_BEARING:
+                self.notes.append(f"more than {_MOST_BEARING} things are {' '.join(words)}; say more")
+            self._bearing[words] = found[:_MOST_BEARING]
+        return self._bearing[words]
+
+    def sizes_of(self, store: Store, words: tuple[str, ...]) -> NDArray[np.float64]:
+        """Longest edges of some of the things that bear some words, of any where fewer than four do; ascending."""
+        bearing = self.bearing(store, words) if words else []
+        ids = bearing[:: -(-len(bearing) // _SAMPLE)] if len(bearing) >= 4 else self.sample
+        edges = [float(np.max(i.box.size)) for i in store.instances_of(ids) if i.structure is None]
+        return np.sort(np.array(edges))
+
+
+def is_large(store: Store) -> bool:
+    """Whether a memory holds too much to look at all of it."""
+    return store.largest_id() > EVERYTHING
+
+
+def sample(store: Store) -> list[Instance]:
+    """All instances, or some of all in a memory that holds too many."""
+    return store.instances_of(store.sample_ids(_SAMPLE)) if is_large(store) else store.instances()
+
+
+def gather(store: Store, phrase: Phrase) -> Gathered | None:
+    """What to look at for a question; None where that is everything."""
+    if not is_large(store):
+        return None
+    out = Gathered(sample=store.sample_ids(_SAMPLE))
+    own = _candidates(store, phrase, out)
+    _keep(out, phrase, out.sample if own is None else own)
+    return out
+
+
+def _candidates(store: Store, phrase: Phrase, out: Gathered) -> list[int] | None:
+    """Ids that a phrase may mean, the best first; None where it may mean anything. Those of its clauses are kept."""
+    found: list[int] | None = None
+    if phrase.instance_id is not None:
+        found = [checked_instance(store, phrase.instance_id).id]
+    elif phrase.words:
+        found = out.bearing(store, phrase.words)
+    for clause in phrase.where:
+        objects = _candidates(store, clause.object, out)
+        if clause.other is not None:
+            _keep(out, clause.other, _candidates(store, clause.other, out) or out.sample)
+        if clause.other is not None or set(clause.predicates) & set(VIEWPOINT):
+            _keep(out, clause.object, out.sample if objects is None else objects)
+            continue
+        found = _standing(store, phrase, clause, found, objects, out)
+    return found
+
+
+def _standing(
+    store: Store, phrase: Phrase, clause: Clause, found: list[int] | None, objects: list[int] | None, out: Gathered
+) -> list[int] | None:
+    """Those of `found` that stand so to one of the objects, which are kept."""
+    if found is None and objects is None:
+        _keep(out, clause.object, out.sample)
+        return None
+    from_objects = objects is not None and (found is None or len(objects) <= len(found))
+    rows = store.related((objects if from_objects else found) or [], clause.predicates, as_object=from_objects)
+    pairs = {(subject, object) for subject, _, object, _ in rows}
+    if "near" in clause.predicates:
+        pairs |= _near_structure(store, objects or [])
+    subjects, others = None if found is None else set(found), None if objects is None else set(objects)
+    pairs = {(s, o) for s, o in pairs if (subjects is None or s in subjects) and (others is None or o in others)}
+    if not pairs:
+        _keep(out, clause.object, (objects or out.sample)[:_KEPT])
+        return (found or out.sample)[:_KEPT]
+    at = {s for s, _ in pairs}, {o for _, o in pairs}
+    _keep(out, clause.object, [n for n in objects if n in at[1]] if objects is not None else sorted(at[1]))
+    return [n for n in found if n in at[0]] if found is not None else sorted(at[0])
+
+
+def _near_structure(store: Store, objects: Sequence[int]) -> set[tuple[int, int]]:
+    """Pairs of anything and a wall or floor among some objects, whose boxes nearly meet."""
+    out = set()
+    for wall in store.instances_of(store.structure_among(objects[:_MOST])[:_KEPT]):
+        reach = 0.1 * float(np.linalg.norm(np.ptp(wall.aabb, axis=0))) + 1.0
+        out |= {(n, wall.id) for n in store.ids_in_box(wall.aabb[0] - reach, wall.aabb[1] + reach)[:_MOST]}
+    return out
+
+
+def _keep(out: Gathered, phrase: Phrase, ids: Sequence[int]) -> None:
+    if len(ids) > _MOST:
+        out.notes.append(f"{len(ids)} things may be meant by {phrase.text!r}; {_MOST} of them were looked at")
+    out.ids.update(ids[:_MOST])

@@ -1,0 +1,139 @@
+"""Surfaces of instances, kept while the instances stay as they are."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+
+_MAX_POINTS = 4000
+"""More points of one instance are thinned out: that is finer than the surfaces are known."""
+STRAY = 2e-5
+"""Points may lie this far outside their thing's box, by its size: the steps in which they are stored."""
+_KEPT_POINTS = 4_000_000
+"""Points of surfaces that are kept for the next question, over all instances of a store."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is known of the surface of one instance, world coordinates."""
+
+    support: NDArray[np.float64] | None
+    """Thinned out, inside the axis-aligned box but for `STRAY`; None where nothing was measured. Shape (N, 3)."""
+    instance: Instance
+
+    @property
+    def weight(self) -> int:
+        """What it counts for among those that are kept."""
+        return 50 if self.support is None else 50 + len(self.support)
+
+    # Cached properties write to __dict__, which frozen dataclasses without slots allow.
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Points of the surface, of the oriented box where nothing was measured. Shape (N, 3)."""
+        return _box_points(self.instance) if self.support is None else self.support
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """KD-tree of the points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """How far the points lie from each other: what is nearer than that touches, as far as is known."""
+        if self.support is None or len(self.support) < 9:
+            return 0.0
+        sample = self.points[:: -(-len(self.points) // 200)]
+        return float(np.median(np.asarray(self.tree.query(sample, k=2)[0])[:, 1]))
+
+
+_kept: WeakKeyDictionary[Store, OrderedDict[int, tuple[bytes, Surface]]] = WeakKeyDictionary()
+_kept_points: WeakKeyDictionary[Store, int] = WeakKeyDictionary()
+
+
+def surface_of(store: Store, instance: Instance) -> Surface:
+    """The surface of an instance: its support, or its box where it has none."""
+    known = _kept.setdefault(store, OrderedDict())
+    stamp = instance.aabb.tobytes() + instance.center.tobytes() + instance.observations.to_bytes(8, "little")
+    if instance.id in known:
+        if known[instance.id][0] == stamp:
+            known.move_to_end(instance.id)
+            return known[instance.id][1]
+        _kept_points[store] -= known.pop(instance.id)[1].weight
+    surface = _surface(store, instance)
+    known[instance.id] = (stamp, surface)
+    _kept_points[store] = _kept_points.get(store, 0) + surface.weight
+    while _kept_points[store] > _KEPT_POINTS and len(known) > 1:
+        _kept_points[store] -= known.popitem(last=False)[1][1].weight
+    return surface
+
+
+def surface_points(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
+    """Surface points of an instance in the world, thinned out (N, 3), and how far they lie from each other."""
+    surface = surface_of(store, instance)
+    return surface.points, surface.spacing
+
+
+def _surface(store: Store, instance: Instance) -> Surface:
+    """Support points inside the box, as deriving the box left strays out; those just outside are moved to its side, so
+    that a thing is never nearer than its box.
+    """
+    points = store.surface_points(instance.id).astype(np.float64)
+    if len(points):
+        low, high = instance.aabb
+        slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
+        points = points[np.all((points >= low - slack) & (points <= high + slack), axis=1)]
+    if len(points) == 0:
+        return Surface(None, instance)
+    stray = STRAY * float(np.max(instance.box.size))
+    points = np.clip(points[:: -(-len(points) // _MAX_POINTS)], low - stray, high + stray)
+    return Surface(points, instance)
+
+
+_FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.float64) * 0.5 - 0.5
+
+
+def _box_points(instance: Instance) -> NDArray[np.float64]:
+    """Corners and middles of edges and faces of the oriented box. Shape (26, 3)."""
+    box = instance.box
+    points = box.center + (_FACES * box.size) @ box.rotation.T
+    return np.asarray(np.clip(points, instance.aabb[0], instance.aabb[1]))
+
+
+def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float64]) -> float:
+    """From a point to the nearest surface point of an instance."""
+    surface = surface_of(store, instance)
+    if surface.support is not None:
+        offset = surface.support - point
+        return float(np.sqrt(np.min(np.einsum("ij,ij->i", offset, offset))))
+    box = instance.box
+    outside = (np.abs((point - box.center) @ box.rotation) - box.size / 2.0).tolist()
+    if max(outside) <= 0.0:
+        return float(-max(outside))
+    apart = np.maximum(instance.aabb[0] - point, point - instance.aabb[1]).tolist()
+    return math.sqrt(max(_squared(*outside), _squared(*apart)))
+
+
+def _squared(x: float, y: float, z: float) -> float:
+    """Square of a distance by how far a point lies outside along three axes, not above 0 where it does not."""
+    x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
+    return x**2 + y**2 + z**2
+
+
+def distance_between(store: Store, a: Instance, b: Instance) -> float:
+    """Between the nearest surface points of two instances; 0 where they touch, which is where the points of one lie as
+    near to the other as to each other.
+    """
+    one, two = surface_of(store, a), surface_of(store, b)
+    small, large = sorted((one, two), key=lambda s: len(s.points))
+    gap = float(np.min(large.tree.query(small.points)[0]))
+    return 0.0 if gap <= max(one.spacing, two.spacing) else gap

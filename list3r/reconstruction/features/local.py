@@ -1,0 +1,162 @@
+"""Local features with depth: what finds a frame again without a guess of its pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.features.vlad import root_sift
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise
+
+SIFT_WIDTH = 128
+LEARNED_RATIO = 0.95
+"""Ratio of best to second best distance for learned descriptors: on redkitchen ALIKED then has SIFT's precision at 0.85
+for frames one second apart and 1.5 times its right pairs."""
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """How local features are found, matched and verified."""
+
+    count: int = 400
+    """Most features on a frame."""
+    contrast: float = 0.015
+    """SIFT's contrast threshold; low, so that plain rooms give some."""
+    ratio: float = 0.85
+    """Lowe's ratio of best to second best distance."""
+    trials: int = 400
+    """RANSAC samples of three pairs."""
+    least_pairs: int = 12
+    """Fewest pairs that must agree."""
+    gate_sigmas: float = 4.0
+    """Largest distance of an agreeing pair, in standard deviations of its depth."""
+    gate_least_m: float = 0.02
+    """That distance is never less, metres."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Local features of one frame, N of them, strongest first."""
+
+    xy: Floats
+    """px. Shape (N, 2)."""
+    descriptors: NDArray[np.uint8]
+    """SIFT, shape (N, 128), or learned ones as bytes, of another width."""
+    points_cam: Floats
+    """Camera coordinates, metres, NaN where depth is unknown. Shape (N, 3)."""
+
+
+@dataclass(frozen=True)
+class FeaturePose:
+    """A relative pose that the features of two frames agree on."""
+
+    T_a_b: NDArray[np.float64]
+    """Shape (4, 4)."""
+    matches: int
+    """Mutual matches with depth on both sides."""
+    inliers: int
+
+
+def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: FeatureSettings) -> Features:
+    """SIFT features of an RGB image, with the depth found at each."""
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
+    keypoints, descriptors = sift.detectAndCompute(gray, None)
+    if descriptors is None:
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
+    xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
+    response = np.array([k.response for k in keypoints])
+    order = np.lexsort((xy[:, 0], xy[:, 1], -response))[: settings.count]
+    xy = xy[order]
+    return Features(xy, descriptors[order].astype(np.uint8), points_at(xy, depth, camera))
+
+
+def points_at(xy: Floats, depth: Floats, camera: Camera) -> Floats:
+    """Camera coordinates of pixels by the median of the known depths in 3x3 around each; NaN without. Shape (N, 3)."""
+    column = np.clip(np.rint(xy[:, 0]).astype(int), 0, camera.width - 1)
+    row = np.clip(np.rint(xy[:, 1]).astype(int), 0, camera.height - 1)
+    steps = np.arange(-1, 2)
+    rows = np.clip(row[:, None, None] + steps[:, None], 0, camera.height - 1)
+    columns = np.clip(column[:, None, None] + steps[None, :], 0, camera.width - 1)
+    around = np.sort(np.where(depth[rows, columns] > 0, depth[rows, columns], np.inf).reshape(len(xy), 9), axis=1)
+    known = np.isfinite(around).sum(axis=1)
+    z = around[np.arange(len(xy)), np.maximum(known - 1, 0) // 2]
+    z = np.where(known > 0, z, np.nan)
+    rays = [(xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy, np.ones(len(xy))]
+    return (np.stack(rays, axis=1) * z[:, None]).astype(np.float32)
+
+
+def match(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float) -> NDArray[np.int64]:
+    """Mutual nearest neighbours that pass the ratio test, by RootSIFT distance. Shape (M, 2).
+
+    Descriptors of another width than SIFT's are learned ones (`learned.as_bytes`), whose distances lie closer together;
+    kinds of different widths have nothing in common.
+    """
+    if len(a) < 2 or len(b) < 2 or a.shape[1] != b.shape[1]:
+        return np.zeros((0, 2), np.int64)
+    if a.shape[1] != SIFT_WIDTH:
+        ratio = max(ratio, LEARNED_RATIO)
+    return nearest_pairs(root_sift(a), root_sift(b), ratio)
+
+
+def nearest_pairs(a: Floats, b: Floats, ratio: float) -> NDArray[np.int64]:
+    """Mutual nearest neighbours of unit descriptors (N, D), (M, D) that pass the ratio test. Shape (K, 2)."""
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), np.int64)
+    likeness = a @ b.T
+    forth, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    rows = np.flatnonzero(back[forth] == np.arange(len(a)))
+    top = np.partition(likeness[rows], -2, axis=1)[:, -2:]
+    distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
+    rows = rows[distance[:, 1] < ratio * distance[:, 0]]
+    return np.stack([rows, forth[rows]], axis=1)
+
+
+def relative_pose(
+    points_a: Floats,
+    points_b: Floats,
+    settings: FeatureSettings,
+    noise: SensorNoise,
+) -> FeaturePose | None:
+    """The rigid transform most pairs of 3D points agree on, by seeded RANSAC; None when too few do.
+
+    `points_a` and `points_b` have shape (M, 3), camera coordinates, metres; pairs with an unknown point are left out.
+    """
+    known = np.isfinite(points_a).all(axis=1) & np.isfinite(points_b).all(axis=1)
+    a, b = points_a[known].astype(np.float64), points_b[known].astype(np.float64)
+    if len(a) < settings.least_pairs:
+        return None
+    farther = np.maximum(a[:, 2], b[:, 2]).astype(np.float32)
+    gate = np.maximum(settings.gate_least_m, settings.gate_sigmas * noise.sigma(farther)).astype(np.float64)
+    triples = np.random.default_rng(len(a)).integers(0, len(a), (settings.trials, 3))
+    R, t = _kabsch(b[triples], a[triples])
+    errors = np.linalg.norm(np.einsum("tij,nj->tni", R, b) + t[:, None] - a, axis=-1)
+    best = int((np.minimum(errors / gate, 1.0)).sum(axis=1).argmin())
+    inside = errors[best] < gate
+    for _ in range(4):
+        if inside.sum() < settings.least_pairs:
+            return None
+        weight = inside / gate**2
+        R1, t1 = _kabsch(b[None], a[None], weight[None])
+        inside = np.linalg.norm(b @ R1[0].T + t1[0] - a, axis=-1) < gate
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R1[0], t1[0]
+    return FeaturePose(T, len(a), int(inside.sum())) if inside.sum() >= settings.least_pairs else None
+
+
+def _kabsch(
+    source: NDArray[np.float64], target: NDArray[np.float64], weight: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rigid transforms of B point sets of n points each. Shapes (B, n, 3) -> (B, 3, 3), (B, 3)."""
+    w = np.full(source.shape[:2], 1.0 / source.shape[1]) if weight is None else weight / weight.sum(-1, keepdims=True)
+    mean_s, mean_t = np.einsum("bn,bni->bi", w, source), np.einsum("bn,bni->bi", w, target)
+    moment = np.einsum("bn,bni,bnj->bij", w, target - mean_t[:, None], source - mean_s[:, None])
+    u, _, vt = np.linalg.svd(moment)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    u[..., 2] *= sign[:, None]
+    R = u @ vt
+    return R, mean_t - np.einsum("bij,bj->bi", R, mean_s)

@@ -1,0 +1,259 @@
+"""Find what moves of its own: a surface that disagrees with the motion that the rest of the picture determines.
+
+A near surface weighs heavily (1 / sigma^2 falls with the fourth power of depth), so a mover over a fifth of the picture
+drags the camera along, and no robust kernel over single pixels can tell it from the background: both agree half. What
+can is a vote by pixels between two explanations, with and without a whole surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.reconstruction.rgbd.registration import Registration, RegistrationSettings, Samples, register, steps_without
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise, View
+
+Mask = NDArray[np.bool_]
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MoverSettings:
+    """When a surface counts as moving of its own."""
+
+    least_share: float = 0.02
+    """Smallest surface that is looked at, share of the picture."""
+    most_share: float = 0.5
+    """Largest one; more than half of the picture is what the camera moves against."""
+    depth_step: float = 0.03
+    """Steps of depth beyond this share of it, and beyond noise, part surfaces."""
+    suspect_m: float = 0.0025
+    """The rest must want to shift a surface by at least this, and by a standard deviation, for a closer look."""
+    suspect_stride: int = 10
+    """Every n-th model point takes part in the search for suspects."""
+    check_stride: int = 3
+    """Every n-th model point takes part in the closer look."""
+    gray_sigma: float = 6.0
+    """Standard deviation of brightness between views of one surface, grey levels."""
+    truncate: float = 3.0
+    """Standard deviations beyond which a pixel counts as plainly not explained."""
+    gain: float = 0.05
+    """What all pixels together must gain of their cost under the pose of the rest, though the surface itself loses."""
+    rest_gain: float = 0.4
+    """Or what the rest alone must gain, whatever the surface loses."""
+    contrast: float = 2.5
+    """Least cost of the surface, against that of the rest, under the pose of the rest."""
+    least_seen: float = 0.3
+    """Share of a surface that must be comparable for a verdict."""
+    least_pairs: int = 20
+    """Fewest compared points for a surface to count as one that the model does not know."""
+    trial_frames: int = 10
+    """Frames after which a mover is looked at again: one that stayed where it was moves no more."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a pose explains model points inside and outside a mask."""
+
+    inside: float
+    """Mean truncated cost, 0 to 2 * truncate^2; NaN for none."""
+    outside: float
+    count_inside: int
+    count_outside: int
+
+    @property
+    def mean(self) -> float:
+        """Over all points, NaN where a side has none."""
+        total = self.inside * self.count_inside + self.outside * self.count_outside
+        return total / max(1, self.count_inside + self.count_outside)
+
+
+def fit(model: Samples, view: View, mask: Mask, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise) -> Fit:
+    """Mean cost inside and outside a mask."""
+    cost, pixel = pixel_costs(model, view, T_model_cam, settings, noise)
+    return _split(cost, mask.ravel()[pixel])
+
+
+def _split(cost: Floats, moving: Mask) -> Fit:
+    return Fit(_mean(cost[moving]), _mean(cost[~moving]), int(moving.sum()), int((~moving).sum()))
+
+
+def pixel_costs(
+    model: Samples, view: View, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Truncated squares of depth and brightness residuals in units of noise, summed, and the pixels they fall on."""
+    camera, gray = view.camera, model.gray
+    R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
+    p = (model.points - t) @ R
+    z = np.maximum(p[:, 2], np.float32(1e-3))
+    u = p[:, 0] / z * np.float32(camera.fx) + np.float32(camera.cx)
+    v = p[:, 1] / z * np.float32(camera.fy) + np.float32(camera.cy)
+    inside = (p[:, 2] > 0.05) & (u > 0) & (v > 0) & (u < camera.width - 1) & (v < camera.height - 1)
+    index = np.flatnonzero(inside)
+    pixel = np.rint(v[index]).astype(np.int64) * camera.width + np.rint(u[index]).astype(np.int64)
+    known = view.valid.ravel()[pixel]
+    index, pixel = index[known], pixel[known]
+    apart = view.points.reshape(-1, 3)[pixel] @ R.T + t - model.points[index]
+    residual = np.einsum("ij,ij->i", apart, model.normals[index]) / noise.sigma(view.depth.ravel()[pixel])
+    limit = np.float32(settings.truncate**2)
+    cost = np.minimum(residual * residual, limit)
+    if gray is not None and len(index):
+        error = cv2.remap(view.gray, u[index][None], v[index][None], cv2.INTER_LINEAR)[0] - gray[index]
+        error = (error - np.median(error)) / np.float32(settings.gray_sigma)
+        cost = cost + np.minimum(error * error, limit)
+    return np.asarray(cost, np.float32), pixel
+
+
+def surfaces(view: View, settings: MoverSettings, noise: SensorNoise) -> list[Mask]:
+    """Masks of the surfaces that are parted from their surroundings by steps of depth, largest first."""
+    depth, area = view.depth, view.depth.size
+    step = np.float32(settings.depth_step) * depth + 3 * noise.sigma(depth)
+    whole = depth > 0
+    across = np.abs(np.diff(depth, axis=1)) > step[:, 1:]
+    down = np.abs(np.diff(depth, axis=0)) > step[1:]
+    whole[:, 1:] &= ~across
+    whole[:, :-1] &= ~across
+    whole[1:] &= ~down
+    whole[:-1] &= ~down
+    core = cv2.erode(whole.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=4)
+    sizes = stats[:, cv2.CC_STAT_AREA]
+    fit_in = (sizes >= settings.least_share * area) & (sizes <= settings.most_share * area)
+    chosen = [int(k) for k in np.argsort(-sizes, kind="stable") if k > 0 and fit_in[k]]
+    return [_grown(labels == k, 7) for k in chosen]
+
+
+def without(view: View, mask: Mask) -> View:
+    """The view with a part unknown."""
+    return replace(view, valid=view.valid & ~mask)
+
+
+def find_mover(
+    model: Samples,
+    view: View,
+    T_guess: Pose,
+    found: Registration,
+    registration: RegistrationSettings,
+    settings: MoverSettings,
+    noise: SensorNoise,
+) -> tuple[Mask, Registration] | None:
+    """The surface that moves of its own most plainly, and the view registered without it; None where nothing does."""
+    best: tuple[float, Mask] | None = None
+    few = _every(model, settings.check_stride)
+    for mask in suspects(model, view, found, registration, settings, noise):
+        rest = register(few, without(view, mask), T_guess, registration, noise)
+        if rest is None:
+            continue
+        before = fit(few, view, mask, found.T_model_cam, settings, noise)
+        after = fit(few, view, mask, rest.T_model_cam, settings, noise)
+        if after.count_inside < settings.least_seen * (mask & view.valid).sum() * len(few.points) / view.valid.sum():
+            continue
+        if after.inside < settings.contrast * after.outside:
+            continue
+        gain = 1 - after.mean / max(before.mean, 1e-6)
+        rest_gain = 1 - after.outside / max(before.outside, 1e-6)
+        strange = before.inside > settings.truncate**2 and after.inside > settings.truncate**2
+        if gain < settings.gain and rest_gain < settings.rest_gain and not strange:
+            continue
+        if best is None or gain > best[0]:
+            best = (gain, mask)
+    if best is None:
+        return None
+    rest = register(model, without(view, best[1]), T_guess, registration, noise)
+    return None if rest is None else (best[1], rest)
+
+
+def suspects(
+    model: Samples,
+    view: View,
+    found: Registration,
+    registration: RegistrationSettings,
+    settings: MoverSettings,
+    noise: SensorNoise,
+) -> list[Mask]:
+    """Surfaces that one more step without them would shift by more than noise."""
+    few = _every(model, settings.suspect_stride)
+    cost, pixel = pixel_costs(few, view, found.T_model_cam, settings, noise)
+    masks = [m for m in surfaces(view, settings, noise) if (m & view.valid).mean() >= 0.5 * settings.least_share]
+    out = []
+    for mask, shift in zip(masks, steps_without(few, view, found.T_model_cam, masks, registration, noise), strict=True):
+        if shift is None:
+            continue
+        now = _split(cost, mask.ravel()[pixel])
+        place = np.median(view.points[mask & view.valid][::7], axis=0) @ found.T_model_cam[:3, :3].T
+        place += found.T_model_cam[:3, 3]
+        moved = float(np.linalg.norm(shift[:3, :3] @ place + shift[:3, 3] - place))
+        strange = now.inside > max(settings.truncate**2, settings.contrast * now.outside)
+        far = np.median(view.depth[mask & view.valid][::7], keepdims=True)
+        least = max(settings.suspect_m, float(noise.sigma(far)[0]))
+        if moved > least or (strange and now.count_inside > settings.least_pairs):
+            out.append(mask)
+    return out
+
+
+class MoverMemory:
+    """What moved in the last frame, carried to the next until it has stood still."""
+
+    def __init__(self, settings: MoverSettings, noise: SensorNoise) -> None:
+        self._settings, self._noise = settings, noise
+        self.mask: Mask | None = None
+        """What moves in the last frame that was followed."""
+        self._trial: Samples | None = None
+        self._trial_age = 0
+        self._home = -1
+
+    def expect(self, view: View) -> Mask | None:
+        """What of the next view still belongs to the mover."""
+        if self.mask is None or not self.mask.any():
+            return None
+        out = np.zeros_like(self.mask)
+        for mask in surfaces(view, replace(self._settings, least_share=0.5 * self._settings.least_share), self._noise):
+            if (mask & self.mask).sum() >= 0.5 * mask.sum():
+                out |= mask
+        if out.sum() < 0.5 * self.mask.sum():
+            out |= self.mask
+        return out
+
+    def keep(self, view: View, mask: Mask, T_model_cam: Pose, usual: float, home: int) -> Mask:
+        """Remember what moves in a followed view (the whole one); returns it, or nothing once it has stood still.
+
+        `usual` is the mean cost of what does not move, `home` the number of the segment whose coordinates are meant.
+        """
+        if home != self._home:
+            self._trial, self._home = None, home
+        self._trial_age += 1
+        if self._trial is not None and self._trial_age >= self._settings.trial_frames:
+            again = fit(self._trial, view, mask, T_model_cam, self._settings, self._noise)
+            seen = again.count_inside >= self._settings.least_seen * len(self._trial.points)
+            if seen and again.inside < self._settings.contrast * usual:
+                mask = np.zeros_like(mask)
+            self._trial = None
+        if self._trial is None and mask.any():
+            self._trial, self._trial_age = _samples(view, mask, T_model_cam), 0
+        self.mask = mask if mask.any() else None
+        if self.mask is None:
+            self._trial = None
+        return mask
+
+
+def _samples(view: View, mask: Mask, T_model_cam: Pose) -> Samples:
+    seen = mask & view.valid
+    R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
+    return Samples(view.points[seen] @ R.T + t, view.normals[seen] @ R.T, view.gray[seen])
+
+
+def _every(model: Samples, stride: int) -> Samples:
+    return Samples(
+        model.points[::stride], model.normals[::stride], None if model.gray is None else model.gray[::stride]
+    )
+
+
+def _grown(mask: Mask, width: int) -> Mask:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((width, width), np.uint8)) > 0
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) else float("nan")

@@ -1,0 +1,294 @@
+"""Find what was in one place for a part of a chunk only: surfaces that another frame saw through.
+
+A point that frame i sees, and behind whose place frame j reads a surface, was not there at j. Frames spread evenly over
+the chunk are asked, so that a thing that is carried away is found in the frames before it moved as well. It needs poses
+and depth alone, so given poses and estimated ones are served alike; what the odometry left out as moving of its own is
+taken as a hint, for the middle of a thing that sways is never seen through.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MovingSettings:
+    """When a surface counts as seen through."""
+
+    width: int = 160
+    """Width of the small images, px: every n-th pixel of the frame."""
+    references: int = 12
+    """Frames, spread evenly over the chunk, that every other frame is compared with."""
+    search_step: int = 4
+    """Every n-th frame and every second small pixel are searched; the rest only where something was found."""
+    search_frames: int = 2
+    """Searched frames in which something must be found."""
+    votes: int = 2
+    """Frames that must have seen through a point, where more than that have looked."""
+    clear: int = 5
+    """Edge of the window, small px, in which a frame must read a surface behind: a pose may be wrong by half of it."""
+    through_m: float = 0.04
+    """How far behind, in metres,"""
+    through_share: float = 0.02
+    """in shares of the distance,"""
+    through_sigma: float = 4.0
+    """and in standard deviations of depth, together."""
+    same_m: float = 0.02
+    same_share: float = 0.01
+    """Two readings this near to each other, and within as many standard deviations, are of one surface."""
+    poses: float = 4.0
+    """Times the median disagreement of two frames, as of poses that are a little wrong, is added to both."""
+    near_share: float = 0.2
+    """Readings further apart than this share of the distance are of two surfaces and say nothing about poses."""
+    edge_share: float = 0.03
+    """Steps of depth beyond this share, and beyond noise, part surfaces."""
+    least_share: float = 0.0015
+    """Smallest part of the picture that is looked at."""
+    part: float = 0.5
+    """Share of the compared pixels of a surface, or of what of it was not seen to stay, that must be seen through."""
+    embedded: float = 0.35
+    """Share of its outline at which it may go on, without a step of depth, as a surface that stays: feet on a floor."""
+    hinted: float = 0.15
+    """The same for a surface that the odometry found to move of its own."""
+    carried: float = 0.6
+    """Share of a surface that must lie on what moved in the frame before, as far away, to go on with it,"""
+    surely_carried: float = 0.8
+    """and of a whole surface that goes on with it though nobody saw through it: a thing that stands still."""
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+
+@dataclass(frozen=True)
+class SmallFrames:
+    """Depth images of a chunk, every n-th pixel, with their poses."""
+
+    camera: Camera
+    depth: Floats
+    """Metres, 0 where unknown. Shape (F, h, w)."""
+    T_chunk_cam: NDArray[np.float64]
+    """Shape (F, 4, 4)."""
+    posed: Mask
+    """Shape (F,)."""
+    stride: int
+    """Which pixel of the whole image each pixel is: the n-th."""
+
+    @staticmethod
+    def of(
+        depths: Sequence[Floats | None], T_chunk_cam: NDArray[np.float64], posed: Mask, camera: Camera, width: int
+    ) -> SmallFrames:
+        """Thin out the depth images; those without depth are not posed."""
+        stride = max(1, round(camera.width / width))
+        height, width = -(-camera.height // stride), -(-camera.width // stride)
+        depth = np.zeros((len(depths), height, width), np.float32)
+        for k, image in enumerate(depths):
+            if image is not None:
+                depth[k] = image[::stride, ::stride]
+        usable = posed & np.array([d is not None for d in depths], bool)
+        small = Camera(width, height, camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
+        return SmallFrames(small, depth, T_chunk_cam, usable, stride)
+
+
+def find_moving(
+    frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: MovingSettings | None = None
+) -> NDArray[np.bool_] | None:
+    """What moves in each frame, at the size of the small frames; None where nothing does. Shape (F, h, w).
+
+    `hints` are masks of any size by position: what the odometry found to move of its own.
+    """
+    s, hints = settings or MovingSettings(), hints or {}
+    ask = _References(frames, s)
+    posed = np.flatnonzero(frames.posed).tolist()
+    if not hints:
+        searched = posed[:: s.search_step]
+        hits = [p for p in searched if ask.anything(p)]
+        if sum(bool(ask.moving(p, None).any()) for p in hits) < min(s.search_frames, len(searched)):
+            return None
+    out = np.zeros(frames.depth.shape, bool)
+    for position in posed:
+        hint = hints.get(position)
+        size = (frames.camera.width, frames.camera.height)
+        hinted = None if hint is None else cv2.resize(hint.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        out[position] = ask.moving(position, hinted)
+    for order in (posed, posed[::-1]):
+        for before, position in itertools.pairwise(order):
+            if out[before].any():
+                out[position] |= ask.carried_on(position, out[before] & ~out[position], frames.depth[before])
+    return out if out.any() else None
+
+
+class _References:
+    """The frames that are asked whether they saw through something."""
+
+    def __init__(self, frames: SmallFrames, settings: MovingSettings) -> None:
+        self._frames, self._s = frames, settings
+        posed = np.flatnonzero(frames.posed)
+        chosen = np.unique(np.linspace(0, len(posed) - 1, min(settings.references, len(posed))).round().astype(int))
+        self._positions = posed[chosen].tolist()
+        window = np.ones((settings.clear, settings.clear), np.uint8)
+        self._nearest = {p: cv2.erode(frames.depth[p], window) for p in self._positions}
+        self._known: dict[int, tuple[Mask, Mask]] = {}
+        self._T_cam_chunk = {p: np.linalg.inv(frames.T_chunk_cam[p]) for p in self._positions}
+
+    def anything(self, position: int) -> bool:
+        """Whether a coarse look finds something that was seen through."""
+        through, _ = self._ask(position, 2)
+        solid = cv2.morphologyEx(through.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        return bool(solid.sum() >= self._s.least_share * through.size)
+
+    def moving(self, position: int, hint: Mask | None) -> Mask:
+        """What moves in a frame: surfaces, or what of them was not seen to stay, of which enough was seen through."""
+        s, depth = self._s, self._frames.depth[position]
+        through, stays = self._ask(position, 1)
+        whole = _whole(depth, s)
+        out = np.zeros(depth.shape, bool)
+        out |= _chosen(whole, whole, through, stays, s.part, s)
+        out |= _chosen(whole & ~stays, whole, through, stays, s.part, s)
+        if hint is not None and hint.any():
+            out |= _chosen(whole & hint, whole, through, stays, s.hinted, s)
+        if not out.any():
+            return out
+        return np.asarray(cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0)
+
+    def carried_on(self, position: int, before: Mask, depth_before: Floats) -> Mask:
+        """What of a frame goes on with what moved in the frame beside it: surfaces that lie on it mostly, as far away,
+        so that a thing that stands still for a while is not lost.
+        """
+        s, depth = self._s, self._frames.depth[position]
+        out = np.zeros(depth.shape, bool)
+        if before.sum() < s.least_share * before.size:
+            return out
+        near = before & (np.abs(depth - depth_before) < 0.1 * depth)
+        through, stays = self._ask(position, 1)
+        whole = _whole(depth, s)
+        for region in (whole, whole & ~stays, whole & near):
+            count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
+            gone, kept, held = (
+                np.bincount(labels.ravel(), image.ravel(), minlength=count) for image in (through, stays, near)
+            )
+            area = stats[:, cv2.CC_STAT_AREA]
+            good = (gone >= s.hinted * (gone + kept)) & (held >= s.carried * area)
+            if region is whole:
+                good |= held >= s.surely_carried * area
+            good &= area >= s.least_share * region.size
+            good[0] = False
+            out |= good[labels]
+        return out
+
+    def _ask(self, position: int, step: int) -> tuple[Mask, Mask]:
+        """Which pixels were seen through, and which were seen to stay. Shapes (h, w), thinned out by `step`.
+
+        Going away from the frame in time, what was seen through and is there again later was never seen through: so
+        a surface that reads badly, or a pose that is wrong, is told from a thing that came or went.
+        """
+        if step == 1 and position in self._known:
+            return self._known[position]
+        s, frames = self._s, self._frames
+        depth = frames.depth[position][::step, ::step]
+        shape = depth.shape
+        known = np.flatnonzero(depth.ravel() > 0)
+        points = _points(depth, frames.camera, step).reshape(-1, 3)[known]
+        stays, back = np.zeros(len(known), bool), np.zeros(len(known), bool)
+        votes, asked = np.zeros(len(known), np.int8), np.zeros(len(known), np.int8)
+        for side in (-1, 1):
+            gone = np.zeros(len(known), bool)
+            for other in self._beside(position, side):
+                behind, same, seen = self._compare(points, position, other)
+                back |= gone & same
+                gone |= behind
+                votes += behind
+                asked += seen
+                stays |= same & ~gone
+        through = (votes > 0) & ~back & ((votes >= s.votes) | (asked <= s.votes))
+        stays = (stays | back) & ~through
+        found = _image(through, known, shape), _image(stays, known, shape)
+        if step == 1:
+            self._known[position] = found
+        return found
+
+    def _beside(self, position: int, side: int) -> list[int]:
+        near = [p for p in self._positions if side * (p - position) > 0]
+        return near if side > 0 else near[::-1]
+
+    def _compare(self, points: Floats, position: int, other: int) -> tuple[Mask, Mask, Mask]:
+        """For points of a frame in its camera: whether another frame reads a surface behind them, the same one, any."""
+        s, camera = self._s, self._frames.camera
+        T = self._T_cam_chunk[other] @ self._frames.T_chunk_cam[position]
+        p = points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+        z = p[:, 2]
+        safe = np.maximum(z, np.float32(0.05))
+        u = np.rint(p[:, 0] / safe * np.float32(camera.fx) + np.float32(camera.cx))
+        v = np.rint(p[:, 1] / safe * np.float32(camera.fy) + np.float32(camera.cy))
+        inside = (z > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        at = np.where(inside, v * camera.width + u, 0).astype(np.int64)
+        near, read = self._nearest[other].ravel()[at], self._frames.depth[other].ravel()[at]
+        apart = read - z
+        seen = inside & (read > 0)
+        noise = s.through_sigma * s.noise.sigma(z) + np.float32(s.poses * _disagreement(apart[seen], z[seen], s))
+        behind = near > z + (np.float32(s.through_m) + np.float32(s.through_share) * z + noise)
+        same = np.abs(apart) < np.float32(s.same_m) + np.float32(s.same_share) * z + noise
+        return inside & behind, seen & same, seen
+
+
+def _disagreement(apart: Floats, z: Floats, s: MovingSettings) -> float:
+    """By how much two frames disagree about what stands still, metres beyond noise: the error of their poses."""
+    few = slice(None, None, max(1, len(apart) // 1000))
+    near = np.abs(apart[few]) < s.near_share * z[few]
+    if near.sum() < 20:
+        return 0.0
+    return max(0.0, float(np.median(np.abs(apart[few][near]) - s.noise.sigma(z[few][near]))))
+
+
+def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: MovingSettings) -> Mask:
+    """The connected parts of a region of which a part of what was compared was seen through, and that do not lie in the
+    midst of a surface that stays.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
+    area, least = stats[:, cv2.CC_STAT_AREA], s.least_share * region.size
+    gone = np.bincount(labels.ravel(), through.ravel(), minlength=count)
+    kept = np.bincount(labels.ravel(), stays.ravel(), minlength=count)
+    good = (area >= least) & (gone >= np.maximum(part * (gone + kept), 0.3 * least)) & (gone >= 0.2 * part * area)
+    good[0] = False
+    if not good.any():
+        return np.zeros(region.shape, bool)
+    rim, embedded = np.zeros(count), np.zeros(count)
+    for here, there in (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]):
+        for a, b in ((here, there), (there, here)):
+            border = (labels[a] > 0) & (labels[a] != labels[b])
+            rim += np.bincount(labels[a][border], minlength=count)
+            within = border & stays[b] & whole[b]
+            embedded += np.bincount(labels[a][within], minlength=count)
+    good &= embedded <= s.embedded * rim
+    return np.asarray(good[labels])
+
+
+def _whole(depth: Floats, s: MovingSettings) -> Mask:
+    """Pixels that no step of depth parts from their neighbours."""
+    limit = np.float32(s.edge_share) * depth + 3 * s.noise.sigma(depth)
+    whole = depth > 0
+    across, down = np.abs(np.diff(depth, axis=1)) > limit[:, 1:], np.abs(np.diff(depth, axis=0)) > limit[1:]
+    whole[:, 1:] &= ~across
+    whole[1:] &= ~down
+    return np.asarray(whole)
+
+
+def _points(depth: Floats, camera: Camera, step: int) -> Floats:
+    """Points in the camera of every `step`-th pixel. Shape (h, w, 3)."""
+    x = (np.arange(depth.shape[1]) * step - camera.cx) / camera.fx
+    y = (np.arange(depth.shape[0]) * step - camera.cy) / camera.fy
+    return np.stack([depth * x[None].astype(np.float32), depth * y[:, None].astype(np.float32), depth], axis=-1)
+
+
+def _image(values: Mask, at: NDArray[np.int64], shape: tuple[int, ...]) -> Mask:
+    out = np.zeros(shape[0] * shape[1], bool)
+    out[at] = values
+    return out.reshape(shape[0], shape[1])

@@ -1,0 +1,370 @@
+"""Dense depth of a chunk of RGB frames whose poses are known: plane sweep, consistency, fusion.
+
+Keyframes are swept (`mvs_sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width.
+What other keyframes confirm is kept and fused (`mvs_fusion`), flat holes are filled and said to be unsure (`mvs_fill`),
+and every frame gets the depth of the keyframes around it. Depth without parallax or texture stays unknown.
+
+Tried on 100 frames of a kitchen against its depth sensor (median error after scale, coverage, CPU seconds a frame):
+poses of a depth-only map, off by centimetres, 0.031 before fusion; bundle-adjusted poses 0.011. One keyframe alone
+0.023, fused with its neighbours 0.010. Windows of 5 px make what stands in front 5 px wider; choosing the nearer or
+the farther surface by 3 px windows alone changes nothing (0.0109 to 0.0109), giving up where neither is cheaper does
+(errors above 10 %: 5.6 to 5.0 %, coverage 0.653 to 0.608). Noise of 0.010 instead of 0.006 in the ZNCC: coverage 0.51
+instead of 0.56. Planes fitted in windows round every hole filled the air beside chairs (errors above 10 %: 6.1 to
+7.1 %); enclosed holes and regions of one colour do not (5.2 %, coverage 0.61, 0.19 s).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+from list3r.reconstruction.base import DepthNoise
+from list3r.reconstruction.mvs.fill import FillSettings, fill_regions
+from list3r.reconstruction.mvs.fusion import (
+    DepthMap,
+    FusionSettings,
+    Seen,
+    agree_and_fuse,
+    carry,
+    enlarge,
+    fill_flat,
+    speckles_out,
+)
+from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, make_pictures, sharpness
+from list3r.reconstruction.mvs.sweep import Match, Reference, SweepSettings, coarse_match, refine
+from list3r.reconstruction.mvs.views import (
+    Pairs,
+    ViewSettings,
+    choose_keyframes,
+    choose_neighbours,
+    choose_sources,
+    pair_views,
+    plane_depths,
+)
+
+__all__ = ["MvsSettings", "Sparse", "dense_depth", "stereo_noise"]
+
+Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Places (N, 2) in px and depths (N,) of a frame's triangulated points."""
+
+
+@dataclass(frozen=True)
+class TrustSettings:
+    """Which matches mean something, and what confidence says."""
+
+    most_cost: float = 0.35
+    """Matching cost above which a match is none (ZNCC 0.3)."""
+    least_margin: float = 0.02
+    """A different depth must cost this much more, or it may be that one."""
+    least_texture: float = 0.5
+    """Variance of the window over that of noise below which there is nothing to match."""
+    half_sigma: float = 0.02
+    """Deviation, share of depth, at which confidence is one half."""
+
+
+@dataclass(frozen=True)
+class MvsSettings:
+    """Dense depth of a chunk."""
+
+    views: ViewSettings = field(default_factory=ViewSettings)
+    sweep: SweepSettings = field(default_factory=SweepSettings)
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    fill: FillSettings = field(default_factory=FillSettings)
+    trust: TrustSettings = field(default_factory=TrustSettings)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """What every step looks at."""
+
+    T_chunk_cam: Poses
+    coarse: Pictures
+    fine: Pictures
+    keyframes: list[int]
+    pairs: Pairs
+    depth: NDArray[np.float64]
+    """Typical depth of each frame, chunk units. Shape (F,)."""
+    span: tuple[float, float]
+    """Nearest and farthest depth looked for, chunk units."""
+    sharp: NDArray[np.float64]
+    device: str
+    settings: MvsSettings
+
+
+def dense_depth(
+    frames: Sequence[Frame],
+    posed: NDArray[np.bool_],
+    T_chunk_cam: Poses,
+    camera: Camera,
+    sparse: Sequence[Sparse | None] | None = None,
+    settings: MvsSettings | None = None,
+    device: str = "cpu",
+) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
+    """Depth along z, chunk units, 0 where unknown, and confidence in [0, 1] of every frame. Shape (F, H, W) each.
+
+    `posed` (F,) says whose pose in `T_chunk_cam` (F, 4, 4) means something; the others get no depth. `sparse` holds
+    the triangulated points of each frame where there are some: they tell between which depths to look. Confidence is
+    1 / (1 + (sigma / half_sigma)^2) of the deviation that is expected.
+    """
+    settings = settings or MvsSettings()
+    shape = (len(frames), camera.height, camera.width)
+    depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float16)
+    if int(posed.sum()) < 3:
+        return depth, confidence
+    with torch.inference_mode(), _one_thread():
+        chunk = _prepare(frames, posed, T_chunk_cam, camera, sparse, settings, device)
+        if chunk is None:
+            return depth, confidence
+        maps = {row: _filled(chunk, row, seen, frames) for row, seen in _keyframe_maps(chunk).items()}
+        for position in np.flatnonzero(posed).tolist():
+            small = _frame_map(chunk, maps, position)
+            if small is None:
+                continue
+            depth[position], confidence[position] = _full_size(chunk, small, frames[position], camera)
+    return depth, confidence
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch with one thread: where work is cut into pieces decides the last bits of vectorised functions."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def stereo_noise(
+    depth: NDArray[np.float32], confidence: NDArray[np.float16], most_frames: int = 12
+) -> DepthNoise | None:
+    """How rough stereo depth (F, H, W) is: what small windows deviate from a plane, growing with depth squared.
+
+    None where too little is known to measure it. Structure looks like roughness, so the smoother windows decide.
+    """
+    used = np.flatnonzero((depth > 0).any(axis=(1, 2)))
+    rates = []
+    for position in used[:: max(1, len(used) // most_frames)].tolist():
+        stride = max(1, depth.shape[2] // 320)
+        d, c = depth[position][::stride, ::stride], confidence[position][::stride, ::stride]
+        inverse = np.where(c > 0.3, 1.0 / np.maximum(d, 1e-9), 0.0)
+        rates.append(plane_residual(inverse, radius=8)[4:-4:4, 4:-4:4].ravel())
+    found = np.concatenate(rates) if rates else np.zeros(0)
+    found = found[np.isfinite(found)]
+    rough = float(np.quantile(found, 0.4)) if len(found) >= 200 else 0.0
+    return DepthNoise(0.0, rough, TrustSettings().half_sigma) if rough > 0 else None
+
+
+def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    """RMS deviation of inverse depth (h, w) from a plane in each window, NaN where a third of it is unknown."""
+    v, u = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float64)
+    known, size = (inverse > 0).astype(np.float64), (2 * radius + 1, 2 * radius + 1)
+    n, *rest = (
+        cv2.boxFilter(known * term, cv2.CV_64F, size, normalize=True, borderType=cv2.BORDER_CONSTANT)
+        for term in (np.ones_like(u), u, v, inverse, u * u, u * v, v * v, inverse * u, inverse * v, inverse**2)
+    )
+    mu, mv, mw, uu, uv, vv, wu, wv, ww = (term / np.maximum(n, 1e-9) for term in rest)
+    uu, uv, vv = uu - mu * mu, uv - mu * mv, vv - mv * mv
+    wu, wv, ww = wu - mw * mu, wv - mw * mv, ww - mw * mw
+    determinant = np.maximum(uu * vv - uv * uv, 1e-9)
+    explained = (vv * wu * wu - 2.0 * uv * wu * wv + uu * wv * wv) / determinant
+    return np.where(n > 0.67, np.sqrt(np.maximum(ww - explained, 0.0)), np.nan)
+
+
+def _prepare(
+    frames: Sequence[Frame],
+    posed: NDArray[np.bool_],
+    T_chunk_cam: Poses,
+    camera: Camera,
+    sparse: Sequence[Sparse | None] | None,
+    settings: MvsSettings,
+    device: str,
+) -> _Chunk | None:
+    """None where the cameras do not move."""
+    T = np.where(posed[:, None, None], T_chunk_cam, np.eye(4))
+    coarse = make_pictures(frames, camera, min(settings.sweep.coarse_width_px, camera.width), device)
+    fine = make_pictures(frames, camera, min(settings.sweep.width_px, camera.width), device)
+    sharp = np.array([sharpness(gray) for gray in fine.gray.cpu().numpy()])
+    known = _sparse_depth(sparse, len(frames))
+    if known is None:
+        known = _probe(posed, T, coarse, sharp, settings, device)
+    if known is None:
+        return None
+    depth, span = known
+    keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
+    pairs = pair_views(keyframes, posed, T, fine.camera, depth)
+    return _Chunk(T, coarse, fine, keyframes, pairs, depth, span, sharp, device, settings)
+
+
+def _sparse_depth(
+    sparse: Sequence[Sparse | None] | None, count: int
+) -> tuple[NDArray[np.float64], tuple[float, float]] | None:
+    """Typical depth of each frame and the span of depths, from triangulated points."""
+    if sparse is None:
+        return None
+    each = [np.zeros(0) if s is None else s[1][s[1] > 0] for s in sparse]
+    joined = np.concatenate(each)
+    if len(joined) < 20:
+        return None
+    typical = float(np.median(joined))
+    depth = np.array([float(np.median(d)) if len(d) >= 10 else typical for d in each])
+    low, high = np.quantile(joined, [0.01, 0.99])
+    return depth, (0.6 * float(low), 2.0 * float(high))
+
+
+def _probe(
+    posed: NDArray[np.bool_],
+    T: Poses,
+    coarse: Pictures,
+    sharp: NDArray[np.float64],
+    settings: MvsSettings,
+    device: str,
+) -> tuple[NDArray[np.float64], tuple[float, float]] | None:
+    """Typical depth without triangulated points: a few keyframes are swept from very near to very far, twice."""
+    centers = T[posed, :3, 3]
+    reach = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    if reach < 1e-9:
+        return None
+    typical, span = 6.0 * reach, (1.0 * reach, 100.0 * reach)
+    for _ in range(2):
+        depth = np.full(len(posed), typical)
+        keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
+        keyframes = keyframes[:: max(1, len(keyframes) // 4)]
+        pairs = pair_views(keyframes, posed, T, coarse.camera, depth)
+        chunk = _Chunk(T, coarse, coarse, keyframes, pairs, depth, span, sharp, device, settings)
+        found = [d for d in (_probed(chunk, row) for row in range(len(keyframes))) if len(d)]
+        if not found:
+            return None
+        joined = np.concatenate(found)
+        typical = float(np.median(joined))
+        low, high = np.quantile(joined, [0.02, 0.98])
+        span = (0.5 * float(low), 2.5 * float(high))
+    return np.full(len(posed), typical), span
+
+
+def _probed(chunk: _Chunk, row: int) -> NDArray[np.float64]:
+    """Depths of the pixels of a keyframe that leave no doubt."""
+    swept = _coarse(chunk, row)
+    if swept is None:
+        return np.zeros(0)
+    inverse, margin, _, _ = swept
+    return (1.0 / inverse[margin > 0.15]).cpu().numpy().astype(np.float64)
+
+
+def _coarse(chunk: _Chunk, row: int) -> tuple[Tensor, Tensor, float, list[int]] | None:
+    """Inverse depth and margin at the coarse width, spacing of the planes, sources; None without parallax."""
+    settings, key = chunk.settings.sweep, chunk.keyframes[row]
+    sources = choose_sources(row, chunk.pairs, chunk.T_chunk_cam, chunk.sharp, key, chunk.settings.views)
+    if not sources:
+        return None
+    parallax = _parallax_px(chunk, row, sources, chunk.coarse.camera)
+    planes = plane_depths(*chunk.span, parallax, 24, settings.planes)
+    spacing = float(planes[1] - planes[0])
+    reference = Reference.of(chunk.coarse.gray[key], settings.radius_px, settings.image_noise)
+    place, margin = coarse_match(
+        reference,
+        [chunk.coarse.gray[k] for k in sources],
+        _warps(chunk, key, sources, chunk.coarse.camera),
+        torch.from_numpy(planes).to(chunk.device),
+        settings,
+    )
+    return float(planes[0]) + place * spacing, margin, spacing, sources
+
+
+def _parallax_px(chunk: _Chunk, row: int, sources: list[int], camera: Camera) -> float:
+    """How far one unit of inverse depth moves a pixel in the sources, px: the upper quartile."""
+    angle = np.radians(chunk.pairs.angle_deg[row, sources])
+    return float(np.quantile(np.tan(angle), 0.75) * chunk.depth[chunk.keyframes[row]] * camera.fx)
+
+
+def _warps(chunk: _Chunk, key: int, others: Sequence[int], camera: Camera) -> list[Warp]:
+    T = chunk.T_chunk_cam
+    return [Warp.between(T[key], T[k], camera, chunk.device) for k in others]
+
+
+def _sweep(chunk: _Chunk, row: int) -> Seen | None:
+    """A keyframe's own depth, None without parallax."""
+    swept = _coarse(chunk, row)
+    if swept is None:
+        return None
+    inverse, margin, spacing, sources = swept
+    settings, trust, key = chunk.settings.sweep, chunk.settings.trust, chunk.keyframes[row]
+    gray = chunk.fine.gray[key]
+    start, margin = (_resized(image, gray.shape) for image in (inverse, margin))
+    reference = Reference.of(gray, settings.radius_px, settings.image_noise)
+    warps = _warps(chunk, key, sources, chunk.fine.camera)
+    match = refine(reference, [chunk.fine.gray[k] for k in sources], warps, start, margin, spacing, settings)
+    known = (match.cost < trust.most_cost) & (match.margin > trust.least_margin) & (match.texture > trust.least_texture)
+    return Seen(match.inverse_depth, _match_sigma(chunk, row, sources, match), known & ~match.doubt)
+
+
+def _match_sigma(chunk: _Chunk, row: int, sources: list[int], match: Match) -> Tensor:
+    """Standard deviation of inverse depth: that of a match in px over the parallax, more where the match is poor."""
+    parallax = _parallax_px(chunk, row, sources, chunk.fine.camera)
+    poor = 1.0 + 4.0 * match.cost
+    return poor * (chunk.settings.fusion.match_px / parallax)
+
+
+def _resized(image: Tensor, shape: torch.Size) -> Tensor:
+    return torch.nn.functional.interpolate(image[None, None], size=tuple(shape), mode="bilinear")[0, 0]
+
+
+def _keyframe_maps(chunk: _Chunk) -> dict[int, DepthMap]:
+    """Confirmed depth of the keyframes by their number."""
+    seen = {row: s for row in range(len(chunk.keyframes)) if (s := _sweep(chunk, row)) is not None}
+    out: dict[int, DepthMap] = {}
+    for row, own in seen.items():
+        near = [k for k in choose_neighbours(row, chunk.keyframes, chunk.pairs, chunk.settings.views) if k in seen]
+        if not near:
+            continue
+        key, others = chunk.keyframes[row], [chunk.keyframes[k] for k in near]
+        warps = _warps(chunk, key, others, chunk.fine.camera)
+        fused = agree_and_fuse(own, [seen[k] for k in near], warps, chunk.settings.fusion)
+        out[row] = speckles_out(fused)
+    return out
+
+
+def _filled(chunk: _Chunk, row: int, depth: DepthMap, frames: Sequence[Frame]) -> DepthMap:
+    """A keyframe's depth with its flat regions without texture filled."""
+    height, width = depth.inverse.shape
+    color = cv2.resize(frames[chunk.keyframes[row]].color, (width, height), interpolation=cv2.INTER_AREA)
+    small = fill_flat(depth, chunk.settings.fusion)
+    inverse, sigma = small.inverse.cpu().numpy(), small.sigma.cpu().numpy()
+    inverse, sigma = fill_regions(inverse, sigma, np.asarray(color, np.uint8), chunk.settings.fill)
+    return DepthMap(torch.from_numpy(inverse).to(chunk.device), torch.from_numpy(sigma).to(chunk.device))
+
+
+def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> DepthMap | None:
+    """Depth of a frame at the working width, from the keyframes nearest to it; None where there are none."""
+    rows = sorted(maps, key=lambda row: (_remoteness(chunk, row, position), row))[: chunk.settings.fusion.carried_from]
+    if not rows:
+        return None
+    T = chunk.T_chunk_cam
+    warps = [Warp.between(T[chunk.keyframes[r]], T[position], chunk.fine.camera, chunk.device) for r in rows]
+    carried = carry([maps[r] for r in rows], warps)
+    return fill_flat(carried, chunk.settings.fusion)
+
+
+def _remoteness(chunk: _Chunk, row: int, position: int) -> float:
+    """How little of a frame a keyframe sees; 0 for the frame itself."""
+    return 0.0 if chunk.keyframes[row] == position else 1.0 - float(chunk.pairs.overlap[row, position])
+
+
+def _full_size(
+    chunk: _Chunk, small: DepthMap, frame: Frame, camera: Camera
+) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
+    """Depth and confidence at the camera's size."""
+    full = make_pictures([frame], camera, camera.width, chunk.device).gray[0]
+    gray = _resized(full, small.inverse.shape)
+    inverse, sigma = enlarge(small, gray, full, chunk.settings.sweep.path_edge)
+    zero = torch.zeros((), device=full.device)
+    depth = torch.where(inverse > 0, 1.0 / inverse.clamp_min(1e-9), zero)
+    confidence = torch.where(inverse > 0, 1.0 / (1.0 + (sigma / chunk.settings.trust.half_sigma) ** 2), zero)
+    return depth.cpu().numpy(), confidence.to(torch.float16).cpu().numpy()

@@ -1,0 +1,147 @@
+"""Which frames get a sweep of their own, which others each is compared with, and between which depths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.mvs.images import Poses
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """How keyframes and their sources are chosen. Angles are of triangulation."""
+
+    stride: int = 8
+    """Most frames from one keyframe to the next; the sharpest of each run is taken."""
+    least_keyframes: int = 6
+    """Short chunks have shorter runs, so that there are about so many."""
+    step: float = 0.06
+    """A run also ends when the camera has moved by this share of the depth,"""
+    turn_deg: float = 8.0
+    """or turned by this."""
+    sources: int = 6
+    neighbours: int = 6
+    """Other keyframes that a keyframe's depth is compared with."""
+    ideal_deg: float = 5.0
+    """Angle that trades precision against change of looks best."""
+    angle_spread: float = 0.6
+    """How soon another angle counts less, natural logarithm."""
+    least_deg: float = 0.6
+    """Sources with less parallax tell nothing."""
+    most_deg: float = 30.0
+    least_overlap: float = 0.3
+    """Share of the picture that a source must see."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What every frame sees of what every keyframe sees at the typical depth. Shape (K, F) each."""
+
+    overlap: Floats
+    """Share of the keyframe's picture, in [0, 1]; 0 for itself and for frames without a pose."""
+    angle_deg: Floats
+    """Median angle of triangulation."""
+    distance: Floats
+    """Between the cameras, chunk units."""
+
+
+def choose_keyframes(
+    posed: NDArray[np.bool_], T_chunk_cam: Poses, depth: Floats, sharp: Floats, settings: ViewSettings
+) -> list[int]:
+    """Positions of the sharpest frame of each run that sees nearly the same. `depth` (F,) is the typical one."""
+    runs: list[list[int]] = []
+    stride = max(1, min(settings.stride, int(posed.sum()) // settings.least_keyframes))
+    for position in np.flatnonzero(posed).tolist():
+        if runs and len(runs[-1]) < stride and _near(T_chunk_cam, runs[-1][0], position, depth, settings):
+            runs[-1].append(position)
+        else:
+            runs.append([position])
+    return [run[int(np.argmax(sharp[run]))] for run in runs]
+
+
+def _near(T: Poses, first: int, second: int, depth: Floats, settings: ViewSettings) -> bool:
+    shift = float(np.linalg.norm(T[first, :3, 3] - T[second, :3, 3]))
+    cosine = (np.trace(T[first, :3, :3].T @ T[second, :3, :3]) - 1.0) / 2.0
+    return bool(shift < settings.step * depth[first] and cosine > np.cos(np.radians(settings.turn_deg)))
+
+
+def pair_views(
+    keyframes: Sequence[int], posed: NDArray[np.bool_], T_chunk_cam: Poses, camera: Camera, depth: Floats
+) -> Pairs:
+    """Overlap and parallax of keyframes with all frames, from a few rays at the typical depth."""
+    u = np.linspace(0.1, 0.9, 5) * (camera.width - 1)
+    v = np.linspace(0.1, 0.9, 4) * (camera.height - 1)
+    grid = np.stack(np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy), axis=-1).reshape(-1, 2)
+    rays = np.concatenate([grid, np.ones((len(grid), 1))], axis=1)
+    centers, into = T_chunk_cam[:, :3, 3], np.linalg.inv(T_chunk_cam)
+    shape = (len(keyframes), len(posed))
+    overlap, angle, distance = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for row, key in enumerate(keyframes):
+        points = rays * depth[key] @ T_chunk_cam[key, :3, :3].T + centers[key]
+        local = np.einsum("fij,nj->fni", into[:, :3, :3], points) + into[:, None, :3, 3]
+        z = np.maximum(local[..., 2], 1e-9)
+        x, y = local[..., 0] / z * camera.fx + camera.cx, local[..., 1] / z * camera.fy + camera.cy
+        seen = (local[..., 2] > 1e-9) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        a, b = points - centers[key], points[None] - centers[:, None]
+        cosine = np.einsum("ni,fni->fn", a, b) / np.linalg.norm(a, axis=1) / np.maximum(np.linalg.norm(b, axis=2), 1e-9)
+        overlap[row] = seen.mean(axis=1) * posed
+        overlap[row, key] = 0.0
+        angle[row] = np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)), axis=1))
+        distance[row] = np.linalg.norm(centers - centers[key], axis=1)
+    return Pairs(overlap, angle, distance)
+
+
+def choose_sources(
+    row: int, pairs: Pairs, T_chunk_cam: Poses, sharp: Floats, key: int, settings: ViewSettings
+) -> list[int]:
+    """Positions of a keyframe's sources, those of its two sides in turn. Empty where no two have parallax.
+
+    Best first by overlap, angle and sharpness; who stands where another source stands already counts less.
+    """
+    angle, overlap = pairs.angle_deg[row], pairs.overlap[row]
+    usable = (angle > settings.least_deg) & (angle < settings.most_deg) & (overlap > settings.least_overlap)
+    fit = np.exp(-0.5 * np.square(np.log(np.maximum(angle, 1e-6) / settings.ideal_deg) / settings.angle_spread))
+    score = np.where(usable, overlap * fit * np.sqrt(sharp / max(float(sharp.max()), 1e-12)), 0.0)
+    centers, chosen = T_chunk_cam[:, :3, 3], list[int]()
+    while len(chosen) < settings.sources and score.max() > 0:
+        best = int(np.argmax(score))
+        chosen.append(best)
+        apart = np.linalg.norm(centers - centers[best], axis=1) / max(float(pairs.distance[row, best]), 1e-9)
+        score = score * np.clip(apart / 0.5, 0.1, 1.0)
+        score[best] = 0.0
+    return _in_turn(chosen, centers, key) if len(chosen) >= 2 else []
+
+
+def _in_turn(chosen: list[int], centers: Floats, key: int) -> list[int]:
+    """Sources ordered so that every second one lies on one side of the keyframe as far as that is possible."""
+    offsets = centers[chosen] - centers[key]
+    axis = np.linalg.svd(offsets)[2][0]
+    order = np.argsort(offsets @ axis, kind="stable")
+    half = (len(order) + 1) // 2
+    left, right = order[:half].tolist(), order[half:].tolist()
+    return [chosen[k] for pair in zip(left, [*right, None], strict=False) for k in pair if k is not None]
+
+
+def choose_neighbours(row: int, keyframes: Sequence[int], pairs: Pairs, settings: ViewSettings) -> list[int]:
+    """Numbers of the keyframes that see most of the same, from not too different places."""
+    overlap = pairs.overlap[row, list(keyframes)]
+    angle = pairs.angle_deg[row, list(keyframes)]
+    score = np.where((overlap > settings.least_overlap) & (angle < settings.most_deg), overlap - 0.01 * angle, 0.0)
+    order = np.argsort(-score, kind="stable")[: settings.neighbours]
+    return [int(k) for k in order if score[k] > 0]
+
+
+def plane_depths(
+    near: float, far: float, parallax_px: float, least: int, most: int, step_px: float = 0.7
+) -> NDArray[np.float32]:
+    """Inverse depths from far to near, evenly spaced. `parallax_px` is what one unit of inverse depth moves a pixel."""
+    low, high = 1.0 / far, 1.0 / near
+    count = int(np.clip(np.ceil((high - low) * parallax_px / step_px), least, most))
+    return np.linspace(low, high, count).astype(np.float32)

@@ -1,0 +1,51 @@
+"""Reconstruction `da3` (Lin et al., "Depth Anything 3: Recovering the Visual Space from Any Views").
+
+Pictures (1, n, 3, h, w) normalised as for DINOv2, the longer side 504. Out come `depth` (1, n, h, w), `depth_conf` =
+1 + exp(x), `extrinsics` (1, n, 3 or 4, 4), camera *from* world with OpenCV axes, and `intrinsics` (1, n, 3, 3), px. The
+nested weights are about metric; taken as relative like the others. Weights without cameras (mono, metric) are refused.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from list3r.memory.errors import OptionError
+from list3r.models.images import normalised
+from list3r.reconstruction.networks.feedforward import (
+    FeedforwardReconstructor,
+    Network,
+    PictureSize,
+    inverted,
+    numpy,
+    sigmoid_of_expp1,
+)
+from list3r.reconstruction.networks.output import WindowOutput
+from list3r.reconstruction.registry import ModelOptions
+
+if TYPE_CHECKING:
+    import torch
+
+
+def make(options: ModelOptions) -> FeedforwardReconstructor:
+    """The model with the weights that the options name."""
+    return FeedforwardReconstructor(NETWORK, options)
+
+
+def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
+    """See `feedforward.Answer`; without poses the network cannot be told the intrinsics."""
+    # The inner network: the outer one chooses half precision by asking CUDA, which a CPU has not got.
+    output = model.model(normalised(pictures)[None], export_feat_layers=[])
+    if "extrinsics" not in output or "depth_conf" not in output:
+        raise OptionError("these weights of da3 say nothing of cameras; give any-view weights, such as DA3-BASE")
+    shape = (len(pictures), *pictures.shape[-2:])
+    return WindowOutput(
+        T_window_cam=inverted(numpy(output["extrinsics"][0])),
+        depth=numpy(output["depth"]).reshape(shape).astype(np.float32),
+        confidence=sigmoid_of_expp1(numpy(output["depth_conf"]).reshape(shape)),
+        focal=numpy(output["intrinsics"][0]).astype(np.float64)[:, [0, 1], [0, 1]],
+    )
+
+
+NETWORK = Network("da3", "depth_anything_3.api", "DepthAnything3", PictureSize(longest=504), answer)

@@ -1,0 +1,179 @@
+"""Reconstruction `rgbd`: sensor depth with poses that are given or estimated.
+
+Estimated poses come from dense registration of each frame to a model of surface elements, depth and brightness
+together (`odometry`, `registration`, `surfels`); local features find frames again after a break (`features`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+from list3r.memory.errors import OptionError, TrackingError
+from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.motion.follow import FollowSettings, follow_movers
+from list3r.reconstruction.motion.moving import MovingSettings, SmallFrames, find_moving
+from list3r.reconstruction.registry import ModelOptions
+from list3r.reconstruction.rgbd.confidence import ConfidenceSettings, depth_confidence
+from list3r.reconstruction.rgbd.odometry import OdometrySettings, Tracker
+
+
+def make(options: ModelOptions) -> RgbdReconstructor:
+    """The model with its default settings; it runs on the CPU whatever device is named."""
+    return RgbdReconstructor(poses=options.poses)
+
+
+@dataclass(frozen=True)
+class RgbdSettings:
+    """How a chunk of RGB-D frames is reconstructed."""
+
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+    moving: MovingSettings = field(default_factory=MovingSettings)
+    follow: FollowSettings = field(default_factory=FollowSettings)
+
+
+@dataclass(frozen=True)
+class RgbdReconstructor:
+    """Poses and depth of RGB-D frames, metres.
+
+    The chunk's frame is the camera of its first posed frame where poses are estimated, and the source's own world where
+    they are given.
+    """
+
+    settings: RgbdSettings = field(default_factory=RgbdSettings)
+    poses: str = "estimate"
+    """given or estimate."""
+
+    def __post_init__(self) -> None:
+        if self.poses not in ("given", "estimate"):
+            raise OptionError(f"poses {self.poses!r}: choose given or estimate")
+
+    def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
+        """Reconstruct a chunk.
+
+        Raises `TrackingError` when the frames have no depth, when no given pose is valid, or when no two frames can
+        be related.
+        """
+        if not any(frame.depth is not None for frame in frames):
+            raise TrackingError("the frames have no depth; the rgbd reconstruction needs it")
+        shape = (camera.height, camera.width)
+        depth = np.stack([np.zeros(shape, np.float32) if f.depth is None else f.depth for f in frames])
+        if self.poses == "given":
+            T, posed, keyframes = self._given(frames, camera)
+            moving = self._moving(frames, T, posed, camera, {})
+        else:
+            T, posed, keyframes, left_out = self._estimate(frames, camera)
+            moving = self._moving(frames, T, posed, camera, left_out)
+            if moving is not None:
+                known = {k: _rim(m > 0) for k, m in enumerate(moving) if m.any()}
+                T, posed, keyframes, left_out = self._estimate(frames, camera, known)
+                moving = self._moving(frames, T, posed, camera, left_out)
+        if moving is not None:
+            _take_out(depth, moving)
+        return Reconstruction(
+            frame_indices=np.array([frame.index for frame in frames], np.int64),
+            posed=posed,
+            T_chunk_cam=T,
+            camera=camera,
+            depth=depth,
+            confidence=np.stack([depth_confidence(d, camera, self.settings.confidence) for d in depth]),
+            scale_kind="metric",
+            keyframes=np.array(keyframes, np.int64),
+            moving=moving,
+        )
+
+    def _moving(
+        self,
+        frames: Sequence[Frame],
+        T_chunk_cam: NDArray[np.float64],
+        posed: NDArray[np.bool_],
+        camera: Camera,
+        hints: Mapping[int, NDArray[np.bool_]],
+    ) -> NDArray[np.uint8] | None:
+        """Number what moves, see `Reconstruction.moving`."""
+        small = SmallFrames.of([f.depth for f in frames], T_chunk_cam, posed, camera, self.settings.moving.width)
+        masks = find_moving(small, hints, self.settings.moving)
+        if masks is None:
+            return None
+        times_s = np.array([f.time_s for f in frames])
+        return follow_movers(masks, [f.color for f in frames], times_s, small, self.settings.follow)
+
+    def _estimate(
+        self, frames: Sequence[Frame], camera: Camera, known: Mapping[int, NDArray[np.bool_]] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], Mapping[int, NDArray[np.bool_]]]:
+        """Poses, which frames have one, keyframes, and what was left out of each frame; without what `known` holds."""
+        tracker = Tracker(frames, camera, self.settings.odometry, known)
+        segments = tracker.run()
+        if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
+            raise TrackingError(
+                f"no two of the {len(frames)} frames from {frames[0].index} to {frames[-1].index} can be related; "
+                "the camera moves too fast, or depth or texture is missing"
+            )
+        T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
+        for position, pose in segments[0].T_segment_cam.items():
+            T[position], posed[position] = pose, True
+        T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
+        return T, posed, segments[0].keyframes, tracker.moving
+
+    def _given(
+        self, frames: Sequence[Frame], camera: Camera
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int]]:
+        T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
+        for position, frame in enumerate(frames):
+            if frame.T_source_cam is not None and is_rigid(frame.T_source_cam):
+                T[position], posed[position] = frame.T_source_cam, True
+        if not posed.any():
+            raise TrackingError(
+                f"none of the frames {frames[0].index} to {frames[-1].index} has a valid pose; use --poses estimate"
+            )
+        return T, posed, select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry)
+
+
+def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
+def _take_out(depth: NDArray[np.float32], moving: NDArray[np.uint8]) -> None:
+    """Make depth (F, H, W) unknown, in place, where something moves: what is left is the scene that stays."""
+    height, width = depth.shape[1:]
+    stride = -(-width // moving.shape[2])
+    for position in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
+        full = np.kron(_rim(moving[position] > 0), np.ones((stride, stride), bool))
+        depth[position][full[:height, :width]] = 0.0
+
+
+def is_rigid(T: NDArray[np.float64]) -> bool:
+    """Whether a 4x4 matrix is a finite rigid transform, to a tolerance that text files keep."""
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)
+
+
+def select_keyframes(
+    T_chunk_cam: NDArray[np.float64],
+    posed: NDArray[np.bool_],
+    depths: Sequence[NDArray[np.float32] | None],
+    settings: OdometrySettings,
+) -> list[int]:
+    """Positions of frames that have moved enough since the last keyframe."""
+    keyframes: list[int] = []
+    for position in map(int, np.flatnonzero(posed)):
+        depth = depths[position]
+        known = depth[::8, ::8][depth[::8, ::8] > 0] if depth is not None else np.zeros(0)
+        if not len(known):
+            continue
+        if keyframes:
+            step = np.linalg.inv(T_chunk_cam[keyframes[-1]]) @ T_chunk_cam[position]
+            turn = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
+            shift = np.linalg.norm(step[:3, 3]) / float(np.median(known))
+            if turn <= settings.keyframe_turn_deg and shift <= settings.keyframe_shift:
+                continue
+        keyframes.append(position)
+    return keyframes or [int(np.flatnonzero(posed)[0])]

@@ -1,0 +1,364 @@
+"""Register a view against surface points of a model: point-to-plane and brightness residuals together.
+
+Each model point is projected into the view; the surface point found there gives a point-to-plane residual along the
+model's normal, and the brightness found there a photometric one. Both are divided by their own robust scale, so that
+one weight balances them, and both are under a Huber kernel. Gauss-Newton on SE(3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import skew
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise, View
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """How a view is registered."""
+
+    iterations: int = 12
+    gate_m: float = 0.10
+    """First limit of the point-to-plane distance."""
+    gate_halvings: int = 2
+    """How often that limit is halved on the way."""
+    gate_hold: int = 1
+    """Iterations before it is halved again."""
+    huber: float = 1.345
+    """Limit of the quadratic part of the kernel, in robust standard deviations."""
+    normal_agreement: float = 0.7
+    """Least cosine between the normals of a pair."""
+    photometric_weight: float = 2.0
+    """Weight of a brightness residual against a depth residual of the same number of standard deviations."""
+    normal_noise: float = 0.05
+    """Standard deviation of a measured normal, radians; what such noise seems to determine does not count."""
+    gradient_noise: float = 2.0
+    """Brightness gradients below this determine nothing, grey levels per pixel."""
+    least_pairs: int = 150
+    converged: float = 3e-5
+    """Largest component of the last step, metres and radians."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Surface points of a model."""
+
+    points: Floats
+    """Model coordinates, metres. Shape (N, 3)."""
+    normals: Floats
+    """Unit. Shape (N, 3)."""
+    gray: Floats | None = None
+    """Brightness, 0 to 255. Shape (N,)."""
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Local features of the view that are known in the model: they hold what bare surfaces leave open."""
+
+    points: Floats
+    """Model coordinates, metres. Shape (N, 3)."""
+    rays_xy: Floats
+    """Where the view sees them, x / z and y / z. Shape (N, 2)."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A view placed against a model."""
+
+    T_model_cam: NDArray[np.float64]
+    """Shape (4, 4)."""
+    overlap: float
+    """Share of the model points that fall on known depth of the view."""
+    inliers: float
+    """Share of those that agree within the last gate."""
+    residual: float
+    """Robust standard deviation of the point-to-plane residuals, in units of the sensor's noise."""
+    correlation: float
+    """Correlation of model and view brightness over the inliers; NaN without texture or brightness."""
+    pairs: int
+    information: NDArray[np.float64]
+    """What is known of the left-hand tangent (translation, rotation) in model coordinates beyond what noise in
+    normals and gradients feigns. Shape (6, 6)."""
+
+    def looseness_m(self, lever_m: float) -> float:
+        """Standard deviation of the motion that the pairs determine worst, metres at `lever_m` from the camera."""
+        T = self.T_model_cam
+        shift = np.eye(6)
+        shift[:3, 3:] = skew(T[:3, 3])  # rotate about the camera instead of the model's origin
+        scale = np.diag([1.0, 1.0, 1.0, *[1.0 / lever_m] * 3])
+        about_camera = scale @ shift.T @ self.information @ shift @ scale
+        weakest = float(np.linalg.eigvalsh(about_camera)[0])
+        return 1.0 / float(np.sqrt(weakest)) if weakest > 0 else float("inf")
+
+
+def register(
+    model: Samples,
+    view: View,
+    T_model_cam: NDArray[np.float64],
+    settings: RegistrationSettings,
+    noise: SensorNoise,
+    anchors: Anchors | None = None,
+) -> Registration | None:
+    """Refine `T_model_cam`; None when too few points meet."""
+    frame = _Frame(view, noise)
+    photometric = model.gray is not None and settings.photometric_weight > 0
+    T = np.array(T_model_cam, dtype=np.float64)
+    pairs = None
+    for iteration in range(settings.iterations):
+        halved = min(iteration // settings.gate_hold, settings.gate_halvings)
+        pairs = _pair(model, frame, T, settings.gate_m * 0.5**halved, settings.normal_agreement)
+        if pairs.count < settings.least_pairs:
+            return None
+        information, gradient = _geometric(pairs, settings.huber)
+        if photometric:
+            more, slope = _photometric(pairs, frame, T)
+            information += settings.photometric_weight * more
+            gradient += settings.photometric_weight * slope
+        if anchors is not None:
+            more, slope = _anchored(anchors, T, view.camera.fx)
+            information += more
+            gradient += slope
+        damped = information + 1e-9 * np.trace(information) * np.eye(6)
+        step = -np.linalg.solve(damped, gradient)
+        T = _exp(step) @ T
+        if halved == settings.gate_halvings and iteration > 2 and np.abs(step).max() < settings.converged:
+            break
+    assert pairs is not None
+    information = _solid_information(pairs, frame, T, settings, photometric)
+    if anchors is not None:
+        information += _anchored(anchors, T, view.camera.fx)[0]
+    return Registration(
+        T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
+    )
+
+
+def steps_without(
+    model: Samples,
+    view: View,
+    T_model_cam: NDArray[np.float64],
+    masks: Sequence[NDArray[np.bool_]],
+    settings: RegistrationSettings,
+    noise: SensorNoise,
+) -> list[NDArray[np.float64] | None]:
+    """The step (4, 4) from a registered pose that the rest of the view would take if a part were left out.
+
+    `masks` are the parts, (h, w) each; None where the rest is too little. One Gauss-Newton step, on shared residuals.
+    """
+    frame, last_gate = _Frame(view, noise), settings.gate_m * 0.5**settings.gate_halvings
+    pairs = _pair(model, frame, T_model_cam, last_gate, settings.normal_agreement)
+    rows, errors = [_geometric_slope(pairs)], [pairs.residual]
+    if pairs.gray is not None and settings.photometric_weight > 0:
+        slope, error = _photometric_slope(pairs, frame, T_model_cam)
+        rows.append(slope)
+        errors.append(error)
+    x, y = np.rint(pairs.uv).astype(np.int64).T
+    out: list[NDArray[np.float64] | None] = []
+    for mask in masks:
+        rest = np.flatnonzero(~mask[y, x])
+        if len(rest) < 50:
+            out.append(None)
+            continue
+        information, gradient = _normal_equations(rows[0][rest], errors[0][rest], _spread(errors[0][rest], 1e-3))
+        if len(rows) > 1:
+            error = errors[1][rest] - np.median(errors[1][rest])
+            more, slope64 = _normal_equations(rows[1][rest], error, _spread(error, 1.0))
+            information += settings.photometric_weight * more
+            gradient += settings.photometric_weight * slope64
+        out.append(_exp(-np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient)))
+    return out
+
+
+class _Frame:
+    """The images of a view laid out for look-ups by pixel number."""
+
+    def __init__(self, view: View, noise: SensorNoise) -> None:
+        self.camera = view.camera
+        self.points = view.points.reshape(-1, 3)
+        self.normals = view.normals.reshape(-1, 3)
+        self.valid = view.valid.ravel()
+        self.inverse_sigma = 1.0 / noise.sigma(view.depth).ravel()
+        dx = cv2.Sobel(view.gray, cv2.CV_32F, 1, 0, scale=0.125)
+        dy = cv2.Sobel(view.gray, cv2.CV_32F, 0, 1, scale=0.125)
+        self.brightness = cv2.merge([view.gray, dx, dy])
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of model and view points for one iteration, M of them."""
+
+    moved: Floats
+    """View points in model coordinates. Shape (M, 3)."""
+    points: Floats
+    normals: Floats
+    gray: Floats | None
+    uv: Floats
+    """Projections of the model points, px. Shape (M, 2)."""
+    points_cam: Floats
+    """Model points in camera coordinates. Shape (M, 3)."""
+    residual: Floats
+    """Point-to-plane distances over the sensor's noise. Shape (M,)."""
+    inverse_sigma: Floats
+    scale: float
+    overlap: float
+    share: float
+
+    @property
+    def count(self) -> int:
+        return len(self.residual)
+
+
+def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, agreement: float) -> _Pairs:
+    camera = frame.camera
+    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    points_cam: Floats = np.asarray((model.points - t) @ R, np.float32)
+    inverse_z = 1.0 / np.maximum(points_cam[:, 2], np.float32(1e-3))
+    u = points_cam[:, 0] * inverse_z * np.float32(camera.fx) + np.float32(camera.cx)
+    v = points_cam[:, 1] * inverse_z * np.float32(camera.fy) + np.float32(camera.cy)
+    inside = (points_cam[:, 2] > 0.05) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    index = np.flatnonzero(inside)
+    pixel = np.rint(v[index]).astype(np.int64) * camera.width + np.rint(u[index]).astype(np.int64)
+    known = frame.valid[pixel]
+    index, pixel = index[known], pixel[known]
+    moved, normals = frame.points[pixel] @ R.T + t, model.normals[index]
+    apart = moved - model.points[index]
+    distance = np.einsum("ij,ij->i", apart, normals)
+    alike = np.einsum("ij,ij->i", frame.normals[pixel] @ R.T, normals) > agreement
+    near = (np.abs(distance) < gate_m) & (np.einsum("ij,ij->i", apart, apart) < (4 * gate_m) ** 2) & alike
+    keep = np.flatnonzero(near)
+    inverse_sigma = frame.inverse_sigma[pixel[keep]]
+    residual = distance[keep] * inverse_sigma
+    scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3 if len(keep) else 1.0
+    index = index[keep]
+    gray = None if model.gray is None else model.gray[index]
+    return _Pairs(
+        moved=moved[keep],
+        points=model.points[index],
+        normals=normals[keep],
+        gray=gray,
+        uv=np.stack([u[index], v[index]], axis=1),
+        points_cam=points_cam[index],
+        residual=residual,
+        inverse_sigma=inverse_sigma,
+        scale=scale,
+        overlap=len(pixel) / max(1, len(model.points)),
+        share=len(keep) / max(1, len(pixel)),
+    )
+
+
+def _geometric(pairs: _Pairs, huber: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
+    return _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, huber)
+
+
+def _geometric_slope(pairs: _Pairs) -> Floats:
+    slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1)
+    return np.asarray(slope * pairs.inverse_sigma[:, None])
+
+
+def _solid_information(
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], settings: RegistrationSettings, photometric: bool
+) -> NDArray[np.float64]:
+    """Information without the share that comes from noise alone.
+
+    A point-to-plane slope is A n with A = (I, [q]x). Noise of variance s in n adds s A A' on average, by which a bare
+    wall would seem to hold the camera; that much is taken off again.
+    """
+    weight = (pairs.inverse_sigma / np.float32(pairs.scale)) ** 2
+    weighted = weight[:, None] * pairs.moved
+    first, second = skew(weighted.sum(axis=0).astype(np.float64)), (weighted.T @ pairs.moved).astype(np.float64)
+    feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
+    information = _geometric(pairs, settings.huber)[0] - settings.normal_noise**2 * feigned
+    if photometric:
+        information += settings.photometric_weight * _photometric(pairs, frame, T, settings.gradient_noise)[0]
+    return information
+
+
+def _photometric(
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
+    slope, error = _photometric_slope(pairs, frame, T, least_gradient)
+    error -= np.median(error)
+    return _normal_equations(slope, error, _spread(error, 1.0))
+
+
+def _photometric_slope(
+    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
+) -> tuple[Floats, Floats]:
+    assert pairs.gray is not None
+    value, dx, dy = _sample(frame, pairs.uv)
+    if least_gradient > 0:
+        strong = dx * dx + dy * dy > least_gradient**2
+        dx, dy = dx * strong, dy * strong
+    camera, p = frame.camera, pairs.points_cam
+    inverse_z = 1.0 / p[:, 2]
+    gx, gy = dx * np.float32(camera.fx) * inverse_z, dy * np.float32(camera.fy) * inverse_z
+    slope_cam = np.stack([gx, gy, -(gx * p[:, 0] + gy * p[:, 1]) * inverse_z], axis=1)
+    slope_model = slope_cam @ T[:3, :3].T.astype(np.float32)
+    slope = -np.concatenate([slope_model, _cross(pairs.points, slope_model)], axis=1)
+    return slope, value - pairs.gray
+
+
+def _spread(error: Floats, least: float) -> float:
+    """Robust standard deviation."""
+    return 1.4826 * float(np.median(np.abs(error))) + least
+
+
+def _anchored(
+    anchors: Anchors, T: NDArray[np.float64], focal_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of the reprojection errors of known features, in pixels of the view."""
+    p = ((anchors.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
+    inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
+    error: Floats = np.asarray((p[:, :2] * inverse_z - anchors.rays_xy) * focal_px, np.float32)
+    scale = 1.4826 * float(np.median(np.abs(error))) + 0.05
+    slope_cam = np.zeros((len(p), 2, 3), np.float32)
+    slope_cam[:, 0, 0] = slope_cam[:, 1, 1] = inverse_z[:, 0]
+    slope_cam[:, :, 2] = -p[:, :2] * inverse_z * inverse_z
+    slope_model = (np.float32(focal_px) * slope_cam @ T[:3, :3].T.astype(np.float32)).reshape(-1, 3)
+    slope = -np.concatenate([slope_model, _cross(np.repeat(anchors.points, 2, axis=0), slope_model)], axis=1)
+    return _normal_equations(slope, error.ravel(), scale)
+
+
+def _normal_equations(
+    slope: Floats, error: Floats, scale: float, huber: float = 1.345
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Huber-weighted, with the residuals in units of their robust scale."""
+    limit = huber * scale
+    weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-9)).astype(np.float32) / np.float32(scale * scale)
+    weighted = slope * weight[:, None]
+    return (weighted.T @ slope).astype(np.float64), (weighted.T @ error).astype(np.float64)
+
+
+def _correlation(pairs: _Pairs, frame: _Frame) -> float:
+    if pairs.gray is None or pairs.count < 2:
+        return float("nan")
+    value = _sample(frame, pairs.uv)[0]
+    a, b = value - value.mean(), pairs.gray - pairs.gray.mean()
+    spread = float(a.std() * b.std())
+    return float((a * b).mean()) / spread if min(a.std(), b.std()) > 2.0 else float("nan")
+
+
+def _sample(frame: _Frame, uv: Floats) -> tuple[Floats, Floats, Floats]:
+    """Brightness and its gradient at sub-pixel places."""
+    u, v = np.ascontiguousarray(uv[None, :, 0]), np.ascontiguousarray(uv[None, :, 1])
+    found = np.asarray(cv2.remap(frame.brightness, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))[0]
+    return found[:, 0], found[:, 1], found[:, 2]
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    ax, ay, az, bx, by, bz = a[:, 0], a[:, 1], a[:, 2], b[:, 0], b[:, 1], b[:, 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
+def _exp(step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A small rigid motion of (translation, rotation vector). Shape (6,) -> (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(step[3:])[0]
+    T[:3, 3] = step[:3]
+    return T

@@ -1,0 +1,309 @@
+"""The lens of an RGB source, estimated once before its chunks: focal length and radial distortion.
+
+One chunk alone says little of the focal length (on redkitchen 472 to 536 px of 524), so some windows spread over the
+video are mapped each by itself with a free camera, and then adjusted together with one camera for all. A window's
+parallax decides how much it says. All chunks are then made with the camera that was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
+from list3r.reconstruction.sfm.colmap import pycolmap
+from list3r.reconstruction.sfm.links import LinkSettings, keyframe_problem
+from list3r.reconstruction.sfm.mapping import MappingSettings, MapProblem, Poses, SparseMap, View, build_maps
+from list3r.reconstruction.sfm.tracks import Tracks, TrackSettings, follow_corners
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """Which frames are looked at, and what is believed."""
+
+    windows: int = 5
+    """Stretches of the video that are looked at."""
+    frames: int = 100
+    """Frames in each."""
+    least_frames: int = 60
+    """... and in each of a video too short for so many: the windows of a short one overlap by half, so that where it
+    stands still, shows a wall or jumps in the middle there is one without that. One window of four clips of 160 frames
+    of redkitchen tells focal lengths 8, 12, 6 and (a guess) 38 % off, three of 80 frames 11, 0, 3 and 1 %."""
+    least_windows: int = 3
+    """Windows of such a video."""
+    most_window_ratio: float = 1.3
+    """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
+    zoom_ratio: float = 1.5
+    """Windows whose focal length is farther off than this are told of: more than four deviations of one window. Windows
+    shorter than `frames` say too little for that."""
+    zoom_distortion: float = 0.2
+    """... unless their k1 is farther off than this, see below."""
+    most_error_px: float = 2.0
+    """Observations farther from their point's image than this are left out."""
+    rounds: int = 3
+    """Joint adjustments, each without what the one before contradicts."""
+    focal_range: tuple[float, float] = (0.4, 3.0)
+    """Focal lengths believed, by the longer side of the picture."""
+    distortion_range: tuple[float, float] = (-0.5, 0.2)
+    """k1 believed. With little parallax a map bends a focal length that is too long straight by a large positive k1,
+    as no lens of a camera has it: of 19 windows of redkitchen three say 887, 971 and 2947 px of 524, with 0.26, 0.32
+    and 5.3."""
+    least_shift_px: float = 0.3
+    """Distortion that shifts the corners of the picture by less is none."""
+    window_sigma: float = 0.09
+    """Standard deviation of the logarithm of one window's focal length (redkitchen, 60 to 100 frames: 0.087)."""
+    window_weight: float = 4.0
+    """So many windows' worth is that belief when the windows of a video tell their own spread."""
+    doubted_sigmas: float = 2.5
+    """A given focal length farther off than this is doubted aloud."""
+    tracks: TrackSettings = field(default_factory=TrackSettings)
+    links: LinkSettings = field(default_factory=LinkSettings)
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found of a source's camera."""
+
+    camera: Camera
+    """With the distortion of the pictures as they are handed out."""
+    windows: int
+    """Windows that it stands on; 0 where none could be mapped and the camera is as it was."""
+    focal_px: float | None
+    """Focal length by the pictures alone, None where they did not tell."""
+    focal_sigma: float | None = None
+    """Standard deviation of its logarithm."""
+    notes: tuple[str, ...] = ()
+    """What the user should know, one sentence each."""
+
+
+def calibrate(
+    source: FrameSource,
+    settings: CalibrationSettings | None = None,
+    progress: Progress | None = None,
+    stored_px: float = 1.0,
+) -> Calibration:
+    """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given.
+
+    `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes speak of those.
+    """
+    chosen = settings or CalibrationSettings()
+    info = source.info
+    known = info.camera is not None
+    start = info.camera or guessed_camera(info)
+    found = _estimated(source, start, chosen, progress)
+    if found is None and known:
+        found = _estimated(source, guessed_camera(info), chosen, progress)
+    if found is None:
+        return _nothing(start, known, stored_px)
+    windows, free, k1 = found.windows, found.camera, found.k1
+    sigma = _focal_sigma(windows, chosen)
+    told = f"{free.fx * stored_px:.0f} px, give or take {100 * sigma:.0f} %"
+    if not known:
+        said = f"the camera was estimated from the pictures: focal length {told}; distortion k1 {k1:.3f}"
+        notes = (said, *_parted(found, stored_px, chosen))
+        return Calibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
+    if abs(np.log(free.fx / start.fx)) > chosen.doubted_sigmas * sigma:
+        said = (
+            f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which say about {told}; "
+            "check --intrinsics, or leave it out"
+        )
+        return Calibration(start, len(windows), free.fx, sigma, (said,))
+    _, k1 = _adjust_together(windows, start, False, chosen)
+    lens = _lens(start, k1, chosen) if _believable(start, k1, chosen) else start
+    return Calibration(lens, len(windows), free.fx, sigma, _parted(found, stored_px, chosen))
+
+
+_Windows = list[tuple[MapProblem, SparseMap]]
+Progress = Callable[[int, int], None]
+"""Called with (windows done, in all)."""
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """What the windows of a video say."""
+
+    windows: _Windows
+    """Those that agree, from which the camera is."""
+    camera: Camera
+    k1: float
+    others: tuple[tuple[int, float, float], ...]
+    """Frame.index at which windows begin that can be believed and say something else; their focal length, px; k1."""
+    frames: int
+    """Length of a window."""
+
+
+def _estimated(
+    source: FrameSource, start: Camera, settings: CalibrationSettings, progress: Progress | None
+) -> _Estimate | None:
+    """What is said by the windows that could be mapped and can be believed; None where they make no sense."""
+    windows, begins, spans = [], [], _spans(source.info.frame_count, settings)
+    for done, (a, b) in enumerate(spans, start=1):
+        window = _window(source, a, b, start, settings)
+        if window is not None and _believable(window[1].camera, window[1].k1, settings):
+            windows.append(window)
+            begins.append(_index_at(source, a))
+        if progress is not None:
+            progress(done, len(spans))
+    if not windows:
+        return None
+    focals = np.array([found.camera.fx for _, found in windows])
+    agree = _agreeing(focals, settings)
+    kept = [w for w, chosen in zip(windows, agree.tolist(), strict=True) if chosen]
+    middle = float(np.exp(np.median(np.log(focals[agree]))))
+    free, k1 = _adjust_together(kept, replace(start, fx=middle, fy=middle), True, settings)
+    others = tuple((begins[k], float(focals[k]), windows[k][1].k1) for k in np.flatnonzero(~agree).tolist())
+    return _Estimate(kept, free, k1, others, spans[0][1] - spans[0][0]) if _believable(free, k1, settings) else None
+
+
+def _believable(camera: Camera, k1: float, settings: CalibrationSettings) -> bool:
+    """Whether a camera has such a lens."""
+    share = camera.fx / max(camera.width, camera.height)
+    (short, long), (least, most) = settings.focal_range, settings.distortion_range
+    return short < share < long and least <= k1 <= most
+
+
+def _agreeing(focals: NDArray[np.float64], settings: CalibrationSettings) -> NDArray[np.bool_]:
+    """Windows that are near the middle of all; where fewer than half are, those near the one with most around it."""
+    logs = np.log(focals)
+    near = np.abs(logs[:, None] - np.r_[np.median(logs), logs][None]) < np.log(settings.most_window_ratio)
+    votes = near.sum(axis=0)
+    return np.asarray(near[:, 0 if 2 * votes[0] >= len(logs) else 1 + int(np.argmax(votes[1:]))])
+
+
+def _index_at(source: FrameSource, position: int) -> int:
+    """The number in the source of the frame at a position."""
+    return next((f.index for f in source.read(position, position + 1)), position)
+
+
+def _parted(found: _Estimate, stored_px: float, settings: CalibrationSettings) -> tuple[str, ...]:
+    """What is said where windows that can be believed tell clearly different focal lengths."""
+    if found.frames < settings.frames:
+        return ()
+    far = [
+        (n, f)
+        for n, f, k1 in found.others
+        if abs(np.log(f / found.camera.fx)) > np.log(settings.zoom_ratio)
+        and abs(k1 - found.k1) < settings.zoom_distortion
+    ]
+    if not far:
+        return ()
+    where = ", ".join(f"{f * stored_px:.0f} px from frame {n} on" for n, f in far)
+    return (
+        f"parts of the video say another focal length ({where}): the camera zoomed or changed its lens, or they tell "
+        "too little; one camera is taken for all. Build what one lens took by itself (--frames, or --start and --end)",
+    )
+
+
+def _nothing(start: Camera, known: bool, stored_px: float) -> Calibration:
+    if known:
+        return Calibration(start, 0, None)
+    guess = f"a focal length of {start.fx * stored_px:.0f} px is a guess: give --intrinsics"
+    said = f"the camera could not be estimated; {guess}"
+    return Calibration(start, 0, None, notes=(said,))
+
+
+def _focal_sigma(windows: _Windows, settings: CalibrationSettings) -> float:
+    """Standard deviation of the logarithm of the focal length of all windows, from how far they differ."""
+    logs = np.log([found.camera.fx for _, found in windows])
+    square = settings.window_weight * settings.window_sigma**2 + float(((logs - logs.mean()) ** 2).sum())
+    return float(np.sqrt(square / (settings.window_weight + len(logs) - 1) / len(logs)))
+
+
+def _spans(count: int, settings: CalibrationSettings) -> list[tuple[int, int]]:
+    """Windows spread evenly over a source; those of a short one overlap."""
+    frames = int(np.clip(count // 2, settings.least_frames, settings.frames))
+    last = max(0, count - frames)
+    most = int(np.clip(count // settings.frames, settings.least_windows, settings.windows))
+    windows = min(most, 1 + last // (frames // 2))
+    starts = np.linspace(0, last, windows).astype(int).tolist() if windows > 1 else [last // 2]
+    return [(a, min(a + frames, count)) for a in starts]
+
+
+def _window(
+    source: FrameSource, start: int, stop: int, camera: Camera, settings: CalibrationSettings
+) -> tuple[MapProblem, SparseMap] | None:
+    """The largest map of a window with a camera of its own."""
+    frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
+    if len(frames) < 2:
+        return None
+    grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
+    tracks = _longest_run(follow_corners(grays, settings.tracks))
+    if len(tracks.keyframes) < 3:
+        return None
+    problem = keyframe_problem(tracks, grays, settings.links)
+    maps = build_maps(problem, camera, free_camera="focal", settings=settings.mapping)
+    return (problem, maps[0]) if maps and len(maps[0].T_map_cam) >= 3 else None
+
+
+def _longest_run(tracks: Tracks) -> Tracks:
+    """The tracks with the keyframes of their longest run alone, where it has half of the frames: what a jump or a wall
+    parts from it would be tied by features and says nothing more of the lens."""
+    followed = tracks.run[tracks.run >= 0]
+    longest = int(np.bincount(followed).argmax()) if len(followed) else -1
+    if 2 * int((tracks.run == longest).sum()) < len(tracks.run):
+        return tracks
+    return replace(tracks, keyframes=tuple(k for k in tracks.keyframes if tracks.run[k] == longest))
+
+
+def _adjust_together(
+    windows: Sequence[tuple[MapProblem, SparseMap]], camera: Camera, free_focal: bool, settings: CalibrationSettings
+) -> tuple[Camera, float]:
+    """One camera and its k1 for all windows, by bundle adjustment of all of them."""
+    made = pycolmap.Reconstruction()
+    start = [0.5 * (camera.fx + camera.fy), camera.cx + 0.5, camera.cy + 0.5, 0.0]
+    if free_focal:
+        start[3] = float(np.median([found.k1 for _, found in windows]))
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=camera.width, height=camera.height, params=start, camera_id=1)
+    made.add_camera_with_trivial_rig(lens)
+    for number, (problem, found) in enumerate(windows):
+        _add_window(made, number, problem, found)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.print_summary = free_focal, False
+    solver = options.ceres
+    solver.loss_function_type, solver.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 0.5
+    solver.solver_options.num_threads, solver.solver_options.max_num_iterations = 1, 60
+    solver.solver_options.function_tolerance = 1e-6
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in made.reg_image_ids():
+        config.add_image(image_id)
+    for _ in range(settings.rounds):
+        pycolmap.create_default_bundle_adjuster(options, config, made).solve()
+        pycolmap.ObservationManager(made).filter_points3D_with_large_reprojection_error(
+            settings.most_error_px, set(made.points3D), pycolmap.ReprojectionErrorType.PIXEL
+        )
+    focal, cx, cy, k1 = made.cameras[1].params
+    return replace(camera, fx=float(focal), fy=float(focal), cx=float(cx) - 0.5, cy=float(cy) - 0.5), float(k1)
+
+
+def _add_window(made: pycolmap.Reconstruction, number: int, problem: MapProblem, found: SparseMap) -> None:
+    """Views and points of one window, apart from those of the others."""
+    base = 1 + 10_000 * number
+    seen: dict[int, list[tuple[int, int]]] = {}
+    for key, T in sorted(found.T_map_cam.items()):
+        view: View = problem.views[key]
+        image = pycolmap.Image(f"{base + key}", view.xy.astype(np.float64) + 0.5, 1, base + key)
+        made.add_image_with_trivial_frame(image, _cam_from_map(T))
+        for row, track in enumerate(view.ids.tolist()):
+            if track in found.points:
+                seen.setdefault(track, []).append((base + key, row))
+    for track, rows in sorted(seen.items()):
+        if len(rows) >= 2:
+            made.add_point3D(found.points[track], pycolmap.Track([pycolmap.TrackElement(*r) for r in rows]))
+
+
+def _cam_from_map(T_map_cam: Poses) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(np.linalg.inv(T_map_cam)[:3])
+
+
+def _lens(camera: Camera, k1: float, settings: CalibrationSettings) -> Camera:
+    """The camera with its distortion, unless that shifts nothing."""
+    x, y = max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)
+    square = (x / camera.fx) ** 2 + (y / camera.fy) ** 2
+    if abs(k1) * square * float(np.hypot(x, y)) < settings.least_shift_px:
+        return camera
+    return replace(camera, distortion=(k1, 0.0, 0.0, 0.0, 0.0))

@@ -1,0 +1,181 @@
+"""Poses of the frames between the keyframes, from the points of the map that their corners belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
+from list3r.reconstruction.sfm.mapping import MappingSettings, Poses, SparseMap
+from list3r.reconstruction.sfm.tracks import Gray, Tracks
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FillSettings:
+    """How the frames between keyframes are posed."""
+
+    bridge: int = 4
+    """Frames without corners in a row, between two that are posed, that are looked for by the structure known there."""
+    bridge_window_px: int = 31
+    """Window by which its points are looked for."""
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+
+
+@dataclass
+class Segment:
+    """Frames posed in one map."""
+
+    found: SparseMap
+    T_map_cam: dict[int, Poses]
+    """By position in the chunk."""
+    seen: dict[int, tuple[Floats, NDArray[np.float64]]]
+    """Where points of the map are seen in each frame, (N, 2) px, and the points, (N, 3) map coordinates."""
+
+    def depths(self, position: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places (N, 2), px, and depths (N,), map units, of the points seen in a frame."""
+        xy, points = self.seen[position]
+        T_cam_map = np.linalg.inv(self.T_map_cam[position])
+        z = points @ T_cam_map[2, :3] + T_cam_map[2, 3]
+        return xy[z > 0].astype(np.float64), z[z > 0]
+
+
+def fill_segments(
+    maps: Sequence[SparseMap], tracks: Tracks, grays: Sequence[Gray], settings: FillSettings | None = None
+) -> list[Segment]:
+    """Pose all frames that can be posed in one of the maps, each in the first that holds it; largest segment first."""
+    chosen = settings or FillSettings()
+    left = set(range(len(grays)))
+    segments = []
+    for found in maps:
+        segment = _fill(found, tracks, sorted(left), chosen)
+        _bridge(segment, grays, sorted(left), chosen)
+        left -= set(segment.T_map_cam)
+        segments.append(segment)
+    segments = [s for s in segments if len(s.T_map_cam) >= 2]
+    return sorted(segments, key=lambda s: (-len(s.T_map_cam), min(s.T_map_cam)))
+
+
+def _fill(found: SparseMap, tracks: Tracks, positions: Iterable[int], settings: FillSettings) -> Segment:
+    numbers = np.array(sorted(found.points), np.int64)
+    places = np.array([found.points[int(n)] for n in numbers]).reshape(-1, 3)
+    segment = Segment(found, {}, {})
+    registered = sorted(found.T_map_cam)
+    for position in positions:
+        known = np.isin(tracks.ids[position], numbers)
+        xy = tracks.xy[position][known]
+        points = places[np.searchsorted(numbers, tracks.ids[position][known])]
+        if position in found.seen:
+            xy, points = _with_features(found, position, tracks, xy, points)
+        start = segment.T_map_cam.get(position - 1)
+        if position in found.T_map_cam or start is None:
+            start = found.T_map_cam[min(registered, key=lambda k: (abs(k - position), k))]
+        posed = pose_of(xy, points, found.camera, start, settings.mapping)
+        if posed is not None:
+            segment.T_map_cam[position] = posed[0]
+            segment.seen[position] = xy[posed[1]], points[posed[1]]
+        elif position in found.T_map_cam and len(xy) == 0:
+            segment.T_map_cam[position] = found.T_map_cam[position]
+            segment.seen[position] = xy, points
+    return segment
+
+
+def _with_features(
+    found: SparseMap, position: int, tracks: Tracks, xy: Floats, points: NDArray[np.float64]
+) -> tuple[Floats, NDArray[np.float64]]:
+    """What a keyframe sees of the map by its corners, and what it sees by other features."""
+    seen = found.seen[position]
+    rows = np.flatnonzero(~np.isin(seen.ids, tracks.ids[position])).tolist()
+    if not rows:
+        return xy, points
+    others = seen.where(rows)
+    places = np.array([found.points[int(n)] for n in others.ids]).reshape(-1, 3)
+    return np.concatenate([xy, others.xy]), np.concatenate([points, places])
+
+
+def pose_of(
+    xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: MappingSettings
+) -> tuple[Poses, NDArray[np.bool_]] | None:
+    """T_map_cam from points (N, 3) and where they are seen (N, 2), and which agree; None when too few do.
+
+    From `start` by robust refinement; where that fails, or without one, by sampling.
+    """
+    if len(xy) < settings.least_matches:
+        return None
+    lens, px = make_lens(camera, ""), xy.astype(np.float64) + 0.5
+    gate = settings.pose_error_px * pixel_unit(camera)
+    if start is not None:
+        found = _refined(px, points, lens, camera, start, np.ones(len(px), bool), gate)
+        if found is not None and found[1].mean() > 0.6:
+            return found
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, settings.seed, 1
+    guess = pycolmap.estimate_and_refine_absolute_pose(px, points, lens, options)
+    if guess is None or guess["num_inliers"] < settings.least_matches:
+        return None
+    T = inverse(matrix_of(guess["cam_from_world"]))
+    found = _refined(px, points, lens, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
+    return found if found is not None and found[1].mean() > 0.3 else None
+
+
+def _refined(
+    px: NDArray[np.float64],
+    points: NDArray[np.float64],
+    lens: Any,
+    camera: Camera,
+    start: Poses,
+    rows: NDArray[np.bool_],
+    gate: float,
+) -> tuple[Poses, NDArray[np.bool_]] | None:
+    T_cam_map = inverse(start)
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.loss_function_scale, options.gradient_tolerance = 0.5 * pixel_unit(camera), 1e-3
+    for _ in range(2):
+        found = pycolmap.refine_absolute_pose(rigid_of(T_cam_map), px, points, rows, lens, options)
+        if found is None:
+            return None
+        T_cam_map = matrix_of(found["cam_from_world"])
+        seen = points @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
+        z = np.maximum(seen[:, 2], 1e-9)
+        at = seen[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx + 0.5, camera.cy + 0.5)
+        rows = (seen[:, 2] > 0) & (np.linalg.norm(at - px, axis=1) < gate)
+        if rows.sum() < 12:
+            return None
+    return inverse(T_cam_map), rows
+
+
+def _bridge(segment: Segment, grays: Sequence[Gray], positions: Sequence[int], settings: FillSettings) -> None:
+    """Pose frames that lost their corners, in place, by looking for the structure that the neighbours see."""
+    posed = sorted(segment.T_map_cam)
+    for before, behind in pairwise(posed):
+        gap = range(before + 1, behind)
+        if not 0 < len(gap) <= settings.bridge:
+            continue
+        for position in gap:
+            near = before if position - before <= behind - position else behind
+            if position in positions:
+                _look_for(segment, grays, near, position, settings)
+
+
+def _look_for(segment: Segment, grays: Sequence[Gray], near: int, position: int, settings: FillSettings) -> None:
+    xy, points = segment.seen[near]
+    if len(xy) < settings.mapping.least_matches:
+        return
+    size = (settings.bridge_window_px, settings.bridge_window_px)
+    a, b = grays[near], grays[position]
+    place, found, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, np.zeros_like(xy), winSize=size, maxLevel=5)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, place, np.zeros_like(xy), winSize=size, maxLevel=5)
+    place = np.asarray(place, np.float32)
+    good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(np.asarray(back) - xy, axis=1) < 2.0)
+    made = pose_of(place[good], points[good], segment.found.camera, segment.T_map_cam[near], settings.mapping)
+    if made is not None and made[1].mean() > 0.5:
+        segment.T_map_cam[position] = made[0]
+        segment.seen[position] = place[good][made[1]], points[good][made[1]]

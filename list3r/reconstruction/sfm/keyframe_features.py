@@ -1,0 +1,111 @@
+"""Local features of keyframes, and which keyframes are worth matching: those whose surest features already agree
+(preemptive matching; Wu, "Towards linear-time incremental structure from motion", 3DV 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.reconstruction.features.learned import LearnedDetector
+from list3r.reconstruction.features.local import LEARNED_RATIO, nearest_pairs
+from list3r.reconstruction.features.vlad import root_sift
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FinderSettings:
+    """How features of keyframes are found and matched."""
+
+    count: int = 2000
+    """SIFT features of a keyframe."""
+    learned_count: int = 1200
+    """Learned ones."""
+    contrast: float = 0.015
+    """SIFT's contrast threshold."""
+    ratio: float = 0.85
+    """Lowe's ratio of SIFT."""
+    few: int = 300
+    """The surest features, by which keyframes worth matching are chosen."""
+    least_few: int = 4
+    """Fewest of them that must agree."""
+    partners: int = 8
+    """Keyframes that one is matched with, those that most agree."""
+
+
+@dataclass(frozen=True)
+class LocalFeatures:
+    """Features of a picture, the surest first."""
+
+    xy: Floats
+    """px. Shape (N, 2)."""
+    descriptors: Floats
+    """Unit vectors. Shape (N, D)."""
+    ratio: float
+    """Lowe's ratio that suits them."""
+
+    def surest(self, count: int) -> LocalFeatures:
+        """The first so many."""
+        return LocalFeatures(self.xy[:count], self.descriptors[:count], self.ratio)
+
+
+Finder = Callable[[int], LocalFeatures]
+"""Features of the frame at a position in the chunk."""
+
+
+def make_finder(
+    grays: Sequence[NDArray[np.uint8]],
+    colors: Sequence[NDArray[np.uint8]] | None,
+    detector: LearnedDetector | None,
+    settings: FinderSettings,
+) -> Finder:
+    """SIFT features of grey pictures, or learned ones of the colour pictures."""
+    if detector is None or colors is None:
+        return lambda position: sift_features(grays[position], settings)
+
+    def find(position: int) -> LocalFeatures:
+        found = detector(colors[position], settings.learned_count)
+        return LocalFeatures(found.xy, found.descriptors, LEARNED_RATIO)
+
+    return find
+
+
+def sift_features(gray: NDArray[np.uint8], settings: FinderSettings) -> LocalFeatures:
+    """SIFT features of a grey picture, each place once."""
+    sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
+    keypoints, descriptors = sift.detectAndCompute(gray, None)
+    if descriptors is None:
+        return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), settings.ratio)
+    xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
+    order = np.lexsort((xy[:, 0], xy[:, 1], -np.array([k.response for k in keypoints])))[: settings.count]
+    _, single = np.unique(xy[order], axis=0, return_index=True)
+    order = order[np.sort(single)]
+    return LocalFeatures(xy[order], root_sift(descriptors[order].astype(np.uint8)), settings.ratio)
+
+
+def match_features(a: LocalFeatures, b: LocalFeatures) -> Ints:
+    """Rows of two pictures that show the same. Shape (M, 2)."""
+    return nearest_pairs(a.descriptors, b.descriptors, a.ratio)
+
+
+def likely_pairs(
+    features: Mapping[int, LocalFeatures], known: set[tuple[int, int]], settings: FinderSettings
+) -> list[tuple[int, int]]:
+    """Pairs of keyframes worth matching, none of those `known`, in order."""
+    surest = {k: f.surest(settings.few) for k, f in features.items()}
+    agreeing: dict[int, list[tuple[int, tuple[int, int]]]] = {k: [] for k in features}
+    for a, b in combinations(sorted(features), 2):
+        if (a, b) in known:
+            continue
+        count = len(match_features(surest[a], surest[b]))
+        if count >= settings.least_few:
+            agreeing[a].append((-count, (a, b)))
+            agreeing[b].append((-count, (a, b)))
+    return sorted({pair for found in agreeing.values() for _, pair in sorted(found)[: settings.partners]})

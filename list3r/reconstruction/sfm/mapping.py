@@ -1,0 +1,373 @@
+"""Structure from motion of keyframes by pycolmap: two-view geometry, incremental mapping, bundle adjustment.
+
+Nothing touches the disk: the correspondences lie in a database in memory. pycolmap's pixels have their origin at the
+corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
+correspondences give the same structure.
+
+Growing a map is a local search: where a camera turns by 3 degrees and moves by 1 cm a frame it may end in a bent room,
+which explains the pictures worse. The first 100 frames of simulated walks, grown from where the mapper likes, from a
+pair in the second third and from one in the last (error px; ATE m): 0.461; 0.149, 0.410; 0.008, 0.412; 0.008 on walk
+102, 0.445; 0.142, 0.397; 0.006, 0.397; 0.007 on another, 0.440; 0.141, 0.395; 0.007, 0.393; 0.006 on a third,
+0.404; 0.005, 0.406; 0.006, 0.406; 0.004 on walk 104. Other angles between the first two (3, 10, 15, 20, 30 degrees)
+often start from the same pair, and two bent rooms may agree to 0.2 %. Adjusting one again from the bent room, with more
+iterations, ends in it. On redkitchen all agree.
+Adjusting the whole at growth 1.1 instead of 1.4 costs 1.4 times the CPU and ends in the same places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
+from list3r.reconstruction.sfm.consistency import contradicted
+from list3r.reconstruction.sfm.turning import only_turns
+
+Poses = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How keyframes become a map. Errors in px of a picture 640 wide."""
+
+    least_matches: int = 20
+    """Fewest correspondences of two keyframes that count."""
+    matched_share: float = 1.0 / 3.0
+    """Share of what two keyframes matched by looks that must agree on their geometry. On redkitchen (every 20th and
+    30th frame) and simulated walks 99 % of the right pairs have 0.34 and more; what only chance relates 0.2 to 0.3."""
+    pair_error_px: float = 2.0
+    """Largest epipolar error of a match."""
+    pose_error_px: float = 4.0
+    """Largest error of a correspondence of structure and picture when a keyframe is added."""
+    point_error_px: float = 2.0
+    """Largest error of an observation that stays."""
+    first_angle_deg: float = 6.0
+    """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
+    told_angle_deg: float = 3.0
+    """... where they are told, or the camera is to be found as well."""
+    told_steps: tuple[int, int] = (4, 7)
+    """Keyframes from the first to the second that are told, at least and at most."""
+    same_error: float = 1.005
+    """Two maps whose errors are that near are the same, and no third is grown: right ones of one chunk differ by 0.1 to
+    0.7 %, bent ones are 9 to 12 % off (simulated walks 101 to 104)."""
+    growth: float = 1.4
+    """The whole map is adjusted each time it has grown by this factor."""
+    alike: float = 0.95
+    """Maps with at least this share of the keyframes of the largest are compared by their error."""
+    point_angle_deg: float = 1.0
+    """Least angle between the rays to a point."""
+    least_points: int = 40
+    """Fewest points of a map that is believed."""
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class View:
+    """Correspondences seen in a keyframe."""
+
+    ids: Ints
+    """Track numbers. Shape (N,)."""
+    xy: Floats
+    """px. Shape (N, 2)."""
+
+    def where(self, rows: Sequence[int]) -> View:
+        """Some of the correspondences."""
+        chosen = np.array(rows, np.int64)
+        return View(self.ids[chosen], self.xy[chosen])
+
+
+@dataclass(frozen=True)
+class SparseMap:
+    """Poses of some keyframes and points, in one frame of reference and scale of their own."""
+
+    T_map_cam: dict[int, Poses]
+    """By key of the view. Shape (4, 4)."""
+    points: dict[int, NDArray[np.float64]]
+    """Map coordinates, by track number. Shape (3,)."""
+    camera: Camera
+    k1: float = 0.0
+    """Radial distortion left in the pictures, where it was free."""
+    error_px: float = 0.0
+    """Mean reprojection error."""
+    seen: dict[int, View] = field(default_factory=dict)
+    """What each view sees of the points, by key of the view."""
+
+
+Matches = Mapping[tuple[int, int], NDArray[np.int64]]
+"""Rows of two views that show the same, by the two views' keys. Shape (M, 2)."""
+
+
+@dataclass(frozen=True)
+class MapProblem:
+    """Keyframes and what they see in common."""
+
+    views: dict[int, View]
+    pairs: dict[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
+    """Rows of the views that show the same point, by keys, the smaller first. Shape (M, 2)."""
+    matched: frozenset[tuple[int, int]] = frozenset()
+    """Pairs whose rows were not followed but matched by looks."""
+    beside: frozenset[int] = frozenset()
+    """Views that help to make the map and are no part of it afterwards."""
+
+
+def shared_rows(a: View, b: View) -> NDArray[np.int64]:
+    """Rows of the tracks that two views share. Shape (M, 2)."""
+    _, at_a, at_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    return np.stack([at_a, at_b], axis=1).astype(np.int64)
+
+
+def build_maps(
+    problem: MapProblem, camera: Camera, *, free_camera: str = "", settings: MappingSettings | None = None
+) -> list[SparseMap]:
+    """Maps of the keyframes, the largest first; several where they cannot be joined, none where nothing has depth or
+    the camera only turns.
+
+    `free_camera` names what of the camera is estimated as well: "" nothing, "k1" the distortion, "focal" the focal
+    length and the distortion.
+    """
+    chosen = settings or MappingSettings()
+    cache = _cache(problem, camera, free_camera, chosen)
+    if cache is None:
+        return []
+    grown: list[list[SparseMap]] = []
+    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen))):
+        maps = _grown(cache, problem, camera, free_camera, pair, chosen)
+        grown.append(_without_beside(maps, problem))
+        if agreed(grown, chosen) or (not maps and pair is None and _turns(problem, problem.views, camera)):
+            break
+    best = best_of(grown, chosen.alike)
+    held = {key for found in best for key in found.T_map_cam}
+    return [*best, *(found for found in grown[0] if not held & found.T_map_cam.keys())]
+
+
+def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[int, int]]:
+    """Pairs of keyframes from which maps are grown besides: those that share most in the second and the last third."""
+    own = sorted(problem.views.keys() - problem.beside)
+    place = {key: n for n, key in enumerate(own)}
+    least, most = settings.told_steps
+    out = []
+    for third in (1, 2):
+        part = own[third * len(own) // 3 : (third + 1) * len(own) // 3]
+        steps = {p: place[p[1]] - place[p[0]] for p in problem.pairs if p[0] in part and p[1] in place}
+        near = [(len(problem.pairs[p]), p) for p, step in sorted(steps.items()) if least <= step <= most]
+        out += [max(near)[1]] if near else []
+    return out
+
+
+def _grown(
+    cache: Any,
+    problem: MapProblem,
+    camera: Camera,
+    free_camera: str,
+    pair: tuple[int, int] | None,
+    settings: MappingSettings,
+) -> list[SparseMap]:
+    """Maps that grow from two keyframes, one from a pair that is told; none of a camera that only turns."""
+    options = _options(camera, free_camera, settings)
+    told = pair is not None or free_camera == "focal"
+    options.mapper.init_min_tri_angle = settings.told_angle_deg if told else settings.first_angle_deg
+    if pair is not None:
+        options.init_image_id1, options.init_image_id2 = pair[0] + 1, pair[1] + 1
+        options.max_num_models = 1
+    manager = pycolmap.ReconstructionManager()
+    pycolmap.IncrementalPipeline(options, cache, manager).run()
+    maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
+    if problem.matched:
+        maps = [_borne_out(m, problem, cache, camera) for m in maps]
+    maps = [m for m in maps if len(m.points) >= settings.least_points and len(m.T_map_cam) >= 2]
+    return [m for m in maps if not _turns(problem, m.T_map_cam, camera)]
+
+
+def _turns(problem: MapProblem, keys: Collection[int], camera: Camera) -> bool:
+    """Whether the camera only turns in some of the views."""
+    return only_turns({key: view.xy for key, view in problem.views.items()}, problem.pairs, keys, camera)
+
+
+def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[SparseMap]:
+    """The maps without the views beside, the largest first."""
+    left = []
+    for found in maps:
+        poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
+        seen = {k: view for k, view in found.seen.items() if k not in problem.beside}
+        if len(poses) >= 2:
+            left.append(replace(found, T_map_cam=poses, seen=seen))
+    return sorted(left, key=lambda m: (-len(m.T_map_cam), min(m.T_map_cam)))
+
+
+def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
+    """Whether two maps that fell into no pieces hold as many keyframes and explain the pictures alike.
+
+    Bent rooms may agree too, but where a room bends something is often left that does not fit.
+    """
+    largest = [(len(maps[0].T_map_cam), maps[0].error_px) for maps in grown if len(maps) == 1]
+    return any(a == b and max(e, f) <= settings.same_error * min(e, f) for (a, e), (b, f) in combinations(largest, 2))
+
+
+def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
+    """Those whose largest map has the least error among the ones that are about as large as any."""
+    most = max((len(maps[0].T_map_cam) for maps in grown if maps), default=0)
+    large = [maps for maps in grown if maps and len(maps[0].T_map_cam) >= alike * most]
+    return min(large, key=lambda maps: maps[0].error_px, default=[])
+
+
+def _borne_out(found: SparseMap, problem: MapProblem, cache: Any, camera: Camera) -> SparseMap:
+    """The map without keyframes that their matches contradict."""
+    seen = {}
+    for a, b in sorted(problem.pairs):
+        if a in found.T_map_cam and b in found.T_map_cam:
+            rows = cache.correspondence_graph.extract_matches_between_images(a + 1, b + 1)
+            rows = np.asarray(rows, np.int64).reshape(-1, 2)
+            seen[a, b] = problem.views[a].xy[rows[:, 0]], problem.views[b].xy[rows[:, 1]]
+    out = contradicted(found.T_map_cam, seen, camera)
+    if not out:
+        return found
+    poses = {k: T for k, T in found.T_map_cam.items() if k not in out}
+    views = {k: view for k, view in found.seen.items() if k not in out}
+    numbers = set(np.concatenate([np.zeros(0, np.int64), *(view.ids for view in views.values())]).tolist())
+    points = {n: xyz for n, xyz in found.points.items() if n in numbers}
+    return replace(found, T_map_cam=poses, seen=views, points=points)
+
+
+def triangulate(
+    problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], settings: MappingSettings | None = None
+) -> SparseMap | None:
+    """Points of views whose poses are known; None when there are too few."""
+    chosen = settings or MappingSettings()
+    known = {key: view for key, view in problem.views.items() if key in T_map_cam}
+    pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
+    cache = _cache(MapProblem(known, pairs, problem.matched), camera, "", chosen)
+    if cache is None:
+        return None
+    mapper = pycolmap.IncrementalMapper(cache)
+    made = pycolmap.Reconstruction()
+    mapper.begin_reconstruction(made)
+    for image_id, image in sorted(made.images.items()):
+        image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
+        made.register_frame(image.frame_id)
+    options = _options(camera, "", chosen)
+    for image_id in sorted(made.images):
+        mapper.triangulate_image(options.triangulation, image_id)
+    mapper.complete_and_merge_tracks(options.triangulation)
+    mapper.filter_points(options.mapper)
+    found = _sparse_map(made, problem, camera)
+    return found if len(found.points) >= chosen.least_points else None
+
+
+def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
+    """pycolmap's correspondence graph; None when no two views have anything in common."""
+    database = pycolmap.Database.open(":memory:")
+    lens = make_lens(camera, free_camera)
+    lens.camera_id = 1
+    database.write_camera(lens, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=1)
+    sensor = pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=1)
+    rig.add_ref_sensor(sensor)
+    database.write_rig(rig, use_rig_id=True)
+    for key, view in sorted(problem.views.items()):
+        frame = pycolmap.Frame(frame_id=key + 1, rig_id=1)
+        frame.add_data_id(pycolmap.data_t(sensor_id=sensor, id=key + 1))
+        database.write_frame(frame, use_frame_id=True)
+        image = pycolmap.Image(name=f"{key:06d}", camera_id=1, image_id=key + 1)
+        image.frame_id = key + 1
+        database.write_image(image, use_image_id=True)
+        database.write_keypoints(key + 1, (view.xy + np.float32(0.5)).astype(np.float32))
+    count = 0
+    for (a, b), rows in sorted(problem.pairs.items()):
+        matched = (a, b) in problem.matched
+        found = _two_view(problem.views[a], problem.views[b], rows, lens, camera, free_camera, settings, matched)
+        wanted = max(settings.least_matches, settings.matched_share * len(rows) if matched else 0.0)
+        if found is not None and len(found.inlier_matches) >= wanted:
+            database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
+            database.write_two_view_geometry(a + 1, b + 1, found)
+            count += 1
+    if not count:
+        return None
+    options = pycolmap.DatabaseCacheOptions()
+    options.min_num_matches = settings.least_matches
+    return pycolmap.DatabaseCache.create(database, options)
+
+
+def _two_view(
+    a: View,
+    b: View,
+    rows: NDArray[np.int64],
+    lens: Any,
+    camera: Camera,
+    free_camera: str,
+    settings: MappingSettings,
+    matched: bool = False,
+) -> Any:
+    if len(rows) < settings.least_matches:
+        return None
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers, options.detect_watermark = settings.least_matches, False
+    options.ransac.max_error = settings.pair_error_px * pixel_unit(camera) * (2.0 if free_camera else 1.0)
+    options.ransac.random_seed, options.ransac.num_threads = settings.seed, 1
+    if matched:
+        options.min_E_F_inlier_ratio, options.ransac.min_inlier_ratio = 0.0, settings.matched_share
+    calibrated, free = pycolmap.estimate_calibrated_two_view_geometry, pycolmap.estimate_two_view_geometry
+    estimate = free if free_camera == "focal" else calibrated
+    one, two = (view.xy.astype(np.float64) + 0.5 for view in (a, b))
+    return estimate(lens, one, lens, two, rows.astype(np.uint32), options)
+
+
+def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.extract_colors = 1, settings.seed, False
+    options.min_num_matches, options.min_model_size = settings.least_matches, 2
+    options.init_num_trials, options.max_num_models = 50, 10
+    options.ba_refine_focal_length = free_camera == "focal"
+    options.ba_refine_extra_params = bool(free_camera)
+    options.ba_refine_principal_point = False
+    options.ba_local_max_num_iterations, options.ba_global_max_num_iterations = 10, 25
+    options.ba_global_max_refinements = 3
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
+    mapper, unit = options.mapper, pixel_unit(camera)
+    mapper.num_threads, mapper.random_seed = 1, settings.seed
+    mapper.init_min_num_inliers = 2 * settings.least_matches
+    mapper.init_max_error = settings.pair_error_px * unit * (2.0 if free_camera else 1.0)
+    mapper.abs_pose_min_num_inliers = settings.least_matches
+    mapper.abs_pose_max_error = settings.pose_error_px * unit
+    mapper.abs_pose_refine_focal_length = free_camera == "focal"
+    mapper.abs_pose_refine_extra_params = bool(free_camera)
+    mapper.filter_max_reproj_error = settings.point_error_px * unit
+    mapper.filter_min_tri_angle = settings.point_angle_deg
+    mapper.ba_local_min_tri_angle = 2.0
+    options.triangulation.min_angle = settings.point_angle_deg
+    options.triangulation.ignore_two_view_tracks = False
+    options.triangulation.random_seed = settings.seed
+    return options
+
+
+def _sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
+    poses: dict[int, Poses] = {}
+    for image_id in sorted(made.reg_image_ids()):
+        poses[image_id - 1] = inverse(matrix_of(made.images[image_id].cam_from_world()))
+    points: dict[int, NDArray[np.float64]] = {}
+    best: dict[int, int] = {}
+    rows: dict[int, list[int]] = {key: [] for key in poses}
+    for _, point in sorted(made.points3D.items()):
+        elements = point.track.elements
+        for element in elements:
+            key = element.image_id - 1
+            track = int(problem.views[key].ids[element.point2D_idx])
+            rows[key].append(element.point2D_idx)
+            if best.get(track, 0) < len(elements):
+                best[track], points[track] = len(elements), np.asarray(point.xyz, np.float64)
+    seen = {key: problem.views[key].where(sorted(found)) for key, found in rows.items()}
+    params = next(iter(made.cameras.values())).params
+    if len(params) == 4 and camera.fx == camera.fy and next(iter(made.cameras.values())).model_name == "SIMPLE_RADIAL":
+        camera = Camera(camera.width, camera.height, params[0], params[0], params[1] - 0.5, params[2] - 0.5)
+        k1 = float(params[3])
+    else:
+        k1 = 0.0
+    error = float(made.compute_mean_reprojection_error()) if made.num_points3D() else 0.0
+    return SparseMap(poses, points, camera, k1, error, seen)

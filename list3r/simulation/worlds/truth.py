@@ -1,0 +1,130 @@
+"""What is true of a world, in words that a scene graph can be held against."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
+from list3r.simulation.worlds.gaps import surface_gap
+from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.world import World
+
+NEXT_TO_M = (0.1, 0.4)
+"""Things are next to each other up to half the mean of their longest edges, within these bounds, metres."""
+NEAR_M = (0.15, 0.4)
+"""The same for things that are near each other, in any direction."""
+SHARED_HEIGHT = 0.3
+"""Least share of the shorter one's height that two things side by side have in common."""
+
+
+def world_truth(world: World, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
+    """The content of `truth.json`: frame, instances with boxes, relations.
+
+    `seen` maps the id of a thing to counts of the walk: frames in which it shows, and its largest area in pixels.
+    """
+    return {
+        "format": "list3r-simulated-truth",
+        "version": 1,
+        "seed": world.seed,
+        "frame": {"up": [0, 0, 1], "units": "m", "metric": "metric", "gravity": "known"},
+        "instances": [_instance(t, (seen or {}).get(t.id, {})) for t in world.things],
+        "relations": [{"subject": s, "predicate": p, "object": o} for s, p, o in true_relations(world)],
+    }
+
+
+def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
+    box = thing.box()
+    return {
+        "id": thing.id,
+        "label": thing.label,
+        "structure": thing.structure is not None,
+        "round": thing.is_round(),
+        "box": {
+            "center": _rounded(box.center),
+            "size": _rounded(box.size),
+            "quat_wxyz": _rounded(quat_wxyz_from_rotation(box.rotation)),
+        },
+        "support": thing.support,
+        "container": thing.container,
+        "attached": thing.attached,
+        "frames_seen": seen.get("frames", 0),
+        "largest_px": seen.get("largest_px", 0),
+    }
+
+
+def mover_truth(thing: Thing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
+    """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
+
+    `thing` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
+    """
+    yaw = np.arctan2(T_world_object[:, 1, 0], T_world_object[:, 0, 0])
+    return {
+        "id": thing.id,
+        "label": thing.label,
+        "size": _rounded(thing.box().size),
+        "position": [_rounded(p) for p in T_world_object[:, :3, 3]],
+        "yaw": _rounded(yaw),
+        "frames_seen": seen.get("frames", 0),
+        "largest_px": seen.get("largest_px", 0),
+    }
+
+
+def true_relations(world: World) -> list[tuple[int, str, int]]:
+    """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `near` and `next_to` both ways.
+
+    `near` is the gap between surfaces against the size of the two, among things of which neither holds the other;
+    `next_to` the same among those that share heights. Rugs are next to nothing: what touches them stands on them.
+    """
+    triples: list[tuple[int, str, int]] = []
+    for thing in world.things:
+        if thing.container is not None:
+            triples.append((thing.id, "in", thing.container))
+        elif thing.support is not None:
+            triples.append((thing.id, "on", thing.support))
+        if thing.attached is not None:
+            triples.append((thing.id, "attached_to", thing.attached))
+    things = [t for t in world.things if t.structure is None]
+    for k, a in enumerate(things):
+        for b in things[:k]:
+            for predicate in _close(a, b):
+                triples += [(a.id, predicate, b.id), (b.id, predicate, a.id)]
+    return sorted(triples)
+
+
+def _close(a: Thing, b: Thing) -> list[str]:
+    """Which of near and next_to two things are."""
+    if a.id in (b.support, b.container) or b.id in (a.support, a.container):
+        return []
+    one, two = a.box(), b.box()
+    half = 0.25 * float(one.size.max() + two.size.max())
+    near, beside = float(np.clip(half, *NEAR_M)), float(np.clip(half, *NEXT_TO_M))
+    if footprint_gap(one, two) > near or (gap := surface_gap(a, b)) > near:
+        return []
+    rug = "rug" in (a.label, b.label)
+    return ["near", "next_to"] if gap <= beside and not rug and _share_heights(one, two) else ["near"]
+
+
+def _share_heights(one: OrientedBox, two: OrientedBox) -> bool:
+    shared = min(one.center[2] + one.size[2] / 2, two.center[2] + two.size[2] / 2)
+    shared -= max(one.center[2] - one.size[2] / 2, two.center[2] - two.size[2] / 2)
+    return bool(shared >= SHARED_HEIGHT * min(one.size[2], two.size[2]))
+
+
+def footprint_gap(a: OrientedBox, b: OrientedBox) -> float:
+    """Distance between the footprints of two upright boxes, metres, 0 where they overlap.
+
+    The longest separation along the sides' normals of either box, which is exact unless corner faces corner.
+    """
+    corners = [box.corners()[::2, :2] for box in (a, b)]
+    gaps = [0.0]
+    for axis in [box.rotation[:2, k] for box in (a, b) for k in (0, 1)]:
+        p, q = corners[0] @ axis, corners[1] @ axis
+        gaps.append(float(max(q.min() - p.max(), p.min() - q.max())))
+    return max(gaps)
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(v), 6) + 0.0 for v in values]
