@@ -80,9 +80,9 @@ def _one_thread() -> None:
 def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
     """All variants on one simulated video."""
     from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+    from benchmarks.simulation.presets import make_video
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
     from list3r.frames.chunking.cuts import cuts_by_descriptor
-    from list3r.simulation.presets import make_video
 
     preset, seed, variants = job
     video = make_video(preset, seed)
@@ -152,8 +152,8 @@ class _Truth:
     """Measures of a memory against a simulated video."""
 
     def __init__(self, video: Any) -> None:
+        from benchmarks.simulation.covisibility import seen_share
         from list3r.evaluation.covisibility import Covisibility
-        from list3r.simulation.covisibility import seen_share
 
         self.frames = len(video.time_s)
         self._video = video

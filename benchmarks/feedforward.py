@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+from benchmarks.simulation.presets import make_video
+from benchmarks.simulation.video import SimulatedVideo
 from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, measure_edge
 from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3, rotation_log, umeyama
 from list3r.memory.records import ChunkResult
-from list3r.simulation.presets import make_video
-from list3r.simulation.video import SimulatedVideo
 
 Array = NDArray[np.float64]
 

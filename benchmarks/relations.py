@@ -37,12 +37,14 @@ from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.views import chunk_views
 from list3r.instances.neural.candidates import plane_of_mask, without_spill
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
+from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_chunk
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.queries.relations import VERTICAL
 from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
 from list3r.simulation.worlds.gaps import surface_gap
+from list3r.simulation.worlds.things import Thing
 from list3r.simulation.worlds.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
@@ -249,13 +251,20 @@ def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
     torn = set()
     for rug_id, rug in ((t.id, t.box()) for t in things if t.label == "rug"):
         for thing in things:
-            feet = [b for b in thing.part_boxes() if b.center[2] - b.size[2] / 2 < 0.05]
+            feet = [b for b in part_boxes(thing) if b.center[2] - b.size[2] / 2 < 0.05]
             if thing.structure is None and thing.label != "rug" and feet:
                 away = [np.abs((b.center - rug.center) @ rug.rotation)[:2] - rug.size[:2] / 2 for b in feet]
                 over = [bool((a < 0).all()) for a in away]
                 if any(over) and not all(over):
                     torn.add((thing.id, rug_id))
     return torn
+
+
+def part_boxes(thing: Thing) -> list[OrientedBox]:
+    """The box of each part of a thing in the world."""
+    rotation, position = thing.rotation(), np.array(thing.position)
+    corners = [part.extent() for part in thing.parts]
+    return [OrientedBox(position + rotation @ ((low + high) / 2), high - low, rotation) for low, high in corners]
 
 
 def _vertical_without_gravity(store: Store) -> int:

@@ -26,6 +26,8 @@ import numpy as np
 from machine import machine, run_list3r, write_json
 from numpy.typing import NDArray
 
+from benchmarks.simulation.changes import random_changes
+from benchmarks.simulation.walks import ChangedWalk
 from list3r.evaluation.scene import evaluate_scene, read_scene
 from list3r.evaluation.trajectory import Trajectory, align, associate, read_tum
 from list3r.memory.geometry import OrientedBox, Sim3
@@ -33,13 +35,12 @@ from list3r.memory.records import ChangeEvent
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.walk import camera_path
-from list3r.simulation.worlds.changes import random_changes
 
 MIN_PX = 150
 KINDS = ("moved", "removed", "added")
 
 
-class ReturnWalk(WalkSettings):
+class ReturnWalk(ChangedWalk):
     """The same rooms the other way round."""
 
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,10 +11,10 @@ from pathlib import Path
 import faiss
 import numpy as np
 
+from benchmarks.simulation.presets import make_shot
 from list3r.frames.base import Camera
 from list3r.reconstruction.features.local import FeatureSettings, detect
 from list3r.reconstruction.features.vlad import root_sift
-from list3r.simulation.presets import make_shot
 from list3r.simulation.rendering.render import Renderer
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)

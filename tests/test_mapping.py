@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+from benchmarks.simulation.presets import make_video
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult
 from list3r.memory.store.store import Store
 from list3r.pipeline import mapping
-from list3r.simulation.presets import make_video
 
 
 def placed(path: Path, chunks: list[ChunkResult], model: FeedForwardModel) -> list[Sim3]:

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+from benchmarks.simulation.presets import make_video
 from list3r.api import open as open_scene
 from list3r.cli.app import run
 from list3r.exporters.scene_json import write_scene_json
@@ -24,7 +25,6 @@ from list3r.memory.records import ChunkResult, Instance
 from list3r.memory.store.store import Store
 from list3r.memory.world.scale import parse_anchor
 from list3r.pipeline import mapping
-from list3r.simulation.presets import make_video
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.simulation.changes import Change, apply_changes, random_changes
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
 from list3r.simulation.rendering.render import RenderedFrame, Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path, look_poses
-from list3r.simulation.worlds.changes import Change, apply_changes, random_changes
 from list3r.simulation.worlds.materials import Material, bake
 from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, Thing
 from list3r.simulation.worlds.truth import footprint_gap, true_relations, world_truth

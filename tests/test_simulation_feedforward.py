@@ -12,13 +12,13 @@ from benchmarks.feedforward_sim.descriptors import Appearance
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
 from benchmarks.feedforward_sim.pose_errors import PoseErrorSettings, bend
 from benchmarks.feedforward_sim.runs import runs_of
+from benchmarks.simulation.presets import make_video
+from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3, rotation_log, umeyama
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import FrameSamples
-from list3r.simulation.presets import make_video
-from list3r.simulation.video import SimulatedVideo
 
 SPAN = ChunkSpan(2, 140, 240)
 

@@ -10,14 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulation.casting import Caster
+from benchmarks.simulation.covisibility import covisibility, seen_share
+from benchmarks.simulation.presets import Shot, make_shot, make_video, preset_camera, preset_names
+from benchmarks.simulation.video import SimulatedVideo
+from benchmarks.simulation.walks import PresetWalk
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
-from list3r.simulation.covisibility import covisibility, seen_share
 from list3r.simulation.dataset import WalkSettings, write_walk
-from list3r.simulation.presets import Shot, make_shot, make_video, preset_camera, preset_names
-from list3r.simulation.rendering.casting import Caster
 from list3r.simulation.rendering.render import Renderer
-from list3r.simulation.video import SimulatedVideo
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import make_world
 
@@ -241,7 +242,7 @@ def test_what_moves_is_no_common_surface() -> None:
 
 
 def test_a_preset_is_written_as_a_sequence_with_its_movers(tmp_path: Path) -> None:
-    settings = WalkSettings(seed=101, preset="dynamic", frames=4, start=500, size=(64, 48), write_ids=True)
+    settings = PresetWalk(seed=101, preset="dynamic", frames=4, start=500, size=(64, 48), write_ids=True)
     root = write_walk(tmp_path / "dynamic", settings)
     film = shot("dynamic")
     caster = Caster(film.building.world.things, settings.camera(), [m.thing for m in film.movers])
@@ -260,9 +261,9 @@ def test_a_preset_is_written_as_a_sequence_with_its_movers(tmp_path: Path) -> No
 
 def test_cuts_are_numbered_as_the_frames_are_written() -> None:
     cut = shot("kidnap").cuts[0]
-    settings = WalkSettings(seed=101, preset="kidnap", frames=6, start=cut - 3, size=(32, 32))
+    settings = PresetWalk(seed=101, preset="kidnap", frames=6, start=cut - 3, size=(32, 32))
     assert settings.cuts() == (3,)
-    assert WalkSettings(seed=101, preset="kidnap", frames=6).cuts() == ()
-    assert settings.movers() == () == WalkSettings().cuts()
+    assert PresetWalk(seed=101, preset="kidnap", frames=6).cuts() == ()
+    assert settings.movers() == () == WalkSettings().movers()
     with pytest.raises(OptionError, match="leaves nothing"):
-        WalkSettings(seed=101, preset="calm", start=5000).poses()
+        PresetWalk(seed=101, preset="calm", start=5000).poses()

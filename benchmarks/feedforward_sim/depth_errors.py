@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.feedforward_sim.runs import runs_of
-from list3r.simulation.video import SimulatedVideo
+from benchmarks.simulation.video import SimulatedVideo
 
 Floats = NDArray[np.float32]
 

@@ -28,14 +28,14 @@ from benchmarks.feedforward_sim.descriptors import FrameDescriptorSettings, fram
 from benchmarks.feedforward_sim.instances import ChunkGeometry, InstanceErrorSettings, simulate_library
 from benchmarks.feedforward_sim.mover_errors import MoverErrorSettings, mover_errors
 from benchmarks.feedforward_sim.pose_errors import PoseErrorSettings, bend, jitter, placements, sides
+from benchmarks.simulation.covisibility import seen_share
+from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import frame_samples
-from list3r.simulation.covisibility import seen_share
-from list3r.simulation.video import SimulatedVideo
 
 Floats = NDArray[np.float32]
 

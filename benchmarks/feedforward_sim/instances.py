@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from benchmarks.feedforward_sim.descriptors import FEATURE_SPACE, Appearance, EmbeddingSettings, track_feature
+from benchmarks.simulation.video import SimulatedVideo
 from list3r.memory.masks import encode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
-from list3r.simulation.video import SimulatedVideo
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]

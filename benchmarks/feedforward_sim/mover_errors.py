@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.feedforward_sim.runs import runs_of
-from list3r.simulation.video import MoverTruth, SimulatedVideo
+from benchmarks.simulation.video import MoverTruth, SimulatedVideo
 
 Floats = NDArray[np.float32]
 

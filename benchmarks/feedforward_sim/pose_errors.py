@@ -17,8 +17,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.csgraph import connected_components
 
 from benchmarks.feedforward_sim.runs import runs_of
+from benchmarks.simulation.video import SimulatedVideo
 from list3r.memory.geometry import Sim3, rotation_exp, skew
-from list3r.simulation.video import SimulatedVideo
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,11 @@ from threadpoolctl import threadpool_limits
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera
 from list3r.memory.errors import ExportError, OptionError
-from list3r.simulation.movers import Mover
-from list3r.simulation.presets import Shot, make_shot
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.worlds.changes import Change, apply_changes
-from list3r.simulation.worlds.truth import mover_truth, world_truth
+from list3r.simulation.worlds.things import MovingThing
+from list3r.simulation.worlds.truth import world_truth
 from list3r.simulation.worlds.world import World, make_world
 
 DEPTH_UNITS_PER_M = 5000.0
@@ -34,14 +31,14 @@ _BATCH = 12
 
 @dataclass(frozen=True)
 class WalkSettings:
-    """A walk through a simulated world."""
+    """A walk through two furnished rooms. Subclasses film other worlds, other ways or things that move."""
 
     seed: int = 0
     """Decides the world."""
     walk_seed: int | None = None
     """Decides the hand's motion and the noise; None takes `seed`."""
     frames: int | None = None
-    """None walks the whole round, about 280; fewer cut it short, more walk it slower. A preset is not slowed."""
+    """None walks the whole round, about 280; fewer cut it short, more walk it slower."""
     start: int = 0
     """Frames of the walk to leave out at its beginning."""
     size: tuple[int, int] = (320, 240)
@@ -50,11 +47,6 @@ class WalkSettings:
     """Focal length, px; None takes the first Kinect's 525 at 640 px."""
     path: PathSettings = field(default_factory=PathSettings)
     sensor: SensorSettings = field(default_factory=SensorSettings)
-    changes: tuple[Change, ...] = ()
-    """What has happened to the world before this walk."""
-    preset: str | None = None
-    """A building, a way through it and what moves there, by name (see `presets`); `seed` decides them and `path` is
-    left aside. None films the two rooms of `make_world`."""
     write_ids: bool = False
     """Also write `ids/`: the id of the thing in every pixel, 16 bit."""
 
@@ -73,15 +65,11 @@ class WalkSettings:
         return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     def world(self) -> World:
-        """The world after its changes."""
-        whole = make_world(self.seed) if self.preset is None else self._shot().building.world
-        return apply_changes(whole, self.changes)
+        """The world that is filmed."""
+        return make_world(self.seed)
 
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Seconds (F,) and T_world_cam (F, 4, 4) of the frames to be written."""
-        if self.preset is not None:
-            shot, span = self._shot(), self._span()
-            return shot.time_s[span], shot.T_world_cam[span]
         seed = self.seed if self.walk_seed is None else self.walk_seed
         frames = None if self.frames is None else self.frames + self.start
         time_s, poses = camera_path(self.world().tour, frames, self.path, seed)
@@ -89,33 +77,13 @@ class WalkSettings:
             raise OptionError(f"start {self.start} leaves nothing of a walk of {len(time_s)} frames")
         return time_s[self.start :], poses[self.start :]
 
-    def movers(self) -> tuple[Mover, ...]:
+    def movers(self) -> tuple[MovingThing, ...]:
         """What moves while it is filmed, with its pose in each of the frames to be written."""
-        if self.preset is None:
-            return ()
-        return tuple(replace(m, T_world_object=m.T_world_object[self._span()]) for m in self._shot().movers)
+        return ()
 
-    def cuts(self) -> tuple[int, ...]:
-        """Frames before which the camera jumps, numbered as they are written."""
-        if self.preset is None:
-            return ()
-        count = len(self.poses()[0])
-        return tuple(c - self.start for c in self._shot().cuts if 0 < c - self.start < count)
-
-    def _shot(self) -> Shot:
-        assert self.preset is not None
-        return _shot(self.preset, self.seed)
-
-    def _span(self) -> slice:
-        total = len(self._shot().time_s)
-        if total - self.start < 2:
-            raise OptionError(f"start {self.start} leaves nothing of a walk of {total} frames")
-        return slice(self.start, total if self.frames is None else min(self.start + self.frames, total))
-
-
-@lru_cache(maxsize=2)
-def _shot(preset: str, seed: int) -> Shot:
-    return make_shot(preset, seed)
+    def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
+        """The content of `truth.json`; `seen` has the counts of each thing's id, as `world_truth` takes them."""
+        return world_truth(self.world(), seen)
 
 
 def write_walk(
@@ -127,8 +95,7 @@ def write_walk(
     """Render a walk into `folder`, which is made if absent and must hold no walk yet; the same for any `workers`.
 
     Writes `rgb/`, `depth/` (16 bit, 5000 per metre), `rgb.txt`, `depth.txt`, `groundtruth.txt` (T_world_cam),
-    `calibration.txt` (fx fy cx cy) and `truth.json`, which for a preset also names its cuts and its movers with their
-    places over time. `progress` is called with the number of frames just written.
+    `calibration.txt` (fx fy cx cy) and `truth.json`. `progress` is called with the number of frames just written.
     More than one worker starts processes, which asks of a script that it guards its main part. Raises `OptionError`
     for a folder that holds a walk, `ExportError` for one that cannot be written.
     """
@@ -159,11 +126,7 @@ def _write(root: Path, settings: WalkSettings, workers: int, progress: Callable[
         if pool:
             pool.shutdown(cancel_futures=True)
     write_tum(root / "groundtruth.txt", Trajectory(time_s, poses))
-    truth = world_truth(settings.world(), seen)
-    if settings.preset is not None:
-        truth |= {"preset": settings.preset, "cuts": list(settings.cuts())}
-        truth["movers"] = [mover_truth(m.thing, m.T_world_object, seen.get(m.thing.id, {})) for m in settings.movers()]
-    (root / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    (root / "truth.json").write_text(json.dumps(settings.truth(seen), indent=1) + "\n", encoding="utf-8")
     _write_lists(root, time_s, settings.camera())
     return root
 

@@ -81,14 +81,15 @@ class Thing:
         rotation = self.rotation()
         return OrientedBox(np.array(self.position) + rotation @ ((low + high) / 2), high - low, rotation)
 
-    def part_boxes(self) -> list[OrientedBox]:
-        """The box of each part in the world."""
-        out = []
-        for part in self.parts:
-            low, high = part.extent()
-            rotation = self.rotation()
-            out.append(OrientedBox(np.array(self.position) + rotation @ ((low + high) / 2), high - low, rotation))
-        return out
+
+@dataclass(frozen=True)
+class MovingThing:
+    """A thing with a pose of its own in every frame."""
+
+    thing: Thing
+    """At the origin."""
+    T_world_object: Array
+    """Upright poses. Shape (F, 4, 4)."""
 
 
 @dataclass(frozen=True)

@@ -43,30 +43,13 @@ def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
         "structure": thing.structure is not None,
         "round": thing.is_round(),
         "box": {
-            "center": _rounded(box.center),
-            "size": _rounded(box.size),
-            "quat_wxyz": _rounded(quat_wxyz_from_rotation(box.rotation)),
+            "center": rounded(box.center),
+            "size": rounded(box.size),
+            "quat_wxyz": rounded(quat_wxyz_from_rotation(box.rotation)),
         },
         "support": thing.support,
         "container": thing.container,
         "attached": thing.attached,
-        "frames_seen": seen.get("frames", 0),
-        "largest_px": seen.get("largest_px", 0),
-    }
-
-
-def mover_truth(thing: Thing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
-    """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
-
-    `thing` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
-    """
-    yaw = np.arctan2(T_world_object[:, 1, 0], T_world_object[:, 0, 0])
-    return {
-        "id": thing.id,
-        "label": thing.label,
-        "size": _rounded(thing.box().size),
-        "position": [_rounded(p) for p in T_world_object[:, :3, 3]],
-        "yaw": _rounded(yaw),
         "frames_seen": seen.get("frames", 0),
         "largest_px": seen.get("largest_px", 0),
     }
@@ -126,5 +109,6 @@ def footprint_gap(a: OrientedBox, b: OrientedBox) -> float:
     return max(gaps)
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float]:
+def rounded(values: NDArray[np.float64]) -> list[float]:
+    """Return values to six decimals, without negative zero."""
     return [round(float(v), 6) + 0.0 for v in values]

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from benchmarks.simulation.furnisher import HERE, Furnisher
 from list3r.simulation.worlds import furniture as f
-from list3r.simulation.worlds.furnisher import HERE, Furnisher
 from list3r.simulation.worlds.layout import FABRICS
 from list3r.simulation.worlds.materials import Material
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.base import Camera
-from list3r.simulation.video import SimulatedVideo
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

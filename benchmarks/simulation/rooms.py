@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from list3r.simulation.worlds import furniture as f
-from list3r.simulation.worlds import furniture_groups as groups
-from list3r.simulation.worlds.furnisher import (
+from benchmarks.simulation import furniture_groups as groups
+from benchmarks.simulation.furnisher import (
     DOOR_HEIGHT_M,
     DOOR_WIDTH_M,
     HALF_WALL_M,
@@ -18,6 +17,7 @@ from list3r.simulation.worlds.furnisher import (
     RoomPlan,
     footprint,
 )
+from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, wall_paint
 from list3r.simulation.worlds.materials import Material
 from list3r.simulation.worlds.things import Thing

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from list3r.simulation.worlds.furnisher import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, moved
+from benchmarks.simulation.furnisher import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, moved
+from benchmarks.simulation.rooms import make_room
 from list3r.simulation.worlds.layout import Placer, Room
-from list3r.simulation.worlds.rooms import make_room
 from list3r.simulation.worlds.things import Thing
 from list3r.simulation.worlds.world import World
 

@@ -8,15 +8,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.simulation.buildings import Building, BuildingSettings, appearance_classes, make_building
+from benchmarks.simulation.casting import Caster
+from benchmarks.simulation.covisibility import shared_view
+from benchmarks.simulation.movers import make_movers
+from benchmarks.simulation.routes import Director, FreeMap, View, mapped_view
+from benchmarks.simulation.video import MoverTruth, SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
-from list3r.simulation.covisibility import shared_view
-from list3r.simulation.movers import Mover, make_movers
-from list3r.simulation.rendering.casting import Caster
-from list3r.simulation.routes import Director, FreeMap, View, mapped_view
-from list3r.simulation.video import MoverTruth, SimulatedVideo
 from list3r.simulation.walk import PathSettings, camera_path, looking_at
-from list3r.simulation.worlds.buildings import Building, BuildingSettings, appearance_classes, make_building
+from list3r.simulation.worlds.things import MovingThing
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
@@ -40,7 +41,7 @@ class Shot:
     """Shape (F, 4, 4)."""
     cuts: tuple[int, ...]
     """Frames before which the camera jumps."""
-    movers: tuple[Mover, ...] = ()
+    movers: tuple[MovingThing, ...] = ()
 
 
 @dataclass

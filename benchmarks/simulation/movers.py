@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from list3r.simulation.routes import FreeMap
+from benchmarks.simulation.buildings import Building
+from benchmarks.simulation.routes import FreeMap
 from list3r.simulation.worlds import furniture as f
-from list3r.simulation.worlds.buildings import Building
 from list3r.simulation.worlds.layout import Placer
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import MovingThing, Thing
 
 Array = NDArray[np.float64]
 
@@ -22,27 +20,17 @@ _HASTE_M_S = 1.3
 """Speed above which a person does not like to walk."""
 
 
-@dataclass(frozen=True)
-class Mover:
-    """A thing with a pose of its own in every frame."""
-
-    thing: Thing
-    """At the origin."""
-    T_world_object: Array
-    """Upright poses. Shape (F, 4, 4)."""
-
-
 def make_movers(
     building: Building, free: FreeMap, T_world_cam: Array, fps: float, rng: np.random.Generator
-) -> tuple[Mover, ...]:
+) -> tuple[MovingThing, ...]:
     """A walking person and a carton that the person carries away in the middle of the video."""
     first = max(t.id for t in building.world.things) + 1
     p = Placer(rng)
     xy, yaw = _stroll(free, T_world_cam, fps, rng)
-    person = Mover(Thing(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw))
+    person = MovingThing(Thing(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw))
     size = (float(rng.uniform(0.36, 0.46)), float(rng.uniform(0.28, 0.36)), float(rng.uniform(0.26, 0.36)))
     carton = f.carton(size, p.bright("stripes", 0.4), p.bright("plain", 0.3))
-    return person, Mover(
+    return person, MovingThing(
         Thing(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(free, T_world_cam, xy, yaw, fps, rng)
     )
 
@@ -146,10 +134,3 @@ def _views(free: FreeMap, T_world_cam: Array, xy: Array) -> int:
     across = np.abs(offset[:, 0] * T_world_cam[:, 1, 2] - offset[:, 1] * T_world_cam[:, 0, 2])
     ahead = (along > 1.6) & (across < 0.45 * along) & (away < 4.5)
     return int((ahead & ~free.crosses_wall(T_world_cam[:, :2, 3], xy[None])).sum())
-
-
-def moved_thing(mover: Mover, frame: int) -> Thing:
-    """The thing where it is in a frame."""
-    T = mover.T_world_object[frame]
-    x, y, z = (float(v) for v in T[:3, 3])
-    return replace(mover.thing, position=(x, y, z), yaw=float(np.arctan2(T[1, 0], T[0, 0])))

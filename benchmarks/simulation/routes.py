@@ -11,8 +11,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from benchmarks.simulation.buildings import Building, PlacedRoom
 from list3r.simulation.walk import PathSettings, walk_duration
-from list3r.simulation.worlds.buildings import Building, PlacedRoom
 from list3r.simulation.worlds.things import Thing, stack_solids
 from list3r.simulation.worlds.world import Stop
 
@@ -92,14 +92,6 @@ class FreeMap:
         places, clear = np.stack([x[inside], y[inside]], axis=1), self.clearance_m[inside]
         enough = clear >= least_m
         return places[enough] if enough.sum() >= 20 else places[np.argsort(-clear, kind="stable")[:100]]
-
-    def snap(self, xy: Array, least_m: float = 0.25) -> Array:
-        """The nearest places with some clearance. Shapes (N, 2) -> (N, 2)."""
-        good = np.argwhere(self._passable & (self.clearance_m >= least_m))
-        middles = (good[:, ::-1] + 0.5) * _CELL_M + self._origin
-        gap = np.linalg.norm(middles[None] - np.atleast_2d(xy)[:, None], axis=2)
-        near = middles[np.argmin(gap, axis=1)]
-        return np.where((self.clearance(np.atleast_2d(xy)) >= least_m)[:, None], np.atleast_2d(xy), near)
 
     def path(self, start: Array, goal: Array) -> Array:
         """A smooth way from one place to another, points 0.1 m apart. Shape (N, 2)."""

@@ -1,0 +1,92 @@
+"""Walks that only benchmarks film: presets, and the two rooms after changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.simulation.changes import Change, apply_changes
+from benchmarks.simulation.presets import Shot, make_shot
+from list3r.memory.errors import OptionError
+from list3r.simulation.dataset import WalkSettings
+from list3r.simulation.worlds.things import MovingThing, Thing
+from list3r.simulation.worlds.truth import rounded
+from list3r.simulation.worlds.world import World
+
+
+@dataclass(frozen=True)
+class ChangedWalk(WalkSettings):
+    """A walk through the two rooms after something happened there."""
+
+    changes: tuple[Change, ...] = ()
+
+    def world(self) -> World:
+        """The world after its changes."""
+        return apply_changes(super().world(), self.changes)
+
+
+@dataclass(frozen=True)
+class PresetWalk(WalkSettings):
+    """A building, a way through it and what moves there, by name (see `presets`).
+
+    `seed` decides them; `path` and `walk_seed` are left aside, and the walk is never slowed.
+    """
+
+    preset: str = "calm"
+
+    def world(self) -> World:
+        """The world of the building."""
+        return self._shot().building.world
+
+    def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Seconds (F,) and T_world_cam (F, 4, 4) of the frames to be written."""
+        return self._shot().time_s[self._span()], self._shot().T_world_cam[self._span()]
+
+    def movers(self) -> tuple[MovingThing, ...]:
+        """What moves while it is filmed, with its pose in each of the frames to be written."""
+        return tuple(replace(m, T_world_object=m.T_world_object[self._span()]) for m in self._shot().movers)
+
+    def cuts(self) -> tuple[int, ...]:
+        """Frames before which the camera jumps, numbered as they are written."""
+        count = len(self.poses()[0])
+        return tuple(c - self.start for c in self._shot().cuts if 0 < c - self.start < count)
+
+    def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
+        """The content of `truth.json`, with the cuts and the movers with their places over time."""
+        movers = [_mover_truth(m.thing, m.T_world_object, seen.get(m.thing.id, {})) for m in self.movers()]
+        return super().truth(seen) | {"preset": self.preset, "cuts": list(self.cuts()), "movers": movers}
+
+    def _shot(self) -> Shot:
+        return _shot(self.preset, self.seed)
+
+    def _span(self) -> slice:
+        total = len(self._shot().time_s)
+        if total - self.start < 2:
+            raise OptionError(f"start {self.start} leaves nothing of a walk of {total} frames")
+        return slice(self.start, total if self.frames is None else min(self.start + self.frames, total))
+
+
+@lru_cache(maxsize=2)
+def _shot(preset: str, seed: int) -> Shot:
+    return make_shot(preset, seed)
+
+
+def _mover_truth(thing: Thing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
+    """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
+
+    `thing` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
+    """
+    yaw = np.arctan2(T_world_object[:, 1, 0], T_world_object[:, 0, 0])
+    return {
+        "id": thing.id,
+        "label": thing.label,
+        "size": rounded(thing.box().size),
+        "position": [rounded(p) for p in T_world_object[:, :3, 3]],
+        "yaw": rounded(yaw),
+        "frames_seen": seen.get("frames", 0),
+        "largest_px": seen.get("largest_px", 0),
+    }
