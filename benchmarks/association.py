@@ -1,12 +1,22 @@
-"""The paper's ablation on simulated videos with known truth: baseline, + ILRD, + IASM, + CWGO.
+"""Association on simulated videos with known truth: VGGT-Long's way, the paper's steps, and ours, one row each.
 
 python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FILE [--plot FILE]
+python benchmarks/association.py --quick --json FILE        # two presets, two seeds, all rows: about ten minutes
 
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
-model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). `baseline` is the
-split-and-fuse way of VGGT-Long: support by confidence alone, adjacent edges, loops by frame similarity of 0.85 without
-verification, plain least squares. Each variant adds to the one before, CWGO the nodes within chunks too; `iasm-only` is
-the baseline with instance-aware support alone.
+model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video,
+chunks, descriptors and joint windows, and chunks end at cuts in all of them but the first:
+
+- vggt-long: as published, `benchmarks/peers/vggt_long.py`, which detects no cuts;
+- vggt-long-cuts: the same on chunks that end at cuts;
+- ilrd-paper: loops accepted by s_loop alone, as the paper writes it;
+- verified: loops proposed by frame similarity and verified by geometry, no instance anywhere;
+- ilrd: + instances rank candidates and object to relations;
+- iasm: + instance-aware support;
+- cwgo-paper: iasm with the paper's weights of edges in the graph;
+- graph: iasm with covariances as weights and loops that can be switched off;
+- full: + nodes within chunks, what builds use;
+- full-no-instances: full with all instance evidence off: what instances are worth is the difference of the two.
 """
 
 from __future__ import annotations
@@ -27,15 +37,20 @@ from machine import machine, write_json
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-VARIANTS = ("baseline", "ilrd", "iasm", "cwgo")
 PRESETS = ("calm", "loop", "kidnap", "dynamic", "twins", "sparse", "corridor")
 TITLES = {
-    "baseline": "baseline",
-    "ilrd": "+ ILRD",
-    "iasm": "+ IASM",
-    "cwgo": "+ CWGO (full)",
-    "iasm-only": "baseline + IASM alone",
+    "vggt-long": "VGGT-Long as published",
+    "vggt-long-cuts": "VGGT-Long, cuts given",
+    "ilrd-paper": "loops by s_loop alone (paper)",
+    "verified": "verified loops, no instances",
+    "ilrd": "+ instances in loops (ILRD)",
+    "iasm": "+ instance-aware support (IASM)",
+    "cwgo-paper": "IASM, the paper's weights",
+    "graph": "+ covariances, robust (CWGO)",
+    "full": "+ nodes within chunks (full)",
+    "full-no-instances": "full, instances off",
 }
+VARIANTS = tuple(TITLES)
 FALSE_M = 0.5
 """A loop whose relation puts a camera further off than this is false; chunks bend by a few centimetres."""
 SHOWN = ("ate_sim3_m", "rte_m", "rre_deg", "completeness_cm", "chamfer_cm", "f_at_5cm", "false_loops", "worst_loop_m")
@@ -47,24 +62,29 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2,3,4,5,6,7,8")
     parser.add_argument("--variants", default=",".join(VARIANTS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--quick", action="store_true", help="presets kidnap and twins, seeds 1 and 2")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path, help="picture of the table: ATE of every seed by preset and variant")
     words = parser.parse_args()
+    if words.quick:
+        words.presets, words.seeds = "kidnap,twins", "1,2"
     presets, variants = words.presets.split(","), words.variants.split(",")
     for given, known in ((presets, PRESETS), (variants, TITLES)):
         if unknown := sorted(set(given) - set(known)):
             parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(known)}")
-    jobs = [(preset, int(seed), tuple(variants)) for preset in presets for seed in words.seeds.split(",")]
+    jobs = [(preset, int(seed), tuple(variants)) for seed in words.seeds.split(",") for preset in presets]
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(words.workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
         for done in pool.map(run_video, jobs):
             rows += done
             ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
             print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
+            shown = [{key: value for key, value in row.items() if key != "judgement"} for row in rows]
+            write_json(words.json, {"unfinished": True, "runs": shown})
     judgements = [(r["preset"], r["variant"], r.pop("judgement")) for r in rows]
     summary = summarise(rows, presets, variants)
     print_tables(summary, presets, variants)
-    revisits = revisit_table(judgements, presets, variants[-1])
+    revisits = revisit_table(judgements, presets, "full" if "full" in variants else variants[-1])
     print(machine())
     write_json(words.json, {"summary": summary, "revisits": revisits, "runs": rows})
     if words.plot is not None:
@@ -92,7 +112,7 @@ def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
     chunks: dict[Any, Any] = {}
     rows = []
     for variant in variants:
-        spans = plan_chunks(len(video.time_s), ChunkSettings(), () if variant in ("baseline", "iasm-only") else cuts)
+        spans = plan_chunks(len(video.time_s), ChunkSettings(), () if variant == "vggt-long" else cuts)
         for span in spans:
             if span not in chunks:
                 chunks[span] = model.chunk(span)
@@ -104,22 +124,36 @@ def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
 
 
 def variant_settings(variant: str) -> Any:
-    """The product's settings with the parts that a variant lacks switched to the baseline's way."""
+    """Return the product's settings with the parts that a variant lacks switched off."""
     from list3r.pipeline.mapping import AssociationSettings
 
     full = AssociationSettings()
     plain_edges = replace(full.edges, instance_aware=False)
-    plain_windows = replace(full.revisits.window, edges=plain_edges)
-    plain_loops = replace(full.revisits, instance_cues=False, verified=False)
     plain_graph = replace(full.graph, weighted=False, robust=False)
-    step = {"baseline": 0, "iasm-only": 0, "ilrd": 1, "iasm": 2, "cwgo": 3}[variant]
-    aware = step >= 2 or variant == "iasm-only"
-    loops = full.revisits if step >= 1 else plain_loops
+    paper_weights = replace(full.graph, robust=False, weights=replace(full.graph.weights, sharpen=True))
+    blind = variant in ("verified", "full-no-instances")
+    loops = _without_instances(full.revisits) if blind else full.revisits
+    if variant == "ilrd-paper":
+        loops = replace(loops, verified=False)
+    aware = variant in ("iasm", "cwgo-paper", "graph", "full")
+    graph = {"cwgo-paper": paper_weights}.get(variant, plain_graph)
     return AssociationSettings(
-        revisits=loops if aware else replace(loops, window=plain_windows),
+        revisits=loops if aware else replace(loops, window=replace(loops.window, edges=plain_edges)),
         edges=full.edges if aware else plain_edges,
-        graph=full.graph if step >= 3 else plain_graph,
-        nodes=full.nodes if step >= 3 else replace(full.nodes, enabled=False),
+        graph=full.graph if variant in ("graph", "full", "full-no-instances") else graph,
+        nodes=full.nodes if variant.startswith("full") else replace(full.nodes, enabled=False),
+    )
+
+
+def _without_instances(revisits: Any) -> Any:
+    """Return settings under which as many candidates are verified, ranked by frame similarity alone."""
+    cross = replace(revisits.window.cross, least_kinds=10**6)
+    return replace(
+        revisits,
+        lambda_=1.0,
+        least_score=0.0,
+        layout_pairs=10**6,
+        window=replace(revisits.window, cross=cross),
     )
 
 
@@ -131,21 +165,45 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth)
     from list3r.pipeline.mapping import add_chunk, finish_session
 
     settings = variant_settings(variant)
+    peer = variant.startswith("vggt-long")
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:
         with store.transaction():
             store.set_value("scale_kind", "relative")
             store.set_value("gravity", "unknown")
             store.set_value("poses", "estimate")
             session = store.add_session("simulation", "", {}, truth.frames)
-        for result in results:
+        if peer:
+            _place_as_vggt_long(store, session, results, model)
+        for result in () if peer else results:
             chunk = result
             if settings.edges.instance_aware:
                 height, width = result.image_size
                 camera = Camera(width, height, *result.intrinsics)
                 chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
             add_chunk(store, session, chunk, model, settings, library=False)
-        finish_session(store, session, settings, library=False)
+        if not peer:
+            finish_session(store, session, settings, library=False)
         return truth.measure(store)
+
+
+def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], model: Any) -> None:
+    """Store the chunks where VGGT-Long places them, with its loops as edges."""
+    from benchmarks.peers.vggt_long import place
+    from list3r.memory.records import Edge
+
+    placed, loops, _ = place(results, model.descriptors, model)
+    with store.transaction():
+        ids = [store.add_chunk(session, result) for result in results]
+        edges = []
+        for loop in loops:
+            w = loop.window
+            ends = ((ids[w.chunk_b], w.frames_b), (ids[w.chunk_a], w.frames_a))
+            (u, frames_u), (v, frames_v) = ends  # the later chunk of a loop is a
+            middles = (sum(frames_u) // 2, sum(frames_v) // 2)
+            S_v_u = loop.S_b_a.inverse()
+            edges.append(Edge(u, v, "loop", S_v_u, 1.0, 1.0, 0, 0.0, True, "as VGGT-Long", {"s_det": 1.0}, middles))
+        store.add_edges(edges)
+        store.place_chunks(dict(zip(ids, placed, strict=True)), dict.fromkeys(ids, ids[0]), {})
 
 
 class _Truth:
@@ -311,11 +369,11 @@ def print_tables(summary: dict[str, Any], presets: Sequence[str], variants: Sequ
     """The ablation table of each preset."""
     for preset in presets:
         print(f"\n{preset}: mean (standard deviation) over the seeds")
-        print(f"{'':24}" + "".join(f"{key:>20}" for key in SHOWN) + f"{'ATE ratio':>12}")
+        print(f"{'':32}" + "".join(f"{key:>20}" for key in SHOWN) + f"{'ATE ratio':>12}")
         for variant in variants:
             entry = summary[preset][variant]
             cells = "".join(f"{entry[k]['mean']:12.3f} ({entry[k]['std']:.3f})" for k in SHOWN)
-            print(f"{TITLES[variant]:24}{cells}{entry['ate_ratio']:12.3f}")
+            print(f"{TITLES[variant]:32}{cells}{entry['ate_ratio']:12.3f}")
 
 
 def revisit_table(

@@ -73,7 +73,25 @@ def _resident(pid: int) -> float:
     return sum(float(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:"))
 
 
+def commit() -> str:
+    """Return the commit of the code that runs, with "+" where files differ from it; "unknown" outside a checkout."""
+    here = Path(__file__).parent
+    try:
+        said = [
+            subprocess.run(["git", "-C", str(here), *words], capture_output=True, text=True, check=True).stdout.strip()
+            for words in (("rev-parse", "--short=10", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        ]
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return said[0] + ("+" if said[1] else "")
+
+
+STARTED_AT = commit()
+"""The code may change while a long benchmark runs; what was loaded is what was there at the start."""
+
+
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Write a result beside the machine it was measured on."""
+    """Write a result beside the machine and the commit that it was measured on."""
     if path is not None:
-        path.write_text(json.dumps({"machine": machine(), **result}, indent=2) + "\n", encoding="utf-8")
+        told = {"machine": machine(), "commit": STARTED_AT, **result}
+        path.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
