@@ -16,6 +16,7 @@ from list3r.association.revisits.search import find_loops
 from list3r.association.revisits.verification import verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
+from list3r.memory.store.derived import Derived
 from list3r.memory.store.tables.chunks import LocalNode
 from list3r.reconstruction.features.local import FeatureSettings, match, relative_pose
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
@@ -33,6 +34,7 @@ class Chunks:
         self, done: list[tuple[Keyframe, ...]], scale_kind: str = "metric", known: Sequence[Edge] = ()
     ) -> None:
         self.done, self.scale_kind, self.known = done, scale_kind, known
+        self.derived = Derived()
 
     def chunks(self, session_id: int | None = None) -> list[ChunkRow]:
         place = (1.0, 1.0, 0.0, 0.0)

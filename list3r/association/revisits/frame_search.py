@@ -7,14 +7,14 @@ rows; FAISS' flat index 0.5 s, an inverted file 0.03 s but trained anew, and dif
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.records import ChunkRow
+from list3r.memory.store.derived import Derived
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -80,6 +80,9 @@ class Candidate:
 class DescriptorStore(Protocol):
     """What of the memory is read here."""
 
+    derived: Derived
+    """Where the index is kept."""
+
     def chunks(self, session_id: int | None = None) -> list[ChunkRow]: ...
 
     def chunk_checksums(self) -> dict[int, int]: ...
@@ -112,14 +115,17 @@ class FrameIndex:
 
 
 @dataclass
-class _Known:
-    """What has been read of a store."""
+class FrameIndices:
+    """The indices of an open store."""
 
-    checksums: dict[int, int]
-    by_length: dict[int, FrameIndex]
+    checksums: dict[int, int] = field(default_factory=dict)
+    """Of the chunks that were read, by chunk id."""
+    by_length: dict[int, FrameIndex] = field(default_factory=dict)
 
-
-_known: WeakKeyDictionary[DescriptorStore, _Known] = WeakKeyDictionary()
+    def clear(self) -> None:
+        """Forget what was read."""
+        self.checksums.clear()
+        self.by_length.clear()
 
 
 def find_candidates(store: DescriptorStore, chunk_id: int, settings: SearchSettings | None = None) -> list[Candidate]:
@@ -183,13 +189,13 @@ def _is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bo
     )
 
 
-def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> _Known:
+def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> FrameIndices:
     """The index with all of the given chunks in it, read anew where a chunk is no longer the one that was read."""
     wanted = set(chunk_ids)
     checksums = {k: c for k, c in store.chunk_checksums().items() if k in wanted}
-    known = _known.get(store)
-    if known is None or any(known.checksums[k] != checksums.get(k) for k in known.checksums):
-        known = _known[store] = _Known({}, {})
+    known = store.derived.of(FrameIndices)
+    if any(known.checksums[k] != checksums.get(k) for k in known.checksums):
+        known.clear()
     missing = [k for k in sorted(checksums) if k not in known.checksums]
     for chunk_id in missing:
         keys, descriptors = _descriptors(store, [chunk_id])

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +17,19 @@ from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.summaries import cameras_of
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChunkRow
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 _KEPT = 400
 """Things that are kept; more are derived again when they are asked for, so that memory does not grow with chunks."""
-_derived: WeakKeyDictionary[Store, OrderedDict[tuple[object, ...], Thing]] = WeakKeyDictionary()
-measured_before: WeakKeyDictionary[Store, dict[tuple[object, ...], object]] = WeakKeyDictionary()
-"""What was measured between things when relations were last looked at, see `relation_scene.Measured`."""
-_stamps = itertools.count(1)
+
+
+class InstanceCache(LruCache[tuple[object, ...], Thing]):
+    """Instances as they were derived from their members."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT)
+        self.stamps = itertools.count(1)
 
 
 def thing_of(
@@ -51,20 +54,18 @@ def thing_of(
     poses = tuple((store.node_checksum(k), chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
     cuts = b"".join(np.packbits(m.dropped[slice(*m.span)]).tobytes() for m in members)
     key: tuple[object, ...] = (instance_id, component, upright, tuple(group), tuple(shown_by), poses, cuts, mover)
-    kept = _derived.setdefault(store, OrderedDict())
-    if key not in kept:
-        if mover is None:
-            thing = derive_thing(instance_id, members, component, upright=upright, settings=s.derive)
-        else:
-            last = [m for m, k in zip(members, group, strict=True) if k in mover.last]
-            thing = derive_mover(
-                instance_id, members, last, component, resting=mover.resting, upright=upright, settings=s.derive
-            )
-        kept[key] = replace(thing, body=replace(thing.body, stamp=next(_stamps)))
-    kept.move_to_end(key)
-    while len(kept) > _KEPT:
-        kept.popitem(last=False)
-    return kept[key]
+    kept = store.derived.of(InstanceCache)
+    found = kept.get(key)
+    if found is not None:
+        return found
+    if mover is None:
+        thing = derive_thing(instance_id, members, component, upright=upright, settings=s.derive)
+    else:
+        last = [m for m, k in zip(members, group, strict=True) if k in mover.last]
+        thing = derive_mover(
+            instance_id, members, last, component, resting=mover.resting, upright=upright, settings=s.derive
+        )
+    return kept.put(key, replace(thing, body=replace(thing.body, stamp=next(kept.stamps))))
 
 
 def eye_level(store: Store, chunks: Sequence[ChunkRow]) -> float:

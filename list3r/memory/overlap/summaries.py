@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +13,7 @@ from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.planes import Planes, chunk_planes
 from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes
 from list3r.memory.records import ChunkRow, MotionTrack
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 ROOM_DEPTH_M = 2.0
@@ -46,35 +45,6 @@ _KEPT_BYTES = 48 << 20
 with chunks. Of a chunk with 12 things it takes 0.2 MB, of one with 50 a megabyte."""
 _SAMPLED = 64
 """Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
-_cache: WeakKeyDictionary[Store, _Kept] = WeakKeyDictionary()
-
-
-class _Kept:
-    """Summaries that were asked for last."""
-
-    def __init__(self) -> None:
-        self._rows: OrderedDict[int, tuple[int, int, ChunkSummary]] = OrderedDict()
-        self._bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def get(self, chunk_id: int, checksum: int) -> ChunkSummary | None:
-        """The summary of a chunk, where it is kept and the chunk is still the same."""
-        found = self._rows.get(chunk_id)
-        if found is None or found[0] != checksum:
-            return None
-        self._rows.move_to_end(chunk_id)
-        return found[2]
-
-    def put(self, chunk_id: int, checksum: int, summary: ChunkSummary) -> None:
-        """Keep one, and let go of what was not asked for longest."""
-        self._bytes -= self._rows.pop(chunk_id, (0, 0, summary))[1]
-        size = _bytes_of(summary)
-        self._rows[chunk_id] = (checksum, size, summary)
-        self._bytes += size
-        while self._bytes > _KEPT_BYTES and len(self._rows) > 1:
-            self._bytes -= self._rows.popitem(last=False)[1][1]
 
 
 def _bytes_of(summary: ChunkSummary) -> int:
@@ -83,6 +53,13 @@ def _bytes_of(summary: ChunkSummary) -> int:
     for value in (*vars(summary.shapes).values(), *vars(summary.planes).values()):
         parts += value if isinstance(value, tuple) else [value]
     return sum(p.nbytes + 100 for p in parts if isinstance(p, np.ndarray))
+
+
+class SummaryCache(LruCache[tuple[int, int], ChunkSummary]):
+    """Summaries by chunk id and checksum of what the chunk measured."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, _bytes_of)
 
 
 class Summaries(Mapping[int, ChunkSummary]):
@@ -95,17 +72,15 @@ class Summaries(Mapping[int, ChunkSummary]):
         self._store = store
         self._settings = settings
         self._ids = [c.chunk_id for c in store.chunks()]
-        self._known = _cache.setdefault(store, _Kept())
+        self._known = store.derived.of(SummaryCache)
         self._checked: dict[int, int] = {}
 
     def __getitem__(self, chunk_id: int) -> ChunkSummary:
         if chunk_id not in self._checked:
             self._checked[chunk_id] = self._store.node_checksum(chunk_id)
-        found = self._known.get(chunk_id, self._checked[chunk_id])
-        if found is None:
-            found = _summary(self._store, self._store.chunk(chunk_id), self._settings)
-            self._known.put(chunk_id, self._checked[chunk_id], found)
-        return found
+        key = chunk_id, self._checked[chunk_id]
+        found = self._known.get(key)
+        return found or self._known.put(key, _summary(self._store, self._store.chunk(chunk_id), self._settings))
 
     @property
     def metre(self) -> float | None:

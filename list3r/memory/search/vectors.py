@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +27,14 @@ _RANKED = 64
 _REBUILD = 0.1
 """Share of the vectors that may have changed before the index is built anew."""
 
-_indices: WeakKeyDictionary[Store, dict[str, VectorIndex]] = WeakKeyDictionary()
-_spaces: WeakKeyDictionary[Store, tuple[int, list[str]]] = WeakKeyDictionary()
+
+class VectorIndices:
+    """What is kept of an open store: the index of each space, and the spaces that it holds."""
+
+    def __init__(self) -> None:
+        self.of_space: dict[str, VectorIndex] = {}
+        self.spaces: tuple[int, list[str]] | None = None
+        """State of the file as other processes left it, and the spaces then."""
 
 
 @dataclass
@@ -66,7 +71,7 @@ class VectorIndex:
         """
         chosen = _chosen_space(store, space)
         stamp = store.state_stamp()
-        held = _indices.setdefault(store, {})
+        held = store.derived.of(VectorIndices).of_space
         found = held.get(chosen)
         if found is None or found._made_of != stamp[0] or not found._caught_up(store, stamp):
             held.pop(chosen, None)
@@ -152,10 +157,10 @@ def _first(
 
 
 def _chosen_space(store: Store, space: str | None) -> str:
-    made_of = store.state_stamp()[0]
-    if store not in _spaces or _spaces[store][0] != made_of or store.spaces_touched - set(_spaces[store][1]):
-        _spaces[store] = (made_of, store.embedding_spaces())
-    spaces = _spaces[store][1]
+    made_of, kept = store.state_stamp()[0], store.derived.of(VectorIndices)
+    if kept.spaces is None or kept.spaces[0] != made_of or store.spaces_touched - set(kept.spaces[1]):
+        kept.spaces = (made_of, store.embedding_spaces())
+    spaces = kept.spaces[1]
     if space is None:
         if len(spaces) != 1:
             held = f"several embedding spaces ({', '.join(spaces)}); name one" if spaces else "no embeddings"

@@ -14,6 +14,7 @@ from typing import Any, Self
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.checksums import Sums
 from list3r.memory.store.codec import checksum, from_json, to_json
+from list3r.memory.store.derived import Derived
 from list3r.memory.store.file import (
     connected,
     explained,
@@ -44,6 +45,7 @@ class Connection:
         self._checks = ReadChecks(database) if _size(database) <= WHOLE_BYTES else None
         self._writing = False
         self._guard = threading.RLock()
+        self.derived = Derived()
         self.rollbacks = 0
         """How often something written was taken back: an id may then stand for something else."""
         self.unsettled = 0

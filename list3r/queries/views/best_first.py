@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,12 @@ _MOST = 300
 _AMPLE = 1.25
 """The first surroundings reach this much further than the k-th nearest of late: most questions are answered in one."""
 
-_reached: WeakKeyDictionary[Store, float] = WeakKeyDictionary()
-"""How far the k-th nearest lay, over the last questions."""
+
+class UsualReach:
+    """How far the k-th nearest lay, over the last questions to an open store."""
+
+    def __init__(self) -> None:
+        self.reach: float | None = None
 
 
 def nearest_first(
@@ -46,7 +49,8 @@ def nearest_first(
     touch += STRAY * float(np.linalg.norm(bounds[1] - bounds[0]))
     whole = float(np.linalg.norm(np.maximum(np.abs(bounds - aabb[0]), np.abs(bounds - aabb[1])).max(axis=0))) + 1.0
     farthest = whole if limit is None else min(limit + touch, whole)
-    usual = _reached.get(store)
+    kept = store.derived.of(UsualReach)
+    usual = kept.reach
     reach = min(_spacing(store, bounds, k) if usual is None else _AMPLE * usual, farthest)
     measured: dict[int, tuple[float, Instance] | None] = {}
     shrinking = 4
@@ -69,7 +73,7 @@ def nearest_first(
         worst = best[k - 1][0] + touch if len(best) >= k else np.inf
         if worst <= reach or reach >= farthest:
             if len(best) >= k:
-                _reached[store] = 0.5 * (worst if usual is None else usual) + 0.5 * max(worst, 1e-6)
+                kept.reach = 0.5 * (worst if usual is None else usual) + 0.5 * max(worst, 1e-6)
             return [(d, i) for d, i in best[:k] if limit is None or d <= limit]
         reach = min(worst if np.isfinite(worst) else 2.0 * reach, farthest)
 

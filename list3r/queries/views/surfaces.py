@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from list3r.memory.records import Instance
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 _MAX_POINTS = 4000
@@ -56,25 +55,19 @@ class Surface:
         return float(np.median(np.asarray(self.tree.query(sample, k=2)[0])[:, 1]))
 
 
-_kept: WeakKeyDictionary[Store, OrderedDict[int, tuple[bytes, Surface]]] = WeakKeyDictionary()
-_kept_points: WeakKeyDictionary[Store, int] = WeakKeyDictionary()
+class SurfaceCache(LruCache[tuple[int, bytes], Surface]):
+    """Surfaces by instance id and what tells that the instance is as it was."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_POINTS, lambda surface: surface.weight)
 
 
 def surface_of(store: Store, instance: Instance) -> Surface:
     """The surface of an instance: its support, or its box where it has none."""
-    known = _kept.setdefault(store, OrderedDict())
+    known = store.derived.of(SurfaceCache)
     stamp = instance.aabb.tobytes() + instance.center.tobytes() + instance.observations.to_bytes(8, "little")
-    if instance.id in known:
-        if known[instance.id][0] == stamp:
-            known.move_to_end(instance.id)
-            return known[instance.id][1]
-        _kept_points[store] -= known.pop(instance.id)[1].weight
-    surface = _surface(store, instance)
-    known[instance.id] = (stamp, surface)
-    _kept_points[store] = _kept_points.get(store, 0) + surface.weight
-    while _kept_points[store] > _KEPT_POINTS and len(known) > 1:
-        _kept_points[store] -= known.popitem(last=False)[1][1].weight
-    return surface
+    key = instance.id, stamp
+    return known.get(key) or known.put(key, _surface(store, instance))
 
 
 def surface_points(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
