@@ -256,7 +256,8 @@ def test_little_is_kept_between_chunks_and_what_is_not_is_read_again(
     monkeypatch.setattr(library_things, "_KEPT", 20)
     for index, place in enumerate((0, 1, 2, 3, 1)):
         add(store, visit(walks, index, place))
-        assert len(summaries._cache[store]) == 1 and len(library_things._derived[store]) <= 20
+        assert len(store.derived.of(summaries.SummaryCache)) == 1
+        assert len(store.derived.of(library_things.InstanceCache)) <= 20
     check(store)
 
 

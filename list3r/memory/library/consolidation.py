@@ -20,7 +20,7 @@ from list3r.memory.library.derivation import Thing, with_agreement
 from list3r.memory.library.evidence import Evidence, contested, weigh, without_missed
 from list3r.memory.library.growth import grow
 from list3r.memory.library.identities import Identities, assign_ids
-from list3r.memory.library.instances import eye_level, measured_before, thing_of
+from list3r.memory.library.instances import eye_level, thing_of
 from list3r.memory.library.rows import log_decisions, moved, pack_scores, record_of, unpack_scores
 from list3r.memory.library.rules import (
     ConsolidationReport,
@@ -314,12 +314,12 @@ def _with_structure(
 
 def _relations(store: Store, things: Sequence[Thing], s: ConsolidationSettings, world: World) -> list[Relation]:
     out: list[Relation] = []
-    cache = Measured(measured_before.get(store, {}))
+    measured = store.derived.of(Measured)
+    measured.begin()
     for component in sorted({t.body.component for t in things}):
         bodies = [t.body for t in things if t.body.component == component and t.resting]
         vertical = world.upright and component == world.first
-        out += relations(bodies, gravity_known=vertical, unit=world.unit, settings=s.relations, measured=cache)
-    measured_before[store] = cache.used
+        out += relations(bodies, gravity_known=vertical, unit=world.unit, settings=s.relations, measured=measured)
     return out
 
 

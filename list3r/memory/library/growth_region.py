@@ -4,10 +4,8 @@ is enough).
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, pair_s
 from list3r.memory.overlap.summaries import Summaries
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import MergeDecision, MotionTrack
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.library import SettledRow
 
@@ -44,7 +43,11 @@ class _Pair:
     links: Links
 
 
-_pairs_before: WeakKeyDictionary[Store, OrderedDict[tuple[int, int], _Pair]] = WeakKeyDictionary()
+class PairCache(LruCache[tuple[int, int], _Pair]):
+    """Pairs of chunks by their ids."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT)
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,7 @@ class Region:
 
     def _pair(self, pair: tuple[int, int]) -> _Pair:
         """What is known of a pair, from the chunks before where that still holds."""
-        kept = _pairs_before.setdefault(self._store, OrderedDict())
+        kept = self._store.derived.of(PairCache)
         rows, stamp = (self._rows[pair[0]], self._rows[pair[1]]), self._world.stamp
         found = kept.get(pair)
         if found is None or any(a is not b for a, b in zip(found.rows, rows, strict=True)) or found.stamp != stamp:
@@ -155,10 +158,7 @@ class Region:
             graph = {k: self._rows[k].S_graph_chunk for k in pair}
             scores = across_sessions(known, shapes, graph, self._seen_through, self._s.changes)[pair]
             u, v = (self._nodes_of(k) for k in pair)
-            found = kept[pair] = _Pair(rows, stamp, scores, links_of(u, v, scores, self._s.merging))
-        kept.move_to_end(pair)
-        while len(kept) > _KEPT:
-            kept.popitem(last=False)
+            found = kept.put(pair, _Pair(rows, stamp, scores, links_of(u, v, scores, self._s.merging)))
         return found
 
     def _numbered(self, chunks: Iterable[int]) -> Numbering:

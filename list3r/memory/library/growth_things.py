@@ -12,7 +12,7 @@ from list3r.memory.library.derivation import Thing, with_agreement
 from list3r.memory.library.growth_evidence import Weighed, Weighing
 from list3r.memory.library.growth_region import Group, Occasion
 from list3r.memory.library.identities import Identities
-from list3r.memory.library.instances import eye_level, measured_before, thing_of
+from list3r.memory.library.instances import eye_level, thing_of
 from list3r.memory.library.rows import moved, record_of
 from list3r.memory.library.uncertainty import position_sigma
 from list3r.memory.records import Observation
@@ -199,15 +199,15 @@ class Writing(Weighing):
                 for n in self._near(b.aabb, reach)
             } - scene
             scene |= ring
-        cache = Measured(measured_before.get(self._store, {}))
+        measured = self._store.derived.of(Measured)
+        measured.begin()
         found = []
         there = [b for b in self._stored(scene) if self._states[b.id] != "removed"]
         bodies = [b for b in there if self._things[b.id].resting]
         for component in sorted({b.component for b in bodies}):
             inside = [b for b in bodies if b.component == component]
             vertical = self._world.upright and component == self._world.first
-            found += relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=cache)
-        measured_before[self._store] = cache.used
+            found += relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=measured)
         self._store.replace_relations(
             sorted(subjects), [r for r in found if r.subject in subjects or r.object in subjects]
         )

@@ -74,18 +74,22 @@ class RelationSettings:
 class Measured:
     """What was measured between pairs of bodies before, by their stamps: a run computes only what is new."""
 
-    def __init__(self, known: dict[tuple[object, ...], object] | None = None) -> None:
-        self._known = known or {}
-        self.used: dict[tuple[object, ...], object] = {}
+    def __init__(self) -> None:
+        self._before: dict[tuple[object, ...], object] = {}
+        self._used: dict[tuple[object, ...], object] = {}
+
+    def begin(self) -> None:
+        """Begin a run: what the last one did not ask for is forgotten."""
+        self._before, self._used = self._used, {}
 
     def get(self, what: str, a: Body, b: Body, compute: Callable[[], T]) -> T:
         """The measure `what` of a and b, computed if it is new."""
         if not (a.stamp and b.stamp):
             return compute()
         key = (what, a.stamp, b.stamp, a.structure, b.structure)
-        if key not in self.used:
-            self.used[key] = self._known[key] if key in self._known else compute()
-        return cast(T, self.used[key])
+        if key not in self._used:
+            self._used[key] = self._before[key] if key in self._before else compute()
+        return cast(T, self._used[key])
 
 
 Found = tuple[int, int, float, float]
