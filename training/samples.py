@@ -1,0 +1,126 @@
+"""Chunks to learn from: the fused views of a filmed world, with the true thing of every pixel, kept on disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.instances.cloud import Cloud, build_cloud
+from list3r.instances.fusion import View
+from list3r.instances.settings import InstanceSettings
+from list3r.instances.views import ChunkViews
+from training.worlds.film import Film, FilmSettings, Truth, frames_of, make_film, reconstruction_of
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One chunk of a filmed world."""
+
+    seed: int
+    sensor: str
+    views: tuple[View, ...]
+    """The fused anchor views."""
+    ids: tuple[NDArray[np.int32], ...]
+    """True thing of each pixel of each view, 0 for none. Shape (h, w) each."""
+    T_chunk_cam: NDArray[np.float64]
+    """Poses of all frames. Shape (F, 4, 4)."""
+    things: tuple[Truth, ...]
+    up: NDArray[np.float64]
+    """True upward direction in the chunk. Shape (3,)."""
+    computed: bool
+    """True where depth was computed, not read by a sensor."""
+
+    def cloud(self, voxel_m: float = 0.01) -> Cloud:
+        """Return the chunk's cloud."""
+        return build_cloud(self.views, voxel_m)
+
+    def truth_of(self, cloud: Cloud) -> NDArray[np.int32]:
+        """Return the true thing of each voxel, that of most of its pixels. Shape (N,)."""
+        return voxel_truth(cloud, self.ids)
+
+
+def voxel_truth(cloud: Cloud, ids: tuple[NDArray[np.int32], ...]) -> NDArray[np.int32]:
+    """Return the id that most pixels of each voxel have. Shape (N,)."""
+    voxel = np.concatenate([index[index >= 0] for index in cloud.index])
+    thing = np.concatenate([image[index >= 0] for image, index in zip(ids, cloud.index, strict=True)])
+    codes, count = np.unique(voxel.astype(np.int64) << 16 | thing, return_counts=True)
+    order = np.lexsort((count, codes >> 16))
+    out = np.zeros(len(cloud.keys), np.int32)
+    out[codes[order] >> 16] = codes[order] & 0xFFFF
+    return out
+
+
+def sample_of(film: Film, seed: int) -> Sample:
+    """Return the chunk of a film as discovery would see it."""
+    reconstruction = reconstruction_of(film, seed=seed)
+    views = ChunkViews(frames_of(film), reconstruction, InstanceSettings())
+    shown = tuple(views.view(p) for p in views.anchors)
+    ids = tuple(film.ids[p][:: views.stride, :: views.stride].astype(np.int32) for p in views.anchors)
+    poses = reconstruction.T_chunk_cam
+    up = poses[0, :3, :3] @ film.T_world_cam[0, :3, :3].T @ np.array([0.0, 0.0, 1.0])
+    return Sample(seed, film.sensor, shown, ids, poses, film.things, up, reconstruction.depth_noise is not None)
+
+
+def make_sample(seed: int, folder: Path, *, held_out: bool = False, sensor: str | None = None) -> Path:
+    """Make the chunk of a seed and write it, unless it is there already; return its file."""
+    path = folder / f"{'test' if held_out else 'train'}-{seed:06d}.npz"
+    if not path.exists():
+        sample = sample_of(make_film(FilmSettings(seed, held_out=held_out, sensor=sensor)), seed)
+        write_sample(path, sample)
+    return path
+
+
+def write_sample(path: Path, sample: Sample) -> None:
+    """Write a chunk; a file is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    head = {
+        "seed": sample.seed,
+        "sensor": sample.sensor,
+        "computed": sample.computed,
+        "up": sample.up.tolist(),
+        "camera": asdict(sample.views[0].camera),
+        "positions": [v.position for v in sample.views],
+        "things": [asdict(t) for t in sample.things],
+    }
+    new = path.with_suffix(".new.npz")
+    np.savez(
+        new,
+        head=np.frombuffer(json.dumps(head).encode(), np.uint8),
+        poses=sample.T_chunk_cam,
+        view_poses=np.stack([v.T_chunk_cam for v in sample.views]),
+        depth=np.stack([v.depth for v in sample.views]),
+        sigma=np.stack([v.sigma for v in sample.views]).astype(np.float16),
+        reading=np.stack([v.reading for v in sample.views]).astype(np.float16),
+        confirmed=np.stack([v.confirmed for v in sample.views]),
+        normals=np.stack([v.normals for v in sample.views]).astype(np.float16),
+        rgb=np.stack([v.rgb for v in sample.views]),
+        ids=np.stack(sample.ids).astype(np.uint16),
+    )
+    new.replace(path)
+
+
+def read_sample(path: Path) -> Sample:
+    """Return a chunk that was written."""
+    from list3r.reconstruction.base import backproject
+
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    head = json.loads(bytes(arrays["head"]).decode())
+    camera = Camera(**{**head["camera"], "distortion": tuple(head["camera"]["distortion"])})
+    views = []
+    for k, position in enumerate(head["positions"]):
+        T, depth = arrays["view_poses"][k], arrays["depth"][k]
+        points = backproject(depth, camera) @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+        sigma, reading, normals = (arrays[n][k].astype(np.float32) for n in ("sigma", "reading", "normals"))
+        views.append(
+            View(position, T, camera, depth, sigma, reading, arrays["confirmed"][k], points, normals, arrays["rgb"][k])
+        )
+    ids = tuple(image.astype(np.int32) for image in arrays["ids"])
+    things = tuple(Truth(**t) for t in head["things"])
+    up = np.array(head["up"])
+    return Sample(head["seed"], head["sensor"], tuple(views), ids, arrays["poses"], things, up, head["computed"])

@@ -1,0 +1,167 @@
+"""A walk through a world: poses of a hand-held camera, its readings, and the truth of every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame
+from list3r.memory.geometry import rotation_exp
+from list3r.reconstruction.base import Reconstruction
+from list3r.simulation.walk import PathSettings, camera_path
+from list3r.simulation.world import Stop
+from training.worlds.furnish import World, make_world
+from training.worlds.render import world_renderer
+from training.worlds.room import Placed, Room
+from training.worlds.sensors import HELD_OUT_SENSORS, SENSORS, depth_noise, drift_field, read
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of a thing."""
+
+    id: int
+    kind: str
+    label: str
+    family: str
+    structure: bool
+
+
+@dataclass(frozen=True)
+class Film:
+    """A filmed world, F frames."""
+
+    camera: Camera
+    sensor: str
+    time_s: NDArray[np.float64]
+    """Shape (F,)."""
+    T_world_cam: NDArray[np.float64]
+    """True poses. Shape (F, 4, 4)."""
+    color: NDArray[np.uint8]
+    """RGB. Shape (F, H, W, 3)."""
+    depth: NDArray[np.float32]
+    """As read, metres, 0 where unknown. Shape (F, H, W)."""
+    ids: NDArray[np.uint16]
+    """True thing of each pixel, 0 for none. Shape (F, H, W)."""
+    things: tuple[Truth, ...]
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """What is filmed and how."""
+
+    seed: int = 0
+    held_out: bool = False
+    """Families, textures and sensors that training never shows appear too."""
+    frames: int = 48
+    size: tuple[int, int] = (320, 240)
+    sensor: str | None = None
+    """None draws one."""
+
+
+def make_film(settings: FilmSettings) -> Film:
+    """Return the walk of a seed through the world of that seed."""
+    world = make_world(settings.seed, held_out=settings.held_out)
+    rng = np.random.default_rng([settings.seed, 7])
+    sensors = SENSORS if settings.held_out else tuple(s for s in SENSORS if s not in HELD_OUT_SENSORS)
+    sensor = settings.sensor or str(rng.choice(sensors))
+    focal = settings.size[0] * rng.uniform(0.72, 0.9)
+    w, h = settings.size
+    camera = Camera(w, h, focal, focal, (w - 1) / 2, (h - 1) / 2)
+    speed = PathSettings(fps=float(rng.uniform(9, 15)), speed_m_s=float(rng.uniform(0.35, 0.7)))
+    time_s, poses = camera_path(_stops(world, rng, settings.frames), settings.frames, speed, settings.seed)
+    renderer = world_renderer(world.things, world.size, camera, settings.seed)
+    color, depth, ids = [], [], []
+    drift = drift_field((h, w), rng)
+    for pose in poses:
+        picture = renderer.render(pose)
+        drift = (0.985 * drift + 0.17 * drift_field((h, w), rng)).astype(np.float32)
+        reading = read(picture, sensor, rng, drift)
+        color.append(reading.color)
+        depth.append(reading.depth)
+        ids.append(picture.ids.astype(np.uint16))
+    things = tuple(_truth(t) for t in world.things)
+    return Film(camera, sensor, time_s, poses, np.stack(color), np.stack(depth), np.stack(ids), things)
+
+
+def _truth(thing: Placed) -> Truth:
+    return Truth(thing.id, thing.kind, thing.label, thing.family, thing.structure)
+
+
+def _stops(world: World, rng: np.random.Generator, frames: int) -> tuple[Stop, ...]:
+    """Return places to look from and at: furniture round the room, from a metre or two, some of it close."""
+    room: Room = world.room
+    w, deep, _ = world.size
+    eyes = [(x, y) for x, y in rng.uniform(0.25, np.array([w, deep]) - 0.25, (300, 2)).tolist() if room.free_eye(x, y)]
+    eyes = eyes or [(w / 2, deep / 2)]
+    targets = [t for t in world.things if not t.structure]
+    count = max(3, frames // 14)
+    start = np.array(eyes[int(rng.integers(len(eyes)))])
+    bearing, stops = rng.uniform(0, 2 * np.pi), []
+    heading = rng.choice([-1, 1])
+    for _ in range(count):
+        middle = (
+            [t.vertices().mean(axis=0) for t in (targets[int(k)] for k in rng.integers(len(targets), size=6))]
+            if targets
+            else []
+        )
+        middle = middle or [np.array([w / 2, deep / 2, 0.5])]
+        angle = [
+            abs((np.arctan2(m[1] - start[1], m[0] - start[0]) - bearing + np.pi) % (2 * np.pi) - np.pi) for m in middle
+        ]
+        goal = middle[int(np.argmin(angle))]
+        options = [np.array(e) for e in eyes if np.linalg.norm(np.array(e) - start) < 1.0]
+        away = [abs(float(np.linalg.norm(e - goal[:2])) - rng.uniform(0.9, 2.4)) for e in options]
+        start = options[int(np.argmin(away))] if options else start
+        bearing += heading * rng.uniform(0.3, 0.9)
+        height = float(rng.uniform(1.1, 1.7))
+        jitter = rng.normal(0, 0.15, 3)
+        stops.append(
+            Stop((float(start[0]), float(start[1]), min(height, world.size[2] - 0.3)), tuple((goal + jitter).tolist()))
+        )
+    return tuple(stops)
+
+
+def reconstruction_of(film: Film, drift_m: float = 0.006, drift_deg: float = 0.15, seed: int = 0) -> Reconstruction:
+    """Return a film as a reconstruction model hands it on, its poses off by a smooth drift."""
+    rng = np.random.default_rng([seed, 11])
+    count = len(film.time_s)
+    at = np.linspace(0, 1, count)
+    knots = np.linspace(0, 1, max(3, count // 12))
+    wave = np.stack([np.interp(at, knots, rng.normal(size=len(knots))) for _ in range(6)], axis=1)
+    T = film.T_world_cam.copy()
+    T[:, :3, 3] += drift_m * wave[:, :3]
+    T[:, :3, :3] = T[:, :3, :3] @ rotation_exp(np.deg2rad(drift_deg) * wave[:, 3:])
+    T_chunk = np.linalg.inv(T[0]) @ T
+    confidence = (film.depth > 0).astype(np.float16) * np.float16(0.8)
+    return Reconstruction(
+        frame_indices=np.arange(count),
+        posed=np.ones(count, bool),
+        T_chunk_cam=T_chunk,
+        camera=film.camera,
+        depth=film.depth,
+        confidence=confidence,
+        scale_kind="metric",
+        keyframes=np.arange(0, count, 8),
+        depth_noise=depth_noise(film.sensor),
+    )
+
+
+def frames_of(film: Film) -> list[Frame]:
+    """Return the frames as a source hands them out."""
+    return [Frame(k, float(t), film.color[k], film.depth[k], None) for k, t in enumerate(film.time_s.tolist())]
+
+
+def part_of(film: Film, start: int, stop: int) -> Film:
+    """Return some frames of a film."""
+    s = slice(start, stop)
+    return replace(
+        film,
+        time_s=film.time_s[s],
+        T_world_cam=film.T_world_cam[s],
+        color=film.color[s],
+        depth=film.depth[s],
+        ids=film.ids[s],
+    )

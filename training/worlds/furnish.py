@@ -1,0 +1,367 @@
+"""What a room is furnished with and where it is put."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.worlds.catalogue import KINDS, Kind, kinds_at
+from training.worlds.draft import Draft
+from training.worlds.materials import Palette
+from training.worlds.mesh import box
+from training.worlds.room import Placed, Room, flat_pose, room_shell
+from training.worlds.settle import fill_zone
+
+
+@dataclass(frozen=True)
+class World:
+    """A furnished room."""
+
+    size: tuple[float, float, float]
+    things: tuple[Placed, ...]
+    room: Room
+
+
+def make_world(seed: int, *, held_out: bool = False) -> World:
+    """Return the furnished room of a seed; with `held_out` families and textures appear that training never shows."""
+    rng = np.random.default_rng([seed, 1 if held_out else 0])
+    size = (float(rng.uniform(2.8, 5.5)), float(rng.uniform(2.8, 5.5)), float(rng.uniform(2.35, 2.9)))
+    palette = Palette(rng, held_out=held_out)
+    room = Room(size, rng)
+    painter = _Furnisher(room, palette, held_out)
+    painter.shell()
+    painter.openings()
+    painter.groups()
+    painter.along_walls()
+    painter.loose_furniture()
+    painter.hangings()
+    painter.floor_things()
+    painter.clutter()
+    return World(size, tuple(room.things), room)
+
+
+class _Furnisher:
+    """Fills one room, step by step."""
+
+    def __init__(self, room: Room, palette: Palette, held_out: bool) -> None:
+        self.room, self.palette, self.held_out, self.rng = room, palette, held_out, room.rng
+        self.zones: list[tuple[Draft, NDArray[np.float64], Kind]] = []
+        self.messy = float(room.rng.choice([0.3, 1.0, 2.0]))
+
+    def _draft(self, kind: Kind) -> Draft:
+        draft = Draft(self.rng, self.palette)
+        kind.build(draft)
+        return draft
+
+    def _draw(self, place: str) -> Kind:
+        kinds = kinds_at(place, held_out=self.held_out)
+        weight = np.array([k.weight for k in kinds])
+        return kinds[int(self.rng.choice(len(kinds), p=weight / weight.sum()))]
+
+    def _place(self, kind: Kind, draft: Draft, pose: NDArray[np.float64], *, mark: bool = True) -> None:
+        self.room.place(kind.name, kind.label, kind.family, draft, pose, mark=mark)
+        if draft.zones:
+            self.zones.append((draft, pose, kind))
+
+    def shell(self) -> None:
+        """Put up floor, ceiling, walls, and at times a pillar or a step in a wall."""
+        wall, floor = self.palette.wall(), self.palette.floor()
+        ceiling = self.palette.paint() if self.rng.random() < 0.2 else self.palette.wall()
+        for name, mesh, material in room_shell(self.room.size, wall, floor, ceiling):
+            things = self.room.things
+            things.append(Placed(len(things) + 1, name, name, "structure", ((mesh, material),), np.eye(4), True))
+        if self.rng.random() < 0.25:
+            w, deep, h = self.room.size
+            sx, sy = self.rng.uniform(0.3, 1.2, 2)
+            x, y = (
+                (sx / 2 if self.rng.random() < 0.5 else w - sx / 2),
+                (sy / 2 if self.rng.random() < 0.5 else deep - sy / 2),
+            )
+            draft = Draft(self.rng, self.palette)
+            draft.add(box((sx - 0.01, sy - 0.01, h - 0.01)), wall)
+            self.room.place("pillar", "wall", "structure", draft, flat_pose(x, y, 0.0))
+            last = self.room.things.pop()
+            self.room.things.append(Placed(last.id, "wall", "wall", "structure", last.parts, last.T_world_thing, True))
+            for number in range(4):
+                along, across = (x, sx) if number % 2 == 0 else (y, sy)
+                self.room.wall_free(number, (along - across / 2, along + across / 2), (0, h), take=True)
+
+    def _hang(
+        self, kind: Kind, z: float, wall: int | None = None, along: float | None = None
+    ) -> tuple[int, float, Draft] | None:
+        for _ in range(6):
+            draft = self._draft(kind)
+            low, high = draft.bounds()
+            number = int(self.rng.integers(4)) if wall is None else wall
+            half = max(-low[0], high[0])
+            length = self.room.wall_length(number)
+            if length < 2 * half + 0.1 or z + high[2] > self.room.size[2] - 0.02:
+                continue
+            x = self.rng.uniform(half + 0.03, length - half - 0.03) if along is None else along
+            span, height = (x - half, x + half), (max(z + low[2], 0.0), z + high[2])
+            pose = self.room.wall_pose(number, x, 0.0, z)
+            if self.room.wall_free(number, span, height) and self.room.fits(draft, pose):
+                self.room.wall_free(number, span, height, take=True)
+                self._place(kind, draft, pose)
+                return number, x, draft
+        return None
+
+    def openings(self) -> None:
+        """Make doors and windows, with radiators below and curtains beside them."""
+        self._hang(KINDS["door"], 0.0)
+        for _ in range(int(self.rng.integers(0, 3))):
+            found = self._hang(KINDS["window"], self.rng.uniform(0.8, 1.0))
+            if found is None:
+                continue
+            wall, x, window = found
+            if self.rng.random() < 0.6:
+                self._hang(KINDS["radiator"], 0.0, wall, x)
+            half = window.bounds()[1][0]
+            for side in (-1, 1):
+                if self.rng.random() < 0.6:
+                    self._hang(KINDS["curtain"], 0.03, wall, x + side * (half + 0.3))
+
+    def _against(
+        self, kind: Kind, tries: int = 8, wall: int | None = None, near: float | None = None
+    ) -> tuple[int, float, Draft, NDArray[np.float64]] | None:
+        """Stand a thing with its back to a wall, touching it or a little off."""
+        for _ in range(tries):
+            draft = self._draft(kind)
+            low, high = draft.bounds()
+            number = int(self.rng.integers(4)) if wall is None else wall
+            length, half = self.room.wall_length(number), max(-low[0], high[0])
+            if length < 2 * half + 0.05:
+                continue
+            x = (
+                self.rng.uniform(half + 0.01, length - half - 0.01)
+                if near is None
+                else near + self.rng.uniform(-0.05, 0.05)
+            )
+            gap = float(self.rng.choice([0.003, 0.003, 0.02, 0.08]))
+            pose = self.room.wall_pose(number, x, gap - low[1])
+            span = (x - half, x + half)
+            if self.room.wall_free(number, span, (0.05, high[2])) and self.room.fits(draft, pose):
+                self.room.wall_free(number, span, (0.0, high[2]), take=True)
+                self._place(kind, draft, pose)
+                return number, x, draft, pose
+        return None
+
+    def _allowed(self, name: str) -> bool:
+        kind = KINDS[name]
+        return kind in kinds_at(kind.place, held_out=self.held_out)
+
+    def groups(self) -> None:
+        """Put up table and chairs, desk and chair, sofa and low table, bed and nightstands."""
+        names = self.rng.permutation(["sofa", "desk", "bed", "table"])[: int(self.rng.integers(1, 4))]
+        for name in names:
+            {"sofa": self._sofa_group, "desk": self._desk_group, "bed": self._bed_group, "table": self._table_group}[
+                str(name)
+            ]()
+
+    def _sofa_group(self) -> None:
+        found = self._against(KINDS["sofa"])
+        if found is None:
+            return
+        pose, depth = found[3], found[2].bounds()[1][1]
+        if self.rng.random() < 0.6:
+            self._lay_rug(pose @ flat_pose(0.0, depth + 0.4, 0.0))
+        if self.rng.random() < 0.75:
+            kind = KINDS["coffee table"]
+            draft = self._draft(kind)
+            spot = pose @ flat_pose(
+                self.rng.uniform(-0.2, 0.2),
+                depth + draft.bounds()[1][1] + self.rng.uniform(0.03, 0.4),
+                self.rng.normal(0, 0.1),
+            )
+            if self.room.fits(draft, spot):
+                self._place(kind, draft, spot)
+
+    def _lay_rug(self, pose: NDArray[np.float64]) -> None:
+        draft = self._draft(KINDS["rug"])
+        corners = np.array(
+            [
+                [x, y, 0.0, 1.0]
+                for x in draft.bounds()[0][[0]].tolist() + draft.bounds()[1][[0]].tolist()
+                for y in (draft.bounds()[0][1], draft.bounds()[1][1])
+            ]
+        )
+        flat = (corners @ pose.T)[:, :2]
+        if (flat > 0.02).all() and (flat < np.array(self.room.size[:2]) - 0.02).all():
+            self._place(KINDS["rug"], draft, pose, mark=False)
+
+    def _desk_group(self) -> None:
+        found = self._against(KINDS["desk"])
+        if found is None:
+            return
+        _, _, table, pose = found
+        top = table.zones[-1]
+        self.zones.pop()
+        pieces = [
+            ("monitor", (self.rng.uniform(-0.25, 0.25), top.low[1] + 0.14)),
+            ("keyboard", (self.rng.uniform(-0.15, 0.15), top.high[1] - 0.16)),
+        ]
+        if self.rng.random() < 0.3:
+            pieces = [("laptop", (self.rng.uniform(-0.2, 0.2), 0.0))]
+        used: list[tuple[Kind, Draft, NDArray[np.float64]]] = []
+        for name, (x, y) in pieces:
+            if self._allowed(name) or name in ("monitor", "keyboard"):
+                used.append(
+                    (
+                        KINDS[name],
+                        self._draft(KINDS[name]),
+                        pose @ flat_pose(x, y, self.rng.normal(0, 0.06), top.z + 0.001),
+                    )
+                )
+        for kind, draft, at in used:
+            self._place(kind, draft, at, mark=False)
+        half = top.high[0] * 0.42
+        for low, high in ((top.low[0], -half), (half, top.high[0])):
+            if high - low > 0.12:
+                side = Draft(self.rng, self.palette)
+                side.zones.append(type(top)((low, top.low[1]), (high, top.high[1]), top.z, top.clearance, "desk"))
+                self.zones.append((side, pose, KINDS["desk"]))
+        name = "office chair" if self.rng.random() < 0.6 else "padded chair"
+        self._chair_at(
+            name,
+            pose
+            @ flat_pose(
+                self.rng.uniform(-0.2, 0.2),
+                table.bounds()[1][1] + self.rng.uniform(-0.05, 0.4),
+                np.pi + self.rng.normal(0, 0.5),
+            ),
+        )
+
+    def _chair_at(self, name: str, pose: NDArray[np.float64], state: dict[str, object] | None = None) -> None:
+        before = self.rng.bit_generator.state
+        if state is not None:
+            self.rng.bit_generator.state = state
+        draft = self._draft(KINDS[name])
+        if state is not None:
+            self.rng.bit_generator.state = before
+        if self.room.fits(draft, pose):
+            self._place(KINDS[name], draft, pose)
+
+    def _bed_group(self) -> None:
+        found = self._against(KINDS["bed"], 12)
+        if found is None or self.rng.random() < 0.3:
+            return
+        wall, x, draft, _ = found
+        for side in (-1, 1):
+            self._against(KINDS["nightstand"], 3, wall, x + side * (draft.bounds()[1][0] + 0.32))
+
+    def _table_group(self) -> None:
+        kind = KINDS["dining table"] if self.rng.random() < 0.7 else KINDS["round table"]
+        for _ in range(8):
+            draft = self._draft(kind)
+            w, deep, _ = self.room.size
+            pose = flat_pose(
+                self.rng.uniform(0.8, w - 0.8),
+                self.rng.uniform(0.8, deep - 0.8),
+                self.rng.choice([0, np.pi / 2]) + self.rng.normal(0, 0.1),
+            )
+            if self.room.fits(draft, pose):
+                break
+        else:
+            return
+        self._place(kind, draft, pose)
+        name = str(self.rng.choice(["slatted chair", "padded chair", "shell chair"]))
+        state = self.rng.bit_generator.state
+        half_x, half_y = draft.bounds()[1][:2]
+        spots = [
+            (x, side * half_y, np.pi if side > 0 else 0.0)
+            for side in (-1, 1)
+            for x in ((-half_x / 2, half_x / 2) if half_x > 0.6 else (0.0,))
+        ]
+        spots += [(side * half_x, 0.0, np.pi / 2 if side > 0 else -np.pi / 2) for side in (-1, 1)]
+        for x, y, yaw in spots:
+            if self.rng.random() < 0.65:
+                out = self.rng.uniform(-0.22, 0.3)
+                away = np.array([x, y]) + out * np.array([np.sin(yaw), -np.cos(yaw)]) * 1.0
+                self._chair_at(name, pose @ flat_pose(away[0], away[1], yaw + self.rng.normal(0, 0.2)), state)
+
+    def along_walls(self) -> None:
+        """Stand furniture along the walls."""
+        for _ in range(int(self.rng.integers(2, 9))):
+            self._against(self._draw("wall"), 4)
+
+    def loose_furniture(self) -> None:
+        """Stand furniture in corners and about the room."""
+        w, deep, _ = self.room.size
+        for _ in range(int(self.rng.integers(1, 6))):
+            corner = self.rng.random() < 0.6
+            kind = self._draw("corner" if corner else "free")
+            for _ in range(4):
+                draft = self._draft(kind)
+                x, y = self.rng.uniform(0.2, w - 0.2), self.rng.uniform(0.2, deep - 0.2)
+                yaw = self.rng.uniform(0, 2 * np.pi)
+                if corner:
+                    x, y = (
+                        self.rng.choice([v, s - v])
+                        for v, s in zip(self.rng.uniform(0.15, 0.6, 2), (w, deep), strict=True)
+                    )
+                pose = flat_pose(float(x), float(y), float(yaw))
+                if self.room.fits(draft, pose):
+                    self._place(kind, draft, pose)
+                    break
+        if self.rng.random() < 0.35:
+            self._lay_rug(
+                flat_pose(self.rng.uniform(0.8, w - 0.8), self.rng.uniform(0.8, deep - 0.8), self.rng.uniform(0, 3))
+            )
+
+    def hangings(self) -> None:
+        """Hang things on walls and from the ceiling, and lean some against walls."""
+        ranges = {"radiator": 0.0, "door": 0.0, "window": 0.9, "curtain": 0.03, "hanging coat": 1.7, "switch": 1.05}
+        for _ in range(int(self.rng.integers(2, 10))):
+            kind = self._draw("hang")
+            if kind.name in ("door", "window") and self.rng.random() < 0.7:
+                continue
+            self._hang(kind, ranges.get(kind.name, self.rng.uniform(1.0, 1.6)))
+        if self.rng.random() < 0.4:
+            kind = self._draw("ceiling")
+            w, deep, h = self.room.size
+            draft, pose = (
+                self._draft(kind),
+                flat_pose(w * self.rng.uniform(0.3, 0.7), deep * self.rng.uniform(0.3, 0.7), 0.0, h),
+            )
+            if self.room.fits(draft, pose):
+                self._place(kind, draft, pose)
+        for _ in range(int(self.rng.integers(0, 3))):
+            kind = self._draw("lean") if self.rng.random() < 0.4 else KINDS["picture"]
+            draft = self._draft(kind)
+            if kind.name == "picture":
+                tilt = float(self.rng.uniform(0.08, 0.3))
+                draft.parts = [(m.moved((0, 0, 0), roll=tilt), c) for m, c in draft.parts]
+            low, high = draft.bounds()
+            wall = int(self.rng.integers(4))
+            x = self.rng.uniform(0.3, self.room.wall_length(wall) - 0.3)
+            pose = self.room.wall_pose(wall, x, 0.005 - low[1], -low[2])
+            if self.room.wall_free(wall, (x + low[0], x + high[0]), (0, high[2])) and self.room.fits(draft, pose):
+                self.room.wall_free(wall, (x + low[0], x + high[0]), (0, high[2]), take=True)
+                self._place(kind, draft, pose)
+
+    def floor_things(self) -> None:
+        """Put small things on the floor: beside furniture and walls more than in the middle, some in heaps."""
+        w, deep, _ = self.room.size
+        for _ in range(int(self.rng.poisson(2 + 3 * self.messy))):
+            kind = self._draw("floor" if self.rng.random() < 0.85 else "shoes")
+            x, y = self.rng.uniform(0.1, w - 0.1), self.rng.uniform(0.1, deep - 0.1)
+            if self.rng.random() < 0.5:
+                side = self.rng.integers(4)
+                x, y = [(x, 0.25), (0.25, y), (x, deep - 0.25), (w - 0.25, y)][int(side)]
+            for _ in range(3 if self.rng.random() < 0.25 else 1):
+                draft = self._draft(kind)
+                pose = flat_pose(float(x), float(y), float(self.rng.uniform(0, 6.3)), 0.002)
+                if self.room.fits(draft, pose):
+                    self._place(kind, draft, pose)
+                x, y = x + self.rng.normal(0, 0.2), y + self.rng.normal(0, 0.2)
+
+    def clutter(self) -> None:
+        """Fill tops, boards, seats and beds."""
+        usual = {"top": 9.0, "shelf": 16.0, "desk": 12.0, "seat": 2.0, "bed": 1.0, "media": 7.0, "shoes": 24.0}
+        for draft, pose, _ in self.zones:
+            for zone in draft.zones:
+                if zone.z < 2.0 and self.rng.random() < 0.85:
+                    density = usual[zone.use] * self.messy * self.rng.uniform(0.3, 1.5)
+                    fill_zone(self.room, self.palette, zone, pose, density=density, held_out=self.held_out)
