@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.instances.cloud import Cloud, build_cloud
-from list3r.instances.fusion import View
+from list3r.instances.geometric.cloud import Cloud, build_cloud
+from list3r.instances.geometric.fusion import View
+from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.settings import InstanceSettings
-from list3r.instances.views import ChunkViews
 from training.worlds.film import Film, FilmSettings, Truth, frames_of, make_film, reconstruction_of
 
 

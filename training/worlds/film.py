@@ -11,7 +11,7 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
 from list3r.reconstruction.base import Reconstruction
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.world import Stop
+from list3r.simulation.worlds.world import Stop
 from training.worlds.furnish import World, make_world
 from training.worlds.render import world_renderer
 from training.worlds.room import Placed, Room
