@@ -25,7 +25,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
-from list3r.reconstruction.sfm.fill import Segment
+from list3r.reconstruction.sfm.fill import PosedSegment
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 
 FILES = {"aliked": "aliked/aliked-t16.pth", "xfeat": "xfeat/xfeat_640x640.onnx"}
@@ -83,7 +83,7 @@ def _measured(words: argparse.Namespace, every: int, start: int, detector: Learn
     }
 
 
-def _ate(segment: Segment, frames: list[Frame]) -> float | None:
+def _ate(segment: PosedSegment, frames: list[Frame]) -> float | None:
     """ATE after Sim(3), metres; None without enough true poses."""
     T_true = {k: frames[k].T_source_cam for k in sorted(segment.T_map_cam)}
     keys = [k for k, T in T_true.items() if T is not None and np.isfinite(T).all()]

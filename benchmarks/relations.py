@@ -44,7 +44,7 @@ from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.queries.relations import VERTICAL
 from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
 from list3r.simulation.worlds.gaps import surface_gap
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import SimulatedThing
 from list3r.simulation.worlds.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
@@ -260,7 +260,7 @@ def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
     return torn
 
 
-def part_boxes(thing: Thing) -> list[OrientedBox]:
+def part_boxes(thing: SimulatedThing) -> list[OrientedBox]:
     """The box of each part of a thing in the world."""
     rotation, position = thing.rotation(), np.array(thing.position)
     corners = [part.extent() for part in thing.parts]

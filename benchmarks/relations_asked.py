@@ -16,7 +16,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.relations import noise_of, viewer_from
 from list3r.queries.views.viewpoint import Viewer, between, viewed
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import SimulatedThing
 
 EVERY = 30
 """Frames from one asked viewpoint to the next."""
@@ -80,7 +80,7 @@ def _counts(name: str, want: set[tuple[object, ...]], said: set[tuple[object, ..
     return {f"{name}_true": len(want), f"{name}_claimed": len(said), f"{name}_correct": len(want & said)}
 
 
-def _true(instance: Instance, thing: Thing) -> Instance:
+def _true(instance: Instance, thing: SimulatedThing) -> Instance:
     box = thing.box()
     corners = box.corners()
     low_high = np.stack([corners.min(axis=0), corners.max(axis=0)])

@@ -27,7 +27,7 @@ from list3r.pipeline.build import _runs, build
 from list3r.pipeline.calibration import camera_notes
 from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
 from list3r.pipeline.session import Job, plan_session
-from list3r.reconstruction.sfm.calibration import CalibrationSettings, _focal_sigma
+from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, _focal_sigma
 from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 from tests.conftest import write_small_room
@@ -198,7 +198,7 @@ def test_more_windows_that_agree_make_the_focal_length_surer() -> None:
     def windows(*focals: float) -> list[tuple[MapProblem, SparseMap]]:
         return [(MapProblem({}), SparseMap({}, {}, Camera(640, 480, f, f, 320, 240))) for f in focals]
 
-    s = CalibrationSettings()
+    s = CameraCalibrationSettings()
     assert _focal_sigma(windows(500.0), s) == pytest.approx(s.window_sigma)
     agreeing = _focal_sigma(windows(500.0, 505.0, 495.0, 500.0, 502.0), s)
     parted = _focal_sigma(windows(500.0, 600.0, 420.0, 560.0, 450.0), s)

@@ -11,7 +11,7 @@ import pytest
 
 from list3r.frames.base import Camera
 from list3r.frames.inspection import describe, lines
-from list3r.frames.registration.calibrate import CalibrateSettings, calibrate
+from list3r.frames.registration.calibrate import DepthCalibrationSettings, calibrate
 from list3r.frames.registration.edges import depth_edges
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError
@@ -40,7 +40,7 @@ def write_pair(root: Path, color: Camera, offset: np.ndarray, k1: float = 0.0, f
 
 def test_a_known_camera_is_found_from_a_wrong_start(tmp_path: Path) -> None:
     root = write_pair(tmp_path, COLOR, moved(-0.025, -0.006), k1=-0.06)
-    found = calibrate(root, START, CalibrateSettings(frames=12, candidates=1))
+    found = calibrate(root, START, DepthCalibrationSettings(frames=12, candidates=1))
     assert found.status == "estimated", found.reason
     assert found.intrinsics[0] == pytest.approx(262.0, rel=0.006)
     np.testing.assert_allclose(found.T_color_depth[:3, 3], [-0.025, -0.006, 0], atol=0.003)
@@ -52,13 +52,13 @@ def test_a_known_camera_is_found_from_a_wrong_start(tmp_path: Path) -> None:
     assert any("--depth-to-color" in line for line in lines(report))
     json.dumps(report, allow_nan=False)
     assert opened.info.depth_camera is not None
-    again = calibrate(root, START, CalibrateSettings(frames=12, candidates=1))
+    again = calibrate(root, START, DepthCalibrationSettings(frames=12, candidates=1))
     assert again.as_dict() == found.as_dict()
 
 
 def test_depth_that_lies_on_the_colour_is_called_registered(tmp_path: Path) -> None:
     root = write_pair(tmp_path, DEPTH, np.eye(4))
-    found = calibrate(root, START, CalibrateSettings(frames=12, candidates=1))
+    found = calibrate(root, START, DepthCalibrationSettings(frames=12, candidates=1))
     assert found.status == "registered" and found.moved_px < 1.0
     assert found.options(START).registered and found.command_line() == ""
 
@@ -68,7 +68,7 @@ def test_pictures_that_do_not_belong_to_the_depth_determine_nothing(tmp_path: Pa
     for k in range(12):
         noise = np.random.default_rng(k).integers(0, 255, (240, 320), dtype=np.uint8)
         write_png(root / f"color/{k}.png", noise)
-    found = calibrate(root, START, CalibrateSettings(frames=12, candidates=1))
+    found = calibrate(root, START, DepthCalibrationSettings(frames=12, candidates=1))
     assert found.status == "undetermined" and found.options(START) == START
 
 

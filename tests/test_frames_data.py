@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame
-from list3r.frames.registration.calibrate import CalibrateSettings, calibrate
+from list3r.frames.registration.calibrate import DepthCalibrationSettings, calibrate
 from list3r.frames.source import SourceOptions, open_source, require_camera
 
 pytestmark = pytest.mark.data
-FEW = CalibrateSettings(frames=10, candidates=3)
+FEW = DepthCalibrationSettings(frames=10, candidates=3)
 
 
 def test_redkitchen_is_recognised(shared_data: Path) -> None:
@@ -37,7 +37,7 @@ def test_redkitchen_calibrates_from_a_wrong_start(shared_data: Path, focal: floa
 
 def calibrate_score(path: Path) -> float:
     """How well edges meet with the constants that the layout knows."""
-    return calibrate(path, SourceOptions(), CalibrateSettings(frames=10, candidates=3)).score_assumed
+    return calibrate(path, SourceOptions(), DepthCalibrationSettings(frames=10, candidates=3)).score_assumed
 
 
 def test_cabinet_is_registered(shared_data: Path) -> None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera
 from list3r.frames.decode import clean_depth
-from list3r.frames.registration.reprojection import Registration, Undistortion
+from list3r.frames.registration.reprojection import DepthReprojection, Undistortion
 from list3r.reconstruction.base import backproject
 from tests.frames_scenes import moved, paint
 
@@ -29,7 +29,7 @@ def test_a_slanted_plane_stays_that_plane_without_holes(color: Camera) -> None:
     T = moved(-0.02, -0.005, 0.01)
     T[:3, :3] = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
     normal, offset = np.array([0.3, -0.2, 0.93]), 1.4
-    out = Registration(DEPTH, color, T)(plane_depth(DEPTH, normal, offset))
+    out = DepthReprojection(DEPTH, color, T)(plane_depth(DEPTH, normal, offset))
     normal_color = T[:3, :3] @ normal
     expected = plane_depth(color, normal_color, offset + normal_color @ T[:3, 3])
     seen = out > 0
@@ -42,13 +42,13 @@ def test_a_slanted_plane_stays_that_plane_without_holes(color: Camera) -> None:
 
 def test_the_same_camera_changes_nothing() -> None:
     depth = paint([(3.0, 0, 0, 9, 9, 1), (1.0, 0.1, 0.1, 0.2, 0.2, 1)], DEPTH, np.eye(4))[1]
-    np.testing.assert_array_equal(Registration(DEPTH, DEPTH, np.eye(4))(depth), depth)
+    np.testing.assert_array_equal(DepthReprojection(DEPTH, DEPTH, np.eye(4))(depth), depth)
 
 
 @pytest.mark.parametrize("color", [COLOR, Camera(320, 240, 262.0, 262.0, 160.0, 120.0)])
 def test_near_hides_far_and_no_depth_lies_between(color: Camera) -> None:
     scene, T = [(3.0, 0, 0, 9, 9, 1), (1.0, 0, 0, 0.2, 0.2, 1)], moved(-0.03, 0.0, 0.0)
-    out = Registration(DEPTH, color, T)(paint(scene, DEPTH, np.eye(4))[1])
+    out = DepthReprojection(DEPTH, color, T)(paint(scene, DEPTH, np.eye(4))[1])
     truth = paint(scene, color, T)[1]
     known = out > 0
     assert set(np.unique(out[known]).round(4)) == {1.0, 3.0}
@@ -63,7 +63,7 @@ def test_near_hides_far_and_no_depth_lies_between(color: Camera) -> None:
 def test_a_hole_in_depth_stays_a_hole() -> None:
     depth = np.full((120, 160), 1.5, np.float32)
     depth[50:60, 70:80] = 0
-    out = Registration(DEPTH, COLOR, moved(0.01, 0, 0))(depth)
+    out = DepthReprojection(DEPTH, COLOR, moved(0.01, 0, 0))(depth)
     assert 60 <= (out[40:80, 50:110] == 0).sum() <= 100
 
 

@@ -45,7 +45,7 @@ from list3r.models.cards import (
 from list3r.models.choice import check_allowed, parse_weights, pinned_weights
 from list3r.models.device import Gpu
 from list3r.models.licences import PROFILES, choose_weights, objection, terms
-from list3r.models.presets import Selection, obstacle, select
+from list3r.models.presets import ModelSelection, obstacle, select
 from list3r.models.upstream import load_upstream, upstream_class
 from list3r.pipeline.chunk import BuildSettings
 from list3r.pipeline.session import prepare, with_weights
@@ -294,7 +294,7 @@ def test_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
 
 
 def test_presets_choose_and_say_why() -> None:
-    assert select("cpu", has_depth=True, profile="any", gpu=None) == Selection(why="preset cpu: no weights")
+    assert select("cpu", has_depth=True, profile="any", gpu=None) == ModelSelection(why="preset cpu: no weights")
     light = select("light", has_depth=False, profile="permissive", gpu=None)
     assert all(c.commercial for _, c in light.cards()) and len(light.cards()) == 4
     assert select("light", has_depth=True, profile="permissive", gpu=None).reconstruction == "auto"
@@ -339,26 +339,26 @@ def test_weights_words_name_their_part() -> None:
 
 def test_what_is_forbidden_or_missing_is_refused_before_anything_is_fetched() -> None:
     with pytest.raises(OptionError, match="--tracking sam3: the weights facebook/sam3"):
-        check_allowed(Selection(tracking="sam3"), {}, "permissive")
+        check_allowed(ModelSelection(tracking="sam3"), {}, "permissive")
     with pytest.raises(OptionError, match="pi3 needs the package pi3: pip install git"):
-        check_allowed(Selection(reconstruction="pi3"), {}, "research")
-    assert check_allowed(Selection(), {}, "permissive") == {}
-    assert check_allowed(Selection(discovery="eomt"), {}, "permissive") == {
+        check_allowed(ModelSelection(reconstruction="pi3"), {}, "research")
+    assert check_allowed(ModelSelection(), {}, "permissive") == {}
+    assert check_allowed(ModelSelection(discovery="eomt"), {}, "permissive") == {
         "discovery": "tue-mps/coco_panoptic_eomt_large_640"
     }
     own = {"discovery": "x/y"}
-    assert check_allowed(Selection(discovery="eomt"), own, "research") == own
+    assert check_allowed(ModelSelection(discovery="eomt"), own, "research") == own
     with pytest.raises(OptionError, match="x/y are under other"):
-        check_allowed(Selection(discovery="eomt"), own, "permissive")
+        check_allowed(ModelSelection(discovery="eomt"), own, "permissive")
 
 
 def test_weights_of_a_build_are_named_by_commit(tmp_path: Path) -> None:
     put("tue-mps/coco_panoptic_eomt_large_640")
     named = {"discovery": f"tue-mps/coco_panoptic_eomt_large_640@{COMMIT}"}
-    assert pinned_weights(Selection(discovery="eomt"), {}, "permissive") == named
-    assert pinned_weights(Selection(), {}, "permissive") == {}
+    assert pinned_weights(ModelSelection(discovery="eomt"), {}, "permissive") == named
+    assert pinned_weights(ModelSelection(), {}, "permissive") == {}
     asked = {"reconstruction": str(tmp_path)}
-    assert pinned_weights(Selection("precomputed"), asked, "permissive") == asked
+    assert pinned_weights(ModelSelection("precomputed"), asked, "permissive") == asked
 
 
 def test_python_builds_video_without_depth_by_default(tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ import torch
 
 from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
-from list3r.reconstruction.mvs.fill import FillSettings, fill_regions
-from list3r.reconstruction.mvs.fusion import DepthMap, FusionSettings, fill_flat
+from list3r.reconstruction.mvs.fill import RegionFillSettings, fill_regions
+from list3r.reconstruction.mvs.fusion import DepthFusionSettings, DepthMap, fill_flat
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up, resized_camera
 from list3r.reconstruction.mvs.stereo import dense_depth, plane_residual, stereo_noise
-from list3r.reconstruction.mvs.views import ViewSettings, choose_sources, pair_views, plane_depths
+from list3r.reconstruction.mvs.views import SweepViewSettings, choose_sources, pair_views, plane_depths
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
 COUNT = 20
@@ -208,13 +208,13 @@ def test_sources_have_parallax_and_stand_on_both_sides() -> None:
     T[:, 0, 3] = 0.02 * np.arange(41)
     posed, depth, sharp = np.ones(41, bool), np.full(41, 2.0), np.ones(41)
     pairs = pair_views([20], posed, T, CAMERA, depth)
-    chosen = choose_sources(0, pairs, T, sharp, 20, ViewSettings())
+    chosen = choose_sources(0, pairs, T, sharp, 20, SweepViewSettings())
     assert len(chosen) == 6 and 20 not in chosen
     assert all(k < 20 for k in chosen[0::2]) and all(k > 20 for k in chosen[1::2])
     assert (pairs.angle_deg[0, chosen] > 0.6).all()
     still = np.tile(np.eye(4), (41, 1, 1))
     nothing = pair_views([20], posed, still, CAMERA, depth)
-    assert choose_sources(0, nothing, still, sharp, 20, ViewSettings()) == []
+    assert choose_sources(0, nothing, still, sharp, 20, SweepViewSettings()) == []
 
 
 def test_planes_are_as_many_as_the_parallax_needs() -> None:
@@ -231,9 +231,9 @@ def test_holes_in_a_plane_are_filled_and_said_to_be_unsure() -> None:
     inverse[hole] = 0.0
     inverse[:, 70:] = 0.0
     sigma = np.where(inverse > 0, 0.01, 0.0).astype(np.float32)
-    out = fill_flat(DepthMap(torch.from_numpy(inverse), torch.from_numpy(sigma)), FusionSettings())
+    out = fill_flat(DepthMap(torch.from_numpy(inverse), torch.from_numpy(sigma)), DepthFusionSettings())
     assert np.allclose(out.inverse.numpy()[hole], plane[hole], rtol=1e-3)
-    assert (out.sigma.numpy()[hole] == np.float32(FusionSettings().fill_sigma)).all()
+    assert (out.sigma.numpy()[hole] == np.float32(DepthFusionSettings().fill_sigma)).all()
     assert not out.inverse.numpy()[:, 70:].any()
 
 
@@ -245,15 +245,15 @@ def test_a_blank_region_takes_the_plane_of_its_rim_only_where_the_rim_is_one() -
     inverse = np.where(hole, 0.0, plane).astype(np.float32)
     sigma = np.where(hole, 0.0, 0.01).astype(np.float32)
     color = np.full((60, 80, 3), 120, np.uint8)
-    filled, unsure = fill_regions(inverse, sigma, color, FillSettings(most_share=0.5))
+    filled, unsure = fill_regions(inverse, sigma, color, RegionFillSettings(most_share=0.5))
     assert np.allclose(filled, plane, rtol=1e-3)
-    assert (unsure[hole] == np.float32(FillSettings().sigma)).all()
+    assert (unsure[hole] == np.float32(RegionFillSettings().sigma)).all()
     rng = np.random.default_rng(0)
     crumpled = np.where(hole, 0.0, plane * rng.uniform(0.8, 1.2, plane.shape)).astype(np.float32)
-    assert not fill_regions(crumpled, sigma, color, FillSettings(most_share=0.5))[0][hole].any()
+    assert not fill_regions(crumpled, sigma, color, RegionFillSettings(most_share=0.5))[0][hole].any()
     other = color.copy()
     other[hole] = 30
-    assert not fill_regions(inverse, sigma, other, FillSettings(most_share=0.5))[0][hole].any()
+    assert not fill_regions(inverse, sigma, other, RegionFillSettings(most_share=0.5))[0][hole].any()
 
 
 def test_noise_is_measured_on_smooth_surfaces() -> None:

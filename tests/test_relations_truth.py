@@ -9,18 +9,18 @@ from scipy.spatial import cKDTree
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.gaps import surface_gap
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import BOX, SPHERE, Thing
+from list3r.simulation.worlds.things import BOX, SPHERE, SimulatedThing
 from list3r.simulation.worlds.truth import true_relations
 from list3r.simulation.worlds.world import make_world
 
 GREY = Material("plain", (120, 120, 120), (130, 130, 130), 0.3)
 
 
-def put(id: int, parts: f.Parts, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> Thing:
-    return Thing(id, "thing", parts, (x, y, z), float(np.deg2rad(yaw_deg)))
+def put(id: int, parts: f.Parts, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> SimulatedThing:
+    return SimulatedThing(id, "thing", parts, (x, y, z), float(np.deg2rad(yaw_deg)))
 
 
-def cube(id: int, x: float, y: float, yaw_deg: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Thing:
+def cube(id: int, x: float, y: float, yaw_deg: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> SimulatedThing:
     return put(id, (f.block((0.2, 0.2, 0.2), (0, 0, 0.1), GREY, yaw),), x, y, z, yaw_deg)
 
 
@@ -60,7 +60,7 @@ def test_is_that_of_the_nearest_of_many_surface_points(seed: int) -> None:
             assert gap - 1e-3 <= sampled <= gap + 0.03 or gap == 0.0
 
 
-def surface_of(thing: Thing, rng: np.random.Generator, count: int = 3000) -> np.ndarray:
+def surface_of(thing: SimulatedThing, rng: np.random.Generator, count: int = 3000) -> np.ndarray:
     """Points on the surfaces of the parts, world. Shape (N, 3)."""
     out = []
     for part in thing.parts:

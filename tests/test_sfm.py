@@ -15,7 +15,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.reconstruction.registry import MODELS, ModelOptions, make_reconstructor
-from list3r.reconstruction.sfm.calibration import CalibrationSettings, calibrate
+from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, calibrate
 from list3r.reconstruction.sfm.mapping import SparseMap, best_of
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 from list3r.reconstruction.sfm.tracks import follow_corners
@@ -167,7 +167,7 @@ def test_corners_do_not_creep():
 
 
 def test_the_camera_is_found_and_a_wrong_one_is_doubted():
-    settings = CalibrationSettings(windows=1, frames=FRAMES)
+    settings = CameraCalibrationSettings(windows=1, frames=FRAMES)
     found = calibrate(Held(walk(), None), settings)
     assert abs(found.camera.fx / CAMERA.fx - 1) < 0.08 and found.windows == 1
     wrong = calibrate(Held(walk(), replace(CAMERA, fx=450.0, fy=450.0)), settings)

@@ -16,16 +16,16 @@ from list3r.memory.geometry import umeyama
 from list3r.reconstruction.sfm.consistency import contradicted
 from list3r.reconstruction.sfm.links import LinkSettings, step_beside
 from list3r.reconstruction.sfm.mapping import (
+    KeyframeView,
     MappingSettings,
     MapProblem,
     SparseMap,
-    View,
     agreed,
     build_maps,
     first_pairs,
 )
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
-from list3r.reconstruction.sfm.tracks import Tracks
+from list3r.reconstruction.sfm.tracks import CornerTracks
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import FRAMES, Held, centres, walk
 
@@ -101,7 +101,9 @@ def test_the_faster_the_picture_changes_the_nearer_are_the_frames_around(
 ) -> None:
     none = tuple(np.zeros(0, np.int64) for _ in range(frames))
     nowhere = tuple(np.zeros((0, 2), np.float32) for _ in range(frames))
-    tracks = Tracks(none, nowhere, tuple(range(keyframes)), np.zeros(frames, np.int64), np.zeros(frames, np.float32))
+    tracks = CornerTracks(
+        none, nowhere, tuple(range(keyframes)), np.zeros(frames, np.int64), np.zeros(frames, np.float32)
+    )
     assert step_beside(tracks, LinkSettings()) == step
 
 
@@ -126,7 +128,7 @@ def test_two_maps_agree_in_their_keyframes_and_their_error(grown: list[list[Spar
 
 
 def test_maps_are_also_grown_from_what_shares_most_in_the_second_and_the_last_third() -> None:
-    none = View(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    none = KeyframeView(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
     keys = range(0, 60, 2)
     steps = {(a, b): np.zeros((200 - (b - a), 2), np.int64) for a in keys for b in keys if a < b <= a + 20}
     steps[24, 34] = steps[50, 58] = np.zeros((500, 2), np.int64)  # five and four keyframes on
@@ -148,7 +150,7 @@ def test_views_beside_are_in_no_map() -> None:
     for key, x in enumerate((0.0, 0.2, 0.4, 0.6)):
         seen = points - (x, 0.0, 0.0)
         xy = seen[:, :2] / seen[:, 2:] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
-        views[key] = View(np.arange(200), xy.astype(np.float32))
+        views[key] = KeyframeView(np.arange(200), xy.astype(np.float32))
     rows = np.stack([np.arange(200)] * 2, axis=1)
     pairs = {(a, b): rows for a in range(4) for b in range(a + 1, 4)}
     (whole,) = build_maps(MapProblem(views, pairs), CAMERA)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.sfm.calibration import CalibrationSettings, _agreeing, _Estimate, _parted
-from list3r.reconstruction.sfm.tracks import TrackSettings, as_bright, follow_corners
+from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, _agreeing, _Estimate, _parted
+from list3r.reconstruction.sfm.tracks import CornerSettings, as_bright, follow_corners
 
 
 def wall(count: int = 24) -> list[np.ndarray]:
@@ -23,7 +23,7 @@ def wall(count: int = 24) -> list[np.ndarray]:
 
 def life(pictures: list[np.ndarray], **settings: float) -> float:
     """Frames in which a corner is seen, on average."""
-    tracks = follow_corners(pictures, TrackSettings(**settings))  # type: ignore[arg-type]
+    tracks = follow_corners(pictures, CornerSettings(**settings))  # type: ignore[arg-type]
     return float(np.bincount(np.concatenate(tracks.ids)).mean())
 
 
@@ -58,7 +58,7 @@ def test_brightness_and_contrast_are_told_by_places_that_show_the_same(gain: flo
 
 def test_windows_that_most_others_bear_out_are_believed() -> None:
     def kept(*focals: float) -> list[bool]:
-        found: list[bool] = _agreeing(np.array(focals), CalibrationSettings()).tolist()
+        found: list[bool] = _agreeing(np.array(focals), CameraCalibrationSettings()).tolist()
         return found
 
     assert kept(500) == [True] and kept(500, 520, 480, 900) == [True, True, True, False]
@@ -67,7 +67,7 @@ def test_windows_that_most_others_bear_out_are_believed() -> None:
 
 
 def test_a_zoom_is_told_of_and_windows_that_are_a_little_off_are_not() -> None:
-    camera, settings = Camera(640, 480, 500.0, 500.0, 319.5, 239.5), CalibrationSettings()
+    camera, settings = Camera(640, 480, 500.0, 500.0, 319.5, 239.5), CameraCalibrationSettings()
     assert _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (180, 890.0, 0.26)), 100), 1.0, settings) == ()
     (said,) = _parted(_Estimate([], camera, 0.0, ((140, 690.0, 0.0), (210, 950.0, 0.0)), 100), 2.0, settings)
     assert "1900 px from frame 210 on" in said and "690" not in said and "1380" not in said

@@ -18,7 +18,7 @@ from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.consistency import contradicted, epipolar_errors
-from list3r.reconstruction.sfm.fill import Segment, fill_segments
+from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
 from list3r.reconstruction.sfm.keyframe_features import (
     FinderSettings,
     LocalFeatures,
@@ -43,7 +43,7 @@ def kitchen(data: Path, every: int) -> tuple[tuple[Frame, ...], Camera]:
     return tuple(f for f in source.read(0, 12) if isinstance(f, Frame)), source.info.camera
 
 
-def segments(frames: tuple[Frame, ...], camera: Camera, detector: LearnedDetector | None) -> list[Segment]:
+def segments(frames: tuple[Frame, ...], camera: Camera, detector: LearnedDetector | None) -> list[PosedSegment]:
     """The poses of a chunk, without its dense depth."""
     model = SfmReconstructor(detector=detector)
     grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]

@@ -12,16 +12,16 @@ from list3r.simulation.rendering.render import RenderedFrame, Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path, look_poses
 from list3r.simulation.worlds.materials import Material, bake
-from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, Thing
+from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, SimulatedThing
 from list3r.simulation.worlds.truth import footprint_gap, true_relations, world_truth
-from list3r.simulation.worlds.world import World, make_world
+from list3r.simulation.worlds.world import SimulatedWorld, make_world
 
 CAMERA = Camera(160, 120, 131.25, 131.25, 79.5, 59.5)
 SEEDS = [0, 1, 2, 3]
 
 
 @pytest.fixture(scope="module", params=[0, 3])
-def world(request: pytest.FixtureRequest) -> World:
+def world(request: pytest.FixtureRequest) -> SimulatedWorld:
     return make_world(request.param)
 
 
@@ -78,7 +78,7 @@ def test_big_things_stay_within_their_walls(seed: int) -> None:
             assert corners[:, 2].min() > -1e-6
 
 
-def test_relations_are_consistent(world: World) -> None:
+def test_relations_are_consistent(world: SimulatedWorld) -> None:
     triples = true_relations(world)
     assert len(triples) == len(set(triples))
     beside = {(s, o) for s, p, o in triples if p == "next_to"}
@@ -119,7 +119,7 @@ def test_fewer_frames_cut_the_walk_and_more_slow_it() -> None:
 # ----------------------------------------------------------------------------------------------- renderer
 
 
-def test_every_point_lies_in_the_box_of_its_thing(world: World) -> None:
+def test_every_point_lies_in_the_box_of_its_thing(world: SimulatedWorld) -> None:
     renderer = Renderer(world, CAMERA)
     boxes = {t.id: t.box() for t in world.things}
     _, poses = camera_path(world.tour, None, PathSettings())
@@ -136,10 +136,10 @@ def test_every_point_lies_in_the_box_of_its_thing(world: World) -> None:
     assert len(seen) > 40
 
 
-def single(part: Part) -> World:
+def single(part: Part) -> SimulatedWorld:
     """A world of one thing at the origin."""
     room = make_world(0).rooms[0]
-    return World(0, (room,), (Thing(1, "thing", (part,), (0.0, 0.0, 0.0)),), ())
+    return SimulatedWorld(0, (room,), (SimulatedThing(1, "thing", (part,), (0.0, 0.0, 0.0)),), ())
 
 
 def view(eye: tuple[float, float, float], yaw_deg: float, pitch_deg: float = 0.0) -> np.ndarray:
@@ -183,16 +183,16 @@ def test_an_open_cylinder_shows_its_inside() -> None:
 
 
 def test_the_nearer_thing_hides_the_farther_whatever_the_order() -> None:
-    near = Thing(1, "near", (Part(BOX, (-1, 0, 0), (0.1, 0.1, 0.1), GREY),), (0.0, 0.0, 0.0))
-    far = Thing(2, "far", (Part(BOX, (1, 0, 0), (0.1, 3, 3), GREY),), (0.0, 0.0, 0.0))
+    near = SimulatedThing(1, "near", (Part(BOX, (-1, 0, 0), (0.1, 0.1, 0.1), GREY),), (0.0, 0.0, 0.0))
+    far = SimulatedThing(2, "far", (Part(BOX, (1, 0, 0), (0.1, 3, 3), GREY),), (0.0, 0.0, 0.0))
     room = make_world(0).rooms[0]
     for things in ((near, far), (far, near)):
-        frame = Renderer(World(0, (room,), things, ()), CAMERA).render(view((-3, 0, 0), 0))
+        frame = Renderer(SimulatedWorld(0, (room,), things, ()), CAMERA).render(view((-3, 0, 0), 0))
         assert frame.ids[60, 80] == 1
         assert frame.ids[10, 10] == 2
 
 
-def test_surfaces_have_texture_to_hold_on_to(world: World) -> None:
+def test_surfaces_have_texture_to_hold_on_to(world: SimulatedWorld) -> None:
     _, poses = camera_path(world.tour, None, PathSettings())
     renderer = Renderer(world, CAMERA)
     for pose in poses[::60]:
@@ -311,7 +311,7 @@ def test_changes_that_make_no_sense_are_named() -> None:
         random_changes(world, 0, moved=100)
 
 
-def test_the_truth_names_boxes_and_what_was_seen(world: World) -> None:
+def test_the_truth_names_boxes_and_what_was_seen(world: SimulatedWorld) -> None:
     truth = world_truth(world, {13: {"frames": 4, "largest_px": 99}})
     entries = {e["id"]: e for e in truth["instances"]}
     assert len(entries) == len(world.things)

@@ -15,7 +15,7 @@ from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.frames.source import SourceOptions
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
-from list3r.reconstruction.sfm.calibration import CalibrationSettings, _longest_run, _spans
+from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, _longest_run, _spans
 from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import render
 
@@ -87,14 +87,14 @@ def test_what_is_followed_through_a_stop_is_told_from_a_wall() -> None:
 
 def test_of_a_short_video_some_window_is_half_without_any_third_of_it() -> None:
     for count in range(120, 500, 7):
-        spans = _spans(count, CalibrationSettings())
+        spans = _spans(count, CameraCalibrationSettings())
         assert spans[0][0] == 0 and spans[-1][1] == count
         for first in range(0, count - count // 3, 5):
             behind = first + count // 3
             assert any(2 * max(first - a, b - behind) >= b - a - 2 for a, b in spans), (count, first)
-    assert _spans(40, CalibrationSettings()) == [(0, 40)]
-    assert _spans(300, CalibrationSettings()) == [(0, 100), (100, 200), (200, 300)]
-    assert [a for a, _ in _spans(1000, CalibrationSettings())] == [0, 225, 450, 675, 900]
+    assert _spans(40, CameraCalibrationSettings()) == [(0, 40)]
+    assert _spans(300, CameraCalibrationSettings()) == [(0, 100), (100, 200), (200, 300)]
+    assert [a for a, _ in _spans(1000, CameraCalibrationSettings())] == [0, 225, 450, 675, 900]
 
 
 def test_a_window_that_jumps_is_its_longer_part() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks.simulation.furnisher import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, moved
 from benchmarks.simulation.rooms import make_room
 from list3r.simulation.worlds.layout import Placer, Room
-from list3r.simulation.worlds.things import Thing
-from list3r.simulation.worlds.world import World
+from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.world import SimulatedWorld
 
 _GAP_M = 2 * HALF_WALL_M
 _LINK_AT_M = 1.1
@@ -73,7 +73,7 @@ class PlacedRoom:
 class Building:
     """A world with its rooms by name."""
 
-    world: World
+    world: SimulatedWorld
     corridor: PlacedRoom
     north: tuple[PlacedRoom, ...]
     south: tuple[PlacedRoom, ...]
@@ -92,8 +92,8 @@ def make_building(settings: BuildingSettings, seed: int) -> Building:
     rng = np.random.default_rng([seed, 21])
     catalogue = make_catalogue(Placer(rng))
     corridor_width = float(rng.uniform(*settings.corridor_m))
-    drawn: dict[str, tuple[RoomPlan, tuple[Thing, ...]]] = {}
-    things: list[Thing] = []
+    drawn: dict[str, tuple[RoomPlan, tuple[SimulatedThing, ...]]] = {}
+    things: list[SimulatedThing] = []
     rows: list[tuple[PlacedRoom, ...]] = []
     for kinds, south in ((settings.north, False), (settings.south, True)):
         x, row = 0.0, []
@@ -111,7 +111,7 @@ def make_building(settings: BuildingSettings, seed: int) -> Building:
     corridor = _place(things, "corridor", plan, make_room(Placer(rng), plan, catalogue), 0.0, None, False)
     rooms = tuple(Room(r.x0, r.x1, r.y1 - r.y0, r.turn != 0, r.y0) for row in rows for r in row)
     rooms += (Room(corridor.x0, corridor.x1, corridor_width, False),)
-    return Building(World(seed, rooms, tuple(things), ()), corridor, rows[0], rows[1])
+    return Building(SimulatedWorld(seed, rooms, tuple(things), ()), corridor, rows[0], rows[1])
 
 
 def _plan(rng: np.random.Generator, settings: BuildingSettings, name: str, links: tuple[bool, bool]) -> RoomPlan:
@@ -143,10 +143,10 @@ def _corridor_plan(
 
 
 def _place(
-    things: list[Thing],
+    things: list[SimulatedThing],
     name: str,
     plan: RoomPlan,
-    parts: tuple[Thing, ...],
+    parts: tuple[SimulatedThing, ...],
     x: float,
     corridor_width: float | None,
     south: bool,
@@ -170,7 +170,7 @@ def _place(
     return PlacedRoom(kind, twin, x0, y0, x1, y1, turn, tuple(t.id for t in placed), doorways)
 
 
-def appearance_classes(things: tuple[Thing, ...]) -> dict[int, int]:
+def appearance_classes(things: tuple[SimulatedThing, ...]) -> dict[int, int]:
     """Class of appearance of each thing, from its label and parts: copies share one, wherever they stand."""
     classes: dict[object, int] = {}
     return {t.id: classes.setdefault((t.label, t.parts), len(classes)) for t in things}

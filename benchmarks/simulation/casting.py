@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.rendering.projection import NEAR_M, Scene, screen_rectangles
-from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Solids, Thing
+from list3r.simulation.rendering.projection import NEAR_M, SolidScene, screen_rectangles
+from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, SimulatedThing, Solids
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -22,9 +22,9 @@ _FIRST = 24
 class Caster:
     """Casts depth and ids for one camera; things that move are put in their places through `scene`."""
 
-    def __init__(self, things: Sequence[Thing], camera: Camera, moving: Sequence[Thing] = ()) -> None:
+    def __init__(self, things: Sequence[SimulatedThing], camera: Camera, moving: Sequence[SimulatedThing] = ()) -> None:
         self._camera = camera
-        self.scene = Scene(things, moving)
+        self.scene = SolidScene(things, moving)
         self._solids = self.scene.solids
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)

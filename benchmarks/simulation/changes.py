@@ -8,9 +8,9 @@ import numpy as np
 
 from list3r.memory.errors import OptionError
 from list3r.simulation.worlds.layout import SMALL_KINDS, Placer
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import SimulatedThing
 from list3r.simulation.worlds.truth import footprint_gap
-from list3r.simulation.worlds.world import World
+from list3r.simulation.worlds.world import SimulatedWorld
 
 _TOPS = ("table", "desk", "side table", "cabinet")
 
@@ -37,7 +37,9 @@ class Change:
             raise OptionError(f"cannot add {self.label!r}: one of {', '.join(SMALL_KINDS)}")
 
 
-def random_changes(world: World, seed: int, moved: int = 2, removed: int = 1, added: int = 1) -> tuple[Change, ...]:
+def random_changes(
+    world: SimulatedWorld, seed: int, moved: int = 2, removed: int = 1, added: int = 1
+) -> tuple[Change, ...]:
     """Changes to small things on tables, drawn from a seed; no thing is changed twice."""
     rng = np.random.default_rng([seed, 5])
     tops = [t.id for t in world.things if t.label in _TOPS]
@@ -62,7 +64,7 @@ def random_changes(world: World, seed: int, moved: int = 2, removed: int = 1, ad
     return tuple(changes)
 
 
-def _first_with_room(world: World, wish: Change, targets: list[int]) -> Change:
+def _first_with_room(world: SimulatedWorld, wish: Change, targets: list[int]) -> Change:
     for target in targets[:-1]:
         try:
             apply_changes(world, (replace(wish, target=target),))
@@ -72,21 +74,21 @@ def _first_with_room(world: World, wish: Change, targets: list[int]) -> Change:
     return replace(wish, target=targets[-1])
 
 
-def apply_changes(world: World, changes: tuple[Change, ...]) -> World:
+def apply_changes(world: SimulatedWorld, changes: tuple[Change, ...]) -> SimulatedWorld:
     """The world after the changes. Raises `OptionError` for an unknown id or a target without room."""
     for change in changes:
         world = replace(world, things=_changed(world, change))
     return world
 
 
-def _changed(world: World, change: Change) -> tuple[Thing, ...]:
+def _changed(world: SimulatedWorld, change: Change) -> tuple[SimulatedThing, ...]:
     known = {t.id: t for t in world.things}
     for thing_id in (change.thing, change.target):
         if thing_id is not None and thing_id not in known:
             raise OptionError(f"no thing {thing_id} in the world: its ids go from 1 to {max(known)}")
     if change.kind == "added":
         parts, _ = Placer(np.random.default_rng([change.seed, 6])).small(change.label)
-        new = Thing(max(known) + 1, change.label, parts, (0.0, 0.0, 0.0))
+        new = SimulatedThing(max(known) + 1, change.label, parts, (0.0, 0.0, 0.0))
         return (*world.things, _put(world, new, known[_asked(change.target, "target")], change.seed))
     thing = known[_asked(change.thing, "thing")]
     with_it = {thing.id} | {t.id for t in world.things if thing.id in (t.support, t.container)}
@@ -107,7 +109,7 @@ def _asked(thing_id: int | None, name: str) -> int:
     return thing_id
 
 
-def _put(world: World, thing: Thing, target: Thing, seed: int) -> Thing:
+def _put(world: SimulatedWorld, thing: SimulatedThing, target: SimulatedThing, seed: int) -> SimulatedThing:
     """The thing at a free place on top of the target."""
     rng = np.random.default_rng([seed, 7])
     box = target.box()

@@ -10,7 +10,7 @@ import numpy as np
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import Placer, Room
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import SimulatedThing
 
 HALF_WALL_M = 0.05
 """Every room has its own half of each wall."""
@@ -191,7 +191,7 @@ class Furnisher:
         self.p.things[first:] = [moved(t, x, y, np.deg2rad(yaw_deg)) for t in self.p.things[first:]]
 
 
-def moved(thing: Thing, x: float, y: float, yaw: float, id_offset: int = 0) -> Thing:
+def moved(thing: SimulatedThing, x: float, y: float, yaw: float, id_offset: int = 0) -> SimulatedThing:
     """The thing after a turn about the origin and a shift; its id and those it names rise by `id_offset`."""
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     px, py, pz = thing.position

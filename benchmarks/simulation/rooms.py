@@ -20,10 +20,10 @@ from benchmarks.simulation.furnisher import (
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, wall_paint
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import SimulatedThing
 
 
-def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[Thing, ...]:
+def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[SimulatedThing, ...]:
     """All things of a room in its own coordinates: x from 0 to width, y from 0 to depth; ids from 1, the floor first.
 
     Colours, sizes and places are drawn from the placer's generator; its list of things must be empty.

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from benchmarks.simulation.buildings import Building, PlacedRoom
 from list3r.simulation.walk import PathSettings, walk_duration
-from list3r.simulation.worlds.things import Thing, stack_solids
+from list3r.simulation.worlds.things import SimulatedThing, stack_solids
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ class FreeMap:
         hull = cv2.convexHull(((corners - self._origin) / _CELL_M - 0.5).astype(np.float32))
         cv2.fillConvexPoly(image, np.rint(hull * 16).astype(np.int32), 1, shift=4)
 
-    def _occupied(self, things: list[Thing], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def _occupied(self, things: list[SimulatedThing], shape: tuple[int, ...]) -> NDArray[np.bool_]:
         image = np.zeros(shape, np.uint8)
         for box in stack_solids(things).corners() if things else ():
             if box[:, 2].max() > _BODY_M[0] and box[:, 2].min() < _BODY_M[1]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.worlds.world import World
+from list3r.simulation.worlds.world import SimulatedWorld
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class SimulatedVideo:
 
     preset: str
     seed: int
-    world: World
+    world: SimulatedWorld
     camera: Camera
     time_s: NDArray[np.float64]
     """Seconds. Shape (F,)."""

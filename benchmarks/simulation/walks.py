@@ -13,9 +13,9 @@ from benchmarks.simulation.changes import Change, apply_changes
 from benchmarks.simulation.presets import Shot, make_shot
 from list3r.memory.errors import OptionError
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.worlds.things import MovingThing, Thing
+from list3r.simulation.worlds.things import MovingThing, SimulatedThing
 from list3r.simulation.worlds.truth import rounded
-from list3r.simulation.worlds.world import World
+from list3r.simulation.worlds.world import SimulatedWorld
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ChangedWalk(WalkSettings):
 
     changes: tuple[Change, ...] = ()
 
-    def world(self) -> World:
+    def world(self) -> SimulatedWorld:
         """The world after its changes."""
         return apply_changes(super().world(), self.changes)
 
@@ -38,7 +38,7 @@ class PresetWalk(WalkSettings):
 
     preset: str = "calm"
 
-    def world(self) -> World:
+    def world(self) -> SimulatedWorld:
         """The world of the building."""
         return self._shot().building.world
 
@@ -75,7 +75,7 @@ def _shot(preset: str, seed: int) -> Shot:
     return make_shot(preset, seed)
 
 
-def _mover_truth(thing: Thing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
+def _mover_truth(thing: SimulatedThing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
     """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
 
     `thing` is at the origin, `T_world_object` (F, 4, 4) upright, metres.

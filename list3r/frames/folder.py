@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_depth, used_bits
 from list3r.frames.exif import exif_focal
-from list3r.frames.layout import FrameFile, Layout, pose_matrix, read_numbers
+from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics, resized
 from list3r.frames.selection import select, sharpness
@@ -32,7 +32,7 @@ _LEAST_M, _MOST_M = 0.1, 30.0
 class FolderSource:
     """A `FrameSource` over files; nothing is kept between frames."""
 
-    def __init__(self, root: Path, layout: Layout, options: SourceOptions) -> None:
+    def __init__(self, root: Path, layout: FolderLayout, options: SourceOptions) -> None:
         """Raises `SourceError` and `OptionError` where the first images and the cameras do not fit together."""
         self._layout, self._options = layout, options
         rate = _rate(layout.files)

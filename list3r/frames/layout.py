@@ -48,7 +48,7 @@ class Optics:
 
 
 @dataclass(frozen=True)
-class Layout:
+class FolderLayout:
     """A folder that was recognised."""
 
     kind: str

@@ -17,7 +17,7 @@ _MEASURED_PX = 320
 
 
 @dataclass(frozen=True)
-class Selection:
+class FrameSelection:
     """One window of frame numbers for each frame handed out; windows ascend and do not overlap."""
 
     starts: NDArray[np.int64]
@@ -35,7 +35,9 @@ class Selection:
         return max(0, int(np.searchsorted(self.starts, number, side="right")) - 1)
 
 
-def select(times_s: NDArray[np.float64], options: SourceOptions, root: Path, *, clock: bool, video: bool) -> Selection:
+def select(
+    times_s: NDArray[np.float64], options: SourceOptions, root: Path, *, clock: bool, video: bool
+) -> FrameSelection:
     """The frames that the options leave of a source.
 
     `times_s` (F,) are the frames' times, ascending, from the source's `clock` or made up from a frame rate. With a
@@ -63,7 +65,7 @@ def select(times_s: NDArray[np.float64], options: SourceOptions, root: Path, *, 
     stops = np.append(starts[1:], last)
     thinned = bool((stops - starts > 1).any())
     sharpest = thinned and (video if options.sharpest is None else options.sharpest)
-    return Selection(starts, stops if sharpest else starts + 1, sharpest)
+    return FrameSelection(starts, stops if sharpest else starts + 1, sharpest)
 
 
 def _range_text(options: SourceOptions) -> str:

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from list3r.frames.base import Camera, FrameSource, SourceInfo
 from list3r.frames.folder import FolderSource
-from list3r.frames.layout import IMAGE_ENDINGS, Layout
+from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers import images, replica, seven_scenes, tum
 from list3r.memory.errors import SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
 
-FOLDERS: dict[str, Callable[[Path, SourceOptions], Layout | None]] = {
+FOLDERS: dict[str, Callable[[Path, SourceOptions], FolderLayout | None]] = {
     "7scenes": seven_scenes.find,
     "tum": tum.find,
     "replica": replica.find,

@@ -12,7 +12,7 @@ FEATURE_SPACE = "geometric-color@1/64"
 
 
 @dataclass(frozen=True)
-class NoiseSettings:
+class DepthNoiseSettings:
     """Standard deviation of one depth reading: base + quadratic * z^2 (structured light and stereo)."""
 
     base_m: float = 0.0015
@@ -20,7 +20,7 @@ class NoiseSettings:
 
 
 @dataclass(frozen=True)
-class ViewSettings:
+class AnchorViewSettings:
     """How neighbouring frames are fused into an anchor's view."""
 
     width_px: int = 320
@@ -33,7 +33,7 @@ class ViewSettings:
     """Depth noisier than this (5 m away with the default noise) shows no things and is left out,"""
     max_computed: float = 0.025
     """unless it was computed and its deviation is less than this share of depth: walls far off still bound the room."""
-    noise: NoiseSettings = field(default_factory=NoiseSettings)
+    noise: DepthNoiseSettings = field(default_factory=DepthNoiseSettings)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SegmentSettings:
 
 
 @dataclass(frozen=True)
-class TrackSettings:
+class MaskTrackSettings:
     """How masks are followed and which tracks are kept."""
 
     min_frames: int = 5
@@ -87,9 +87,9 @@ class InstanceSettings:
     """Frames from one anchor to the next; the sharpest of each run is taken (paper: at least every 50)."""
     min_score: float = 0.2
     """Prompts below this confidence are not followed."""
-    view: ViewSettings = field(default_factory=ViewSettings)
+    view: AnchorViewSettings = field(default_factory=AnchorViewSettings)
     segment: SegmentSettings = field(default_factory=SegmentSettings)
-    track: TrackSettings = field(default_factory=TrackSettings)
+    track: MaskTrackSettings = field(default_factory=MaskTrackSettings)
 
     @property
     def feature_space(self) -> str:

@@ -8,7 +8,7 @@ from list3r.memory.errors import OptionError
 from list3r.models.cache import resolve
 from list3r.models.cards import ModelCard
 from list3r.models.licences import check_profile, choose_weights
-from list3r.models.presets import Selection, missing_package
+from list3r.models.presets import ModelSelection, missing_package
 
 PARTS_OF_OPTIONS = {
     "reconstruction": "geometry",
@@ -36,7 +36,7 @@ def parse_weights(words: list[str] | None) -> dict[str, str]:
     return found
 
 
-def check_allowed(selection: Selection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
+def check_allowed(selection: ModelSelection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
     """The weights to use, by option, those asked for and those that the licence profile leaves of the cards'.
 
     Nothing is loaded or fetched. Raises `OptionError` for what the profile forbids and for packages that are missing.
@@ -59,7 +59,7 @@ def check_package(card: ModelCard) -> None:
         raise OptionError(f"{card.name} needs the package {missing}: {card.install}")
 
 
-def pinned_weights(selection: Selection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
+def pinned_weights(selection: ModelSelection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
     """The weights of every model, by option, as a path or `owner/name@commit`; what is not in the cache is fetched.
 
     Nothing is fetched before all of them are allowed. Raises `OptionError` as `check_allowed` and `cache.resolve` do.

@@ -16,7 +16,7 @@ PRESETS = ("cpu", "light", "paper", "auto")
 
 
 @dataclass(frozen=True)
-class Selection:
+class ModelSelection:
     """The models of a run, by the names that the options know."""
 
     reconstruction: str = "auto"
@@ -39,25 +39,25 @@ class Selection:
         return [(option, card) for option, card in found if card is not None]
 
 
-def select(preset: str, *, has_depth: bool, profile: str, gpu: Gpu | None) -> Selection:
+def select(preset: str, *, has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelection:
     """The models of a preset for a source. Raises `OptionError` for a preset that is not known."""
     if preset == "cpu":
-        return Selection(why="preset cpu: no weights")
+        return ModelSelection(why="preset cpu: no weights")
     if preset == "light":
         geometry = "auto" if has_depth else "da3"
-        return Selection(geometry, "eomt", "edgetam", "dinov2", "preset light: small networks, free for any use")
+        return ModelSelection(geometry, "eomt", "edgetam", "dinov2", "preset light: small networks, free for any use")
     if preset == "paper":
-        return Selection("pi3", "eomt", "sam3", "own", "preset paper: the models of the paper")
+        return ModelSelection("pi3", "eomt", "sam3", "own", "preset paper: the models of the paper")
     if preset == "auto":
         return _by_machine(has_depth, profile, gpu)
     raise OptionError(f"--preset {preset} is not known; choose {', '.join(PRESETS)}")
 
 
-def _by_machine(has_depth: bool, profile: str, gpu: Gpu | None) -> Selection:
+def _by_machine(has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelection:
     """The best models that are installed, fetched, and allowed; without a GPU none that has weights."""
     if gpu is None:
-        return Selection(why="preset auto: no GPU, so nothing that has weights")
-    chosen = Selection()
+        return ModelSelection(why="preset auto: no GPU, so nothing that has weights")
+    chosen = ModelSelection()
     reasons: list[str] = []
     wanted = {
         "reconstruction": ("geometry", () if has_depth else ("pi3x", "pi3", "mapanything", "vggt", "da3")),

@@ -21,7 +21,7 @@ from list3r.memory.store.store import Store
 from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
-from list3r.models.presets import Selection
+from list3r.models.presets import ModelSelection
 from list3r.pipeline.calibration import camera_key, camera_notes, with_camera
 from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
 from list3r.pipeline.joint_windows import joint_windows
@@ -273,7 +273,7 @@ def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> Bui
     Raises `OptionError` for what the licence profile forbids, when a package is missing, or when weights can be had
     neither from the disk nor from the hub.
     """
-    chosen = Selection(settings.reconstruction, settings.discovery, settings.tracking, settings.features)
+    chosen = ModelSelection(settings.reconstruction, settings.discovery, settings.tracking, settings.features)
     known = dict(settings.instance_weights)
     asked = {name: known[key] for name in PARTS_OF_OPTIONS if (key := f"{name}/{getattr(chosen, name)}") in known}
     if settings.weights is not None:

@@ -23,7 +23,7 @@ from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.things import MovingThing
 from list3r.simulation.worlds.truth import world_truth
-from list3r.simulation.worlds.world import World, make_world
+from list3r.simulation.worlds.world import SimulatedWorld, make_world
 
 DEPTH_UNITS_PER_M = 5000.0
 _BATCH = 12
@@ -64,7 +64,7 @@ class WalkSettings:
         focal = 525.0 * width / 640 if self.focal is None else self.focal
         return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
-    def world(self) -> World:
+    def world(self) -> SimulatedWorld:
         """The world that is filmed."""
         return make_world(self.seed)
 

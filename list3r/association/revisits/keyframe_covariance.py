@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from list3r.association.graph.edge_information import about
 from list3r.association.graph.solver import adjoint
 from list3r.memory.geometry import Sim3
-from list3r.reconstruction.rgbd.registration import Registration
+from list3r.reconstruction.rgbd.registration import FrameRegistration
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ class KeyframeErrorSettings:
 
 
 def registration_covariance(
-    found: Registration, T_chunk_cam: Array, depth: float, settings: KeyframeErrorSettings
+    found: FrameRegistration, T_chunk_cam: Array, depth: float, settings: KeyframeErrorSettings
 ) -> Array:
     """Covariance of a rigid S_v_u through a registration of v's view to u's keyframe at `T_chunk_cam` (4, 4), whose
     middle depth is `depth`: of x in S_true = S_v_u exp(x), u's units, sigma 0. Shape (7, 7).

@@ -17,8 +17,8 @@ from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
 from list3r.reconstruction.features.local import FeaturePose, FeatureSettings, match, relative_pose
-from list3r.reconstruction.rgbd.registration import Anchors, Registration, RegistrationSettings, Samples, register
-from list3r.reconstruction.rgbd.view import SensorNoise, View, surface
+from list3r.reconstruction.rgbd.registration import Anchors, FrameRegistration, RegistrationSettings, Samples, register
+from list3r.reconstruction.rgbd.view import SensorNoise, WorkingFrame, surface
 
 Pose = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class VerificationSettings:
 class _Side:
     """A keyframe as a view."""
 
-    view: View
+    view: WorkingFrame
     samples: Samples
 
 
@@ -108,7 +108,7 @@ def _side(keyframe: Keyframe, noise: SensorNoise) -> _Side:
     camera = Camera(width, height, *keyframe.camera_small)
     depth = np.ascontiguousarray(keyframe.depth_small, np.float32)
     points, normals, valid = surface(depth, camera)
-    view = View(camera, depth, points, normals, valid, np.zeros_like(depth))
+    view = WorkingFrame(camera, depth, points, normals, valid, np.zeros_like(depth))
     return _Side(view, Samples(points[valid][::2], normals[valid][::2]))
 
 
@@ -119,7 +119,7 @@ def _refine(
     a: NDArray[np.float32],
     b: NDArray[np.float32],
     settings: VerificationSettings,
-) -> Registration | None:
+) -> FrameRegistration | None:
     """T_u_v from depth and the features that agree, in the camera coordinates of u."""
     T = pose.T_a_b
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
@@ -182,7 +182,7 @@ class _EdgeBuilder:
     def judged(
         self,
         T_v_u: Pose,
-        found: Registration,
+        found: FrameRegistration,
         checks: tuple[_Check, _Check],
         pose: FeaturePose,
         settings: VerificationSettings,

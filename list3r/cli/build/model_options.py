@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from list3r.frames.base import SourceInfo
     from list3r.frames.chunking.chunks import ChunkSettings
     from list3r.models.cards import ModelCard
-    from list3r.models.presets import Selection
+    from list3r.models.presets import ModelSelection
     from list3r.pipeline.chunk import BuildSettings
 
 Reconstruction = Annotated[
@@ -202,7 +202,7 @@ def build_settings(
     return replace(settings, chunks=chunks, depth_every=depth_every if wanted is None else wanted), notes
 
 
-def _check_used(asked: Mapping[str, str], selection: Selection) -> None:
+def _check_used(asked: Mapping[str, str], selection: ModelSelection) -> None:
     """Raises `OptionError` for weights of a part whose model has none, so that nobody waits for another result."""
     from list3r.memory.errors import OptionError
 
@@ -232,12 +232,12 @@ def _local_features(words: str) -> tuple[str, str | None]:
     return kind, str(path)
 
 
-def _selection(info: SourceInfo, words: ModelWords) -> Selection:
+def _selection(info: SourceInfo, words: ModelWords) -> ModelSelection:
     """The preset's models, or the classical ones, with what was asked for by name put in their place."""
     from list3r.models.device import find_gpu
-    from list3r.models.presets import Selection, select
+    from list3r.models.presets import ModelSelection, select
 
-    chosen = Selection()
+    chosen = ModelSelection()
     if words.preset is not None:
         gpu = find_gpu(words.device) if words.preset == "auto" else None
         chosen = select(words.preset, has_depth=info.has_depth, profile=words.licence, gpu=gpu)
@@ -254,7 +254,7 @@ def _selection(info: SourceInfo, words: ModelWords) -> Selection:
     return replace(chosen, **named)
 
 
-def _terms(selection: Selection, chosen: Mapping[str, str]) -> list[str]:
+def _terms(selection: ModelSelection, chosen: Mapping[str, str]) -> list[str]:
     """Licences that a user of the models should know of."""
     from list3r.models.cards import find_weights
     from list3r.models.licences import terms

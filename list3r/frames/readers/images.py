@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.layout import (
     IMAGE_ENDINGS,
+    FolderLayout,
     FrameFile,
-    Layout,
     Optics,
     natural_key,
     pose_matrix,
@@ -23,7 +23,7 @@ _COLOR_FOLDERS = ("images", "rgb", "color", "colour", "image")
 _POSE_FILES = ("poses.txt", "traj.txt")
 
 
-def find(root: Path, options: SourceOptions) -> Layout | None:
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout, or None when there are no images in the folder or in its `images`, `rgb` or `color`."""
     folder = next((f for f in (root, *(root / name for name in _COLOR_FOLDERS)) if _images(f)), None)
     if folder is None:
@@ -38,9 +38,9 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
     )
     written = read_calibration(root)
     if written is None:
-        return Layout("images", files, Optics(), notes=notes)
+        return FolderLayout("images", files, Optics(), notes=notes)
     optics = Optics(*written)
-    return Layout("images", files, optics, "color", written[0], ("intrinsics of calibration.txt", *notes))
+    return FolderLayout("images", files, optics, "color", written[0], ("intrinsics of calibration.txt", *notes))
 
 
 def _images(folder: Path) -> list[Path]:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.layout import (
     IMAGE_ENDINGS,
+    FolderLayout,
     FrameFile,
-    Layout,
     Optics,
     natural_key,
     pose_matrix,
@@ -24,7 +24,7 @@ _NICE_SLAM: Intrinsics = (600.0, 600.0, 599.5, 339.5)
 _SCALE = 6553.5
 
 
-def find(root: Path, options: SourceOptions) -> Layout | None:
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout, or None when the folder has another."""
     base = root.parent if root.name == "results" and (root.parent / "traj.txt").is_file() else root
     results = base / "results"
@@ -42,7 +42,7 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
     )
     intrinsics, scale, note = _camera(base, options)
     optics = Optics(intrinsics, depth_scale=scale)
-    return Layout("replica", files, optics, "color", intrinsics, (*note, *notes))
+    return FolderLayout("replica", files, optics, "color", intrinsics, (*note, *notes))
 
 
 def _poses(path: Path, colors: list[str]) -> tuple[list[NDArray[np.float64] | None], tuple[str, ...]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.frames.layout import FrameFile, Layout, Optics, natural_key, read_numbers
+from list3r.frames.layout import FolderLayout, FrameFile, Optics, natural_key, read_numbers
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.memory.errors import SourceError
 
@@ -28,7 +28,7 @@ KINECT_T_COLOR_DEPTH = np.array(
 )
 
 
-def find(root: Path, options: SourceOptions) -> Layout | None:
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout, or None when the folder has another. Raises `SourceError` for several sequences in one folder."""
     folder = _sequence_folder(root)
     if folder is None:
@@ -43,12 +43,12 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
             f"{note}; depth and colour are not registered in 7-Scenes, and its depth camera of 585 px is nominal: the "
             "measured cameras of its Kinect are used"
         )
-        return Layout("7scenes", files, optics, "depth", intrinsics, (known,))
+        return FolderLayout("7scenes", files, optics, "depth", intrinsics, (known,))
     other = (
         "the intrinsics are not those of the 7-Scenes Kinect, so depth is taken as registered into the colour image; "
         "give --depth-intrinsics and --depth-to-color if it is not"
     )
-    return Layout("7scenes", files, Optics(intrinsics, depth_scale=1000.0), "color", intrinsics, (note, other))
+    return FolderLayout("7scenes", files, Optics(intrinsics, depth_scale=1000.0), "color", intrinsics, (note, other))
 
 
 def _is_kinect(intrinsics: Intrinsics) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.frames.layout import FrameFile, Layout, Optics, read_calibration, read_numbers, read_text
+from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_calibration, read_numbers, read_text
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
 from list3r.memory.errors import SourceError
 
@@ -32,7 +32,7 @@ _PUBLISHED: dict[str, tuple[Intrinsics, tuple[float, ...]]] = {
 _FREIBURG = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", re.IGNORECASE)
 
 
-def find(root: Path, options: SourceOptions) -> Layout | None:
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout, or None when the folder has another. Raises `SourceError` for lists that cannot be read."""
     if not (root / "rgb.txt").is_file():
         return None
@@ -58,7 +58,7 @@ def find(root: Path, options: SourceOptions) -> Layout | None:
     )
     intrinsics, distortion, camera_note = _camera(root, options)
     optics = Optics(intrinsics, distortion, depth_scale=5000.0)
-    return Layout("tum", files, optics, "color", intrinsics, (*camera_note, *notes))
+    return FolderLayout("tum", files, optics, "color", intrinsics, (*camera_note, *notes))
 
 
 def associate(a_s: NDArray[np.float64], b_s: NDArray[np.float64], max_gap_s: float) -> NDArray[np.int64]:

@@ -25,7 +25,7 @@ from list3r.memory.errors import FrameError, SourceError
 
 
 @dataclass(frozen=True)
-class CalibrateSettings:
+class DepthCalibrationSettings:
     """How the search is done."""
 
     frames: int = 24
@@ -54,7 +54,7 @@ class CalibrateSettings:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class DepthCalibration:
     """What was found, and how sure it is."""
 
     status: str
@@ -128,13 +128,13 @@ class Calibration:
 
 
 def calibrate(
-    source_path: str | Path, options: SourceOptions | None = None, settings: CalibrateSettings | None = None
-) -> Calibration:
+    source_path: str | Path, options: SourceOptions | None = None, settings: DepthCalibrationSettings | None = None
+) -> DepthCalibration:
     """Estimate the colour camera relative to the depth camera of a folder with both.
 
     Raises `SourceError` when the source has no depth or no first guess of a camera.
     """
-    options, settings = options or SourceOptions(), settings or CalibrateSettings()
+    options, settings = options or SourceOptions(), settings or DepthCalibrationSettings()
     source = open_source(source_path, replace(options or SourceOptions(), max_side=0))
     if not isinstance(source, FolderSource) or not source.info.has_depth:
         raise SourceError(f"{source_path} has no depth images: there is nothing to calibrate")
@@ -152,7 +152,7 @@ def calibrate(
     return _result(fit, verdict, assumed, best, std, depth_intrinsics, positions)
 
 
-def _search(fit: EdgeFit, settings: CalibrateSettings) -> tuple[Array, dict[str, float]]:
+def _search(fit: EdgeFit, settings: DepthCalibrationSettings) -> tuple[Array, dict[str, float]]:
     """The best camera from coarse to fine, without a distortion that the data do not show, and its uncertainty."""
     finest, free = settings.levels_px[-1], [0, 1, 2, 3]
     free += ([5, 6] if settings.center else []) + ([7, 8, 9] if settings.rotation else [])
@@ -168,7 +168,7 @@ def _search(fit: EdgeFit, settings: CalibrateSettings) -> tuple[Array, dict[str,
     return best, std
 
 
-def _judge(fit: EdgeFit, best: Array, std: dict[str, float], settings: CalibrateSettings) -> tuple[str, str]:
+def _judge(fit: EdgeFit, best: Array, std: dict[str, float], settings: DepthCalibrationSettings) -> tuple[str, str]:
     """Status and reason."""
     score, start = fit.score(best, settings.levels_px[-1]), fit.start()
     if score < settings.least_score:
@@ -203,12 +203,12 @@ def _result(
     std: dict[str, float],
     depth_intrinsics: Intrinsics,
     positions: list[int],
-) -> Calibration:
+) -> DepthCalibration:
     T_color_depth = np.eye(4)
     T_color_depth[:3, :3] = Rotation.from_rotvec(v[7:]).as_matrix()
     T_color_depth[:3, 3] = v[2:5]
     aspect, moved = fit.aspect, fit.moved_px(v)
-    return Calibration(
+    return DepthCalibration(
         status=verdict[0],
         reason=verdict[1],
         intrinsics=(float(v[0]), float(v[0] * aspect), float(v[5]), float(v[6])),
@@ -225,7 +225,7 @@ def _result(
 
 
 def _still_pairs(
-    source: FolderSource, settings: CalibrateSettings
+    source: FolderSource, settings: DepthCalibrationSettings
 ) -> tuple[list[int], list[tuple[NDArray[np.uint8], NDArray[np.float32]]]]:
     """Positions and raw images of the stillest frame of each part of the source."""
     total = source.info.frame_count

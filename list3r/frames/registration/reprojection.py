@@ -17,7 +17,7 @@ _SLANT = math.tan(math.radians(80.0))
 _NOISE_PER_M = 0.006
 
 
-class Registration:
+class DepthReprojection:
     """Moves depth images of one camera onto the pixels of another, with everything that does not change tabulated."""
 
     def __init__(self, depth_camera: Camera, color_camera: Camera, T_color_depth: NDArray[np.float64]) -> None:

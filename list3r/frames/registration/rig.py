@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.frames.decode import clean_depth
-from list3r.frames.layout import Layout, Optics
+from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import Intrinsics, SourceOptions
-from list3r.frames.registration.reprojection import Registration, Undistortion
+from list3r.frames.registration.reprojection import DepthReprojection, Undistortion
 from list3r.frames.selection import working_size
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
 
-def merge_optics(layout: Layout, options: SourceOptions) -> tuple[Optics, tuple[str, ...]]:
+def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, tuple[str, ...]]:
     """What the layout knows, overruled by what the user says, with notes on what that leaves to assume."""
     optics, notes = layout.optics, []
     if options.registered:
@@ -57,7 +57,7 @@ class Rig:
     depth_scale: float
     max_depth_m: float | None
     undistortion: Undistortion | None
-    registration: Registration | None
+    registration: DepthReprojection | None
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorted colour. Shape (H, W, 3). Raises `FrameError` for another size than the first frame's."""
@@ -126,7 +126,7 @@ def build_rig(
 
 def _registration(
     optics: Optics, camera: Camera | None, depth_size: tuple[int, int], color_size: tuple[int, int]
-) -> Registration | None:
+) -> DepthReprojection | None:
     if optics.depth_intrinsics is None:
         if depth_size != color_size:
             raise SourceError(
@@ -139,7 +139,7 @@ def _registration(
     depth_camera = _camera(optics.depth_intrinsics, depth_size, "depth intrinsics", ())
     assert depth_camera is not None and optics.T_color_depth is not None
     same = replace(camera, distortion=()) == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
-    return None if same else Registration(depth_camera, camera, optics.T_color_depth)
+    return None if same else DepthReprojection(depth_camera, camera, optics.T_color_depth)
 
 
 def _camera(

@@ -17,7 +17,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.instances.carving.carved_surfaces import Bools, ChangedPlaceSettings, Ints, Seen, ask, gone, lift, told
+from list3r.instances.carving.carved_surfaces import (
+    Bools,
+    CarvedSurfaces,
+    ChangedPlaceSettings,
+    Ints,
+    ask,
+    gone,
+    lift,
+    told,
+)
 from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE
@@ -45,7 +54,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         return 0
     keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
     upright = store.get_value("gravity", "unknown") != "unknown"
-    asked: list[tuple[ChunkRow, list[View], float, Seen]] = []
+    asked: list[tuple[ChunkRow, list[View], float, CarvedSurfaces]] = []
     for chunk in near:
         others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
         if others and store.feature_space(chunk.chunk_id) == FEATURE_SPACE:

@@ -59,7 +59,7 @@ class ChangedPlaceSettings:
 
 
 @dataclass(frozen=True)
-class Seen:
+class CarvedSurfaces:
     """The surfaces of one chunk, one point for each occupied cell, world coordinates, with what frames tell of them."""
 
     points: Array
@@ -81,10 +81,10 @@ def lift(view: View) -> tuple[Array, Ints, Ints]:
     return view.S_cam_world.inverse().apply(p), row, column
 
 
-def ask(own: Sequence[View], others: Sequence[View], unit: float, s: ChangedPlaceSettings) -> Seen:
+def ask(own: Sequence[View], others: Sequence[View], unit: float, s: ChangedPlaceSettings) -> CarvedSurfaces:
     """The surfaces that a chunk's keyframes see, and what the frames of the other sessions tell of them."""
     points = _cells([lift(v) for v in own], own, unit, s)
-    blocks = _Blocks(points, s.block_m * unit)
+    blocks = _SurfaceBlocks(points, s.block_m * unit)
     counts = {}
     for name, views in (("own", own), ("others", others)):
         met, free = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
@@ -96,10 +96,10 @@ def ask(own: Sequence[View], others: Sequence[View], unit: float, s: ChangedPlac
         counts[name] = met, free
     met, free = counts["own"]
     sure = (met >= s.least_told) & (free <= s.own_free * met)
-    return Seen(points, counts["others"][1], counts["others"][0], sure)
+    return CarvedSurfaces(points, counts["others"][1], counts["others"][0], sure)
 
 
-class _Blocks:
+class _SurfaceBlocks:
     """Points sorted into large cells, so that a frame is asked only about those that it may see."""
 
     def __init__(self, points: Array, edge: float) -> None:
@@ -140,12 +140,12 @@ def _cells(
     return np.stack([np.bincount(at, points[:, k]) / count for k in range(3)], axis=1)
 
 
-def gone(seen: Seen, s: ChangedPlaceSettings) -> Array:
+def gone(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     """The surfaces that the other sessions see through. Shape (N, 3)."""
     through = (seen.free >= s.least_told) & (seen.free >= s.free_share * (seen.free + seen.met))
     return np.asarray(seen.points[seen.own & through])
 
 
-def told(seen: Seen, s: ChangedPlaceSettings) -> Array:
+def told(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     """The surfaces that the other sessions tell of, one way or the other. Shape (K, 3)."""
     return np.asarray(seen.points[seen.free + seen.met >= s.least_told])

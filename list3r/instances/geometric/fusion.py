@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.instances.settings import NoiseSettings
+from list3r.instances.settings import DepthNoiseSettings
 
 Float = NDArray[np.float32]
 
@@ -52,7 +52,7 @@ def small_color(color: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(blurred[::stride, ::stride])
 
 
-def single_sigma(depth: Float, noise: NoiseSettings, unit: float) -> Float:
+def single_sigma(depth: Float, noise: DepthNoiseSettings, unit: float) -> Float:
     """Standard deviation of depth readings by the noise model. Shape (...)."""
     metres = depth / np.float32(unit)
     return np.asarray((noise.base_m + noise.quadratic_per_m * metres * metres) * unit, dtype=np.float32)

@@ -21,7 +21,7 @@ from list3r.instances.geometric.fusion import (
     working_camera,
 )
 from list3r.instances.geometric.registration import align_views, moved_view
-from list3r.instances.settings import InstanceSettings, ViewSettings
+from list3r.instances.settings import AnchorViewSettings, InstanceSettings
 from list3r.reconstruction.base import Reconstruction, backproject
 
 
@@ -177,7 +177,7 @@ def working_unit(reconstruction: Reconstruction) -> float:
     return float(np.median(sample)) / 2.0 if len(sample) else 1.0
 
 
-def _neighbours(reconstruction: Reconstruction, position: int, settings: ViewSettings) -> list[int]:
+def _neighbours(reconstruction: Reconstruction, position: int, settings: AnchorViewSettings) -> list[int]:
     low, high = position - settings.reach, position + settings.reach + 1
     wanted = range(low + (position - low) % settings.step, high, settings.step)
     count = len(reconstruction.posed)

@@ -13,8 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.reconstruction.rgbd.registration import Registration, RegistrationSettings, Samples, register, steps_without
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, View
+from list3r.reconstruction.rgbd.registration import (
+    FrameRegistration,
+    RegistrationSettings,
+    Samples,
+    register,
+    steps_without,
+)
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise, WorkingFrame
 
 Mask = NDArray[np.bool_]
 Pose = NDArray[np.float64]
@@ -71,7 +77,9 @@ class Fit:
         return total / max(1, self.count_inside + self.count_outside)
 
 
-def fit(model: Samples, view: View, mask: Mask, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise) -> Fit:
+def fit(
+    model: Samples, view: WorkingFrame, mask: Mask, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
+) -> Fit:
     """Mean cost inside and outside a mask."""
     cost, pixel = pixel_costs(model, view, T_model_cam, settings, noise)
     return _split(cost, mask.ravel()[pixel])
@@ -82,7 +90,7 @@ def _split(cost: Floats, moving: Mask) -> Fit:
 
 
 def pixel_costs(
-    model: Samples, view: View, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
+    model: Samples, view: WorkingFrame, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Truncated squares of depth and brightness residuals in units of noise, summed, and the pixels they fall on."""
     camera, gray = view.camera, model.gray
@@ -107,7 +115,7 @@ def pixel_costs(
     return np.asarray(cost, np.float32), pixel
 
 
-def surfaces(view: View, settings: MoverSettings, noise: SensorNoise) -> list[Mask]:
+def surfaces(view: WorkingFrame, settings: MoverSettings, noise: SensorNoise) -> list[Mask]:
     """Masks of the surfaces that are parted from their surroundings by steps of depth, largest first."""
     depth, area = view.depth, view.depth.size
     step = np.float32(settings.depth_step) * depth + 3 * noise.sigma(depth)
@@ -126,20 +134,20 @@ def surfaces(view: View, settings: MoverSettings, noise: SensorNoise) -> list[Ma
     return [_grown(labels == k, 7) for k in chosen]
 
 
-def without(view: View, mask: Mask) -> View:
+def without(view: WorkingFrame, mask: Mask) -> WorkingFrame:
     """The view with a part unknown."""
     return replace(view, valid=view.valid & ~mask)
 
 
 def find_mover(
     model: Samples,
-    view: View,
+    view: WorkingFrame,
     T_guess: Pose,
-    found: Registration,
+    found: FrameRegistration,
     registration: RegistrationSettings,
     settings: MoverSettings,
     noise: SensorNoise,
-) -> tuple[Mask, Registration] | None:
+) -> tuple[Mask, FrameRegistration] | None:
     """The surface that moves of its own most plainly, and the view registered without it; None where nothing does."""
     best: tuple[float, Mask] | None = None
     few = _every(model, settings.check_stride)
@@ -168,8 +176,8 @@ def find_mover(
 
 def suspects(
     model: Samples,
-    view: View,
-    found: Registration,
+    view: WorkingFrame,
+    found: FrameRegistration,
     registration: RegistrationSettings,
     settings: MoverSettings,
     noise: SensorNoise,
@@ -205,7 +213,7 @@ class MoverMemory:
         self._trial_age = 0
         self._home = -1
 
-    def expect(self, view: View) -> Mask | None:
+    def expect(self, view: WorkingFrame) -> Mask | None:
         """What of the next view still belongs to the mover."""
         if self.mask is None or not self.mask.any():
             return None
@@ -217,7 +225,7 @@ class MoverMemory:
             out |= self.mask
         return out
 
-    def keep(self, view: View, mask: Mask, T_model_cam: Pose, usual: float, home: int) -> Mask:
+    def keep(self, view: WorkingFrame, mask: Mask, T_model_cam: Pose, usual: float, home: int) -> Mask:
         """Remember what moves in a followed view (the whole one); returns it, or nothing once it has stood still.
 
         `usual` is the mean cost of what does not move, `home` the number of the segment whose coordinates are meant.
@@ -239,7 +247,7 @@ class MoverMemory:
         return mask
 
 
-def _samples(view: View, mask: Mask, T_model_cam: Pose) -> Samples:
+def _samples(view: WorkingFrame, mask: Mask, T_model_cam: Pose) -> Samples:
     seen = mask & view.valid
     R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
     return Samples(view.points[seen] @ R.T + t, view.normals[seen] @ R.T, view.gray[seen])

@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class MovingSettings:
+class MovingSurfaceSettings:
     """When a surface counts as seen through."""
 
     width: int = 160
@@ -99,13 +99,13 @@ class SmallFrames:
 
 
 def find_moving(
-    frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: MovingSettings | None = None
+    frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: MovingSurfaceSettings | None = None
 ) -> NDArray[np.bool_] | None:
     """What moves in each frame, at the size of the small frames; None where nothing does. Shape (F, h, w).
 
     `hints` are masks of any size by position: what the odometry found to move of its own.
     """
-    s, hints = settings or MovingSettings(), hints or {}
+    s, hints = settings or MovingSurfaceSettings(), hints or {}
     ask = _References(frames, s)
     posed = np.flatnonzero(frames.posed).tolist()
     if not hints:
@@ -129,7 +129,7 @@ def find_moving(
 class _References:
     """The frames that are asked whether they saw through something."""
 
-    def __init__(self, frames: SmallFrames, settings: MovingSettings) -> None:
+    def __init__(self, frames: SmallFrames, settings: MovingSurfaceSettings) -> None:
         self._frames, self._s = frames, settings
         posed = np.flatnonzero(frames.posed)
         chosen = np.unique(np.linspace(0, len(posed) - 1, min(settings.references, len(posed))).round().astype(int))
@@ -239,7 +239,7 @@ class _References:
         return inside & behind, seen & same, seen
 
 
-def _disagreement(apart: Floats, z: Floats, s: MovingSettings) -> float:
+def _disagreement(apart: Floats, z: Floats, s: MovingSurfaceSettings) -> float:
     """By how much two frames disagree about what stands still, metres beyond noise: the error of their poses."""
     few = slice(None, None, max(1, len(apart) // 1000))
     near = np.abs(apart[few]) < s.near_share * z[few]
@@ -248,7 +248,7 @@ def _disagreement(apart: Floats, z: Floats, s: MovingSettings) -> float:
     return max(0.0, float(np.median(np.abs(apart[few][near]) - s.noise.sigma(z[few][near]))))
 
 
-def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: MovingSettings) -> Mask:
+def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: MovingSurfaceSettings) -> Mask:
     """The connected parts of a region of which a part of what was compared was seen through, and that do not lie in the
     midst of a surface that stays.
     """
@@ -271,7 +271,7 @@ def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, 
     return np.asarray(good[labels])
 
 
-def _whole(depth: Floats, s: MovingSettings) -> Mask:
+def _whole(depth: Floats, s: MovingSurfaceSettings) -> Mask:
     """Pixels that no step of depth parts from their neighbours."""
     limit = np.float32(s.edge_share) * depth + 3 * s.noise.sigma(depth)
     whole = depth > 0

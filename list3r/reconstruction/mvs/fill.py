@@ -13,7 +13,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class FillSettings:
+class RegionFillSettings:
     """Which regions are filled. Pixels are those of the working width, 320."""
 
     edge: float = 9.0
@@ -38,7 +38,7 @@ class FillSettings:
 
 
 def fill_regions(
-    inverse: Floats, sigma: Floats, color: NDArray[np.uint8], settings: FillSettings
+    inverse: Floats, sigma: Floats, color: NDArray[np.uint8], settings: RegionFillSettings
 ) -> tuple[Floats, Floats]:
     """Inverse depth and sigma (h, w) with flat regions filled. `color` is RGB of the same size, shape (h, w, 3).
 
@@ -59,7 +59,7 @@ def fill_regions(
 
 
 def _regions(
-    known: Mask, color: NDArray[np.uint8], settings: FillSettings
+    known: Mask, color: NDArray[np.uint8], settings: RegionFillSettings
 ) -> tuple[NDArray[np.int32], list[tuple[int, tuple[slice, slice]]]]:
     """Numbered regions without depth, parted at edges of colour; each with a box that holds its rim too."""
     gray = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32)
@@ -81,7 +81,7 @@ def _regions(
 
 
 def _plane_of_rim(
-    region: Mask, inverse: Floats, sigma: Floats, color: Floats, settings: FillSettings
+    region: Mask, inverse: Floats, sigma: Floats, color: Floats, settings: RegionFillSettings
 ) -> NDArray[np.float64] | None:
     """(c, a, b) of inverse depth = c + a x + b y in the box, None where the rim is no plane."""
     size = 2 * settings.rim_px + 1
@@ -111,7 +111,7 @@ def _plane_of_rim(
 
 
 def _best_plane(
-    places: NDArray[np.float64], w: NDArray[np.float64], settings: FillSettings
+    places: NDArray[np.float64], w: NDArray[np.float64], settings: RegionFillSettings
 ) -> NDArray[np.float64] | None:
     """The plane through three pixels of the rim that most of it agrees with."""
     rng = np.random.default_rng(len(w))

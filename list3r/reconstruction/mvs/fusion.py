@@ -11,7 +11,7 @@ from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up
 
 
 @dataclass(frozen=True)
-class FusionSettings:
+class DepthFusionSettings:
     """How depth is checked, fused and filled."""
 
     match_px: float = 0.35
@@ -47,7 +47,7 @@ class DepthMap:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SweptDepth:
     """A keyframe's own depth before it is held against the others."""
 
     inverse: Tensor
@@ -58,7 +58,9 @@ class Seen:
     """Where the match means something. Shape (h, w), bool."""
 
 
-def agree_and_fuse(seen: Seen, others: Sequence[Seen], warps: Sequence[Warp], settings: FusionSettings) -> DepthMap:
+def agree_and_fuse(
+    seen: SweptDepth, others: Sequence[SweptDepth], warps: Sequence[Warp], settings: DepthFusionSettings
+) -> DepthMap:
     """What other keyframes confirm of a keyframe's depth, averaged with theirs."""
     inverse, variance = seen.inverse, seen.sigma**2
     total, weight = inverse / variance, 1.0 / variance
@@ -92,7 +94,7 @@ def agree_and_fuse(seen: Seen, others: Sequence[Seen], warps: Sequence[Warp], se
     return DepthMap(torch.where(keep, mean, zero), torch.where(keep, sigma, zero))
 
 
-def fill_flat(depth: DepthMap, settings: FusionSettings) -> DepthMap:
+def fill_flat(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
     """Small holes in flat surroundings filled with the plane of what is known around them, and said to be unsure.
 
     Inverse depth of a plane is linear in the pixel's place, so the plane is a regression by window sums.

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.reconstruction.base import DepthNoise
-from list3r.reconstruction.mvs.fill import FillSettings, fill_regions
+from list3r.reconstruction.mvs.fill import RegionFillSettings, fill_regions
 from list3r.reconstruction.mvs.fusion import (
+    DepthFusionSettings,
     DepthMap,
-    FusionSettings,
-    Seen,
+    SweptDepth,
     agree_and_fuse,
     carry,
     enlarge,
@@ -38,10 +38,10 @@ from list3r.reconstruction.mvs.fusion import (
     speckles_out,
 )
 from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, make_pictures, sharpness
-from list3r.reconstruction.mvs.sweep import Match, Reference, SweepSettings, coarse_match, refine
+from list3r.reconstruction.mvs.sweep import DepthMatch, SweepReference, SweepSettings, coarse_match, refine
 from list3r.reconstruction.mvs.views import (
-    Pairs,
-    ViewSettings,
+    SweepViewSettings,
+    ViewPairs,
     choose_keyframes,
     choose_neighbours,
     choose_sources,
@@ -56,7 +56,7 @@ Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
-class TrustSettings:
+class MatchTrustSettings:
     """Which matches mean something, and what confidence says."""
 
     most_cost: float = 0.35
@@ -73,11 +73,11 @@ class TrustSettings:
 class MvsSettings:
     """Dense depth of a chunk."""
 
-    views: ViewSettings = field(default_factory=ViewSettings)
+    views: SweepViewSettings = field(default_factory=SweepViewSettings)
     sweep: SweepSettings = field(default_factory=SweepSettings)
-    fusion: FusionSettings = field(default_factory=FusionSettings)
-    fill: FillSettings = field(default_factory=FillSettings)
-    trust: TrustSettings = field(default_factory=TrustSettings)
+    fusion: DepthFusionSettings = field(default_factory=DepthFusionSettings)
+    fill: RegionFillSettings = field(default_factory=RegionFillSettings)
+    trust: MatchTrustSettings = field(default_factory=MatchTrustSettings)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class _Chunk:
     coarse: Pictures
     fine: Pictures
     keyframes: list[int]
-    pairs: Pairs
+    pairs: ViewPairs
     depth: NDArray[np.float64]
     """Typical depth of each frame, chunk units. Shape (F,)."""
     span: tuple[float, float]
@@ -159,7 +159,7 @@ def stereo_noise(
     found = np.concatenate(rates) if rates else np.zeros(0)
     found = found[np.isfinite(found)]
     rough = float(np.quantile(found, 0.4)) if len(found) >= 200 else 0.0
-    return DepthNoise(0.0, rough, TrustSettings().half_sigma) if rough > 0 else None
+    return DepthNoise(0.0, rough, MatchTrustSettings().half_sigma) if rough > 0 else None
 
 
 def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
@@ -267,7 +267,7 @@ def _coarse(chunk: _Chunk, row: int) -> tuple[Tensor, Tensor, float, list[int]] 
     parallax = _parallax_px(chunk, row, sources, chunk.coarse.camera)
     planes = plane_depths(*chunk.span, parallax, 24, settings.planes)
     spacing = float(planes[1] - planes[0])
-    reference = Reference.of(chunk.coarse.gray[key], settings.radius_px, settings.image_noise)
+    reference = SweepReference.of(chunk.coarse.gray[key], settings.radius_px, settings.image_noise)
     place, margin = coarse_match(
         reference,
         [chunk.coarse.gray[k] for k in sources],
@@ -289,7 +289,7 @@ def _warps(chunk: _Chunk, key: int, others: Sequence[int], camera: Camera) -> li
     return [Warp.between(T[key], T[k], camera, chunk.device) for k in others]
 
 
-def _sweep(chunk: _Chunk, row: int) -> Seen | None:
+def _sweep(chunk: _Chunk, row: int) -> SweptDepth | None:
     """A keyframe's own depth, None without parallax."""
     swept = _coarse(chunk, row)
     if swept is None:
@@ -298,14 +298,14 @@ def _sweep(chunk: _Chunk, row: int) -> Seen | None:
     settings, trust, key = chunk.settings.sweep, chunk.settings.trust, chunk.keyframes[row]
     gray = chunk.fine.gray[key]
     start, margin = (_resized(image, gray.shape) for image in (inverse, margin))
-    reference = Reference.of(gray, settings.radius_px, settings.image_noise)
+    reference = SweepReference.of(gray, settings.radius_px, settings.image_noise)
     warps = _warps(chunk, key, sources, chunk.fine.camera)
     match = refine(reference, [chunk.fine.gray[k] for k in sources], warps, start, margin, spacing, settings)
     known = (match.cost < trust.most_cost) & (match.margin > trust.least_margin) & (match.texture > trust.least_texture)
-    return Seen(match.inverse_depth, _match_sigma(chunk, row, sources, match), known & ~match.doubt)
+    return SweptDepth(match.inverse_depth, _match_sigma(chunk, row, sources, match), known & ~match.doubt)
 
 
-def _match_sigma(chunk: _Chunk, row: int, sources: list[int], match: Match) -> Tensor:
+def _match_sigma(chunk: _Chunk, row: int, sources: list[int], match: DepthMatch) -> Tensor:
     """Standard deviation of inverse depth: that of a match in px over the parallax, more where the match is poor."""
     parallax = _parallax_px(chunk, row, sources, chunk.fine.camera)
     poor = 1.0 + 4.0 * match.cost

@@ -40,7 +40,7 @@ class SweepSettings:
 
 
 @dataclass(frozen=True)
-class Match:
+class DepthMatch:
     """What one keyframe sees by itself. All images share their shape (h, w)."""
 
     inverse_depth: Tensor
@@ -56,7 +56,7 @@ class Match:
 
 
 @dataclass(frozen=True)
-class Reference:
+class SweepReference:
     """A keyframe with its window sums, ready to be compared."""
 
     gray: Tensor
@@ -65,16 +65,16 @@ class Reference:
     """Variance of brightness in the window, noise added."""
 
     @staticmethod
-    def of(gray: Tensor, radius: int, noise: float) -> Reference:
+    def of(gray: Tensor, radius: int, noise: float) -> SweepReference:
         """Sums over windows of an image (h, w)."""
         count = float((2 * radius + 1) ** 2)
         mean = box_sum(gray, radius) / count
         variance = (box_sum(gray * gray, radius) / count - mean * mean).clamp_min(0.0)
-        return Reference(gray, mean, variance + noise * noise)
+        return SweepReference(gray, mean, variance + noise * noise)
 
 
 def matching_cost(
-    reference: Reference, sources: Sequence[Tensor], warps: Sequence[Warp], depths: Tensor, settings: SweepSettings
+    reference: SweepReference, sources: Sequence[Tensor], warps: Sequence[Warp], depths: Tensor, settings: SweepSettings
 ) -> Tensor:
     """Cost in [0, 1] of inverse depths (D, 1, 1) or (D, h, w). Shape (D, h, w).
 
@@ -94,7 +94,7 @@ def matching_cost(
 
 
 def _group_cost(
-    reference: Reference, sources: Sequence[Tensor], warps: Sequence[Warp], depths: Tensor, settings: SweepSettings
+    reference: SweepReference, sources: Sequence[Tensor], warps: Sequence[Warp], depths: Tensor, settings: SweepSettings
 ) -> Tensor:
     shape = (depths.shape[0], *reference.gray.shape)
     total = torch.zeros(shape, device=reference.gray.device)
@@ -107,7 +107,7 @@ def _group_cost(
     return torch.where(count > 0, 0.5 - 0.5 * total / count.clamp_min(1.0), torch.full((), 0.5, device=total.device))
 
 
-def _zncc(reference: Reference, values: Tensor, settings: SweepSettings) -> Tensor:
+def _zncc(reference: SweepReference, values: Tensor, settings: SweepSettings) -> Tensor:
     size = float((2 * settings.radius_px + 1) ** 2)
     mean = box_sum(values, settings.radius_px) / size
     square = box_sum(values * values, settings.radius_px) / size
@@ -153,7 +153,7 @@ def below_planes(cost: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def coarse_match(
-    reference: Reference, sources: Sequence[Tensor], warps: Sequence[Warp], planes: Tensor, settings: SweepSettings
+    reference: SweepReference, sources: Sequence[Tensor], warps: Sequence[Warp], planes: Tensor, settings: SweepSettings
 ) -> tuple[Tensor, Tensor]:
     """Plane number (with a fraction) of each pixel and the margin of the choice. Shape (h, w) each."""
     cost = matching_cost(reference, sources, warps, planes[:, None, None], settings)
@@ -182,7 +182,7 @@ def choose_at_edges(
     back = -torch.nn.functional.max_pool2d(-start[None, None], size, 1, reach)[0, 0]
     small = replace(settings, radius_px=1)
     depths = torch.stack([start, front, back])
-    cost = matching_cost(Reference.of(gray, 1, settings.image_noise), sources, warps, depths, small)
+    cost = matching_cost(SweepReference.of(gray, 1, settings.image_noise), sources, warps, depths, small)
     cost = _alike_mean(cost, gray, settings)
     chosen = depths.gather(0, cost.argmin(dim=0, keepdim=True))[0]
     apart = torch.where((depths - chosen).abs() > spacing, cost, torch.full((), 2.0, device=cost.device))
@@ -208,14 +208,14 @@ def _alike_mean(values: Tensor, gray: Tensor, settings: SweepSettings, radius: i
 
 
 def refine(
-    reference: Reference,
+    reference: SweepReference,
     sources: Sequence[Tensor],
     warps: Sequence[Warp],
     start: Tensor,
     margin: Tensor,
     spacing: float,
     settings: SweepSettings,
-) -> Match:
+) -> DepthMatch:
     """Better inverse depths near `start` (h, w): windows bend with the depth found so far, so slopes are no bias."""
     inverse, doubt = choose_at_edges(reference.gray, sources, warps, start, spacing, settings)
     least = 0.02 * spacing
@@ -231,7 +231,7 @@ def refine(
         inverse = _median(inverse)
         cost = raw.gather(0, plane[None])[0]
     texture = reference.spread / settings.image_noise**2 - 1.0
-    return Match(inverse, cost, margin, texture, doubt)
+    return DepthMatch(inverse, cost, margin, texture, doubt)
 
 
 def _median(inverse: Tensor) -> Tensor:

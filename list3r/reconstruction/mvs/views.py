@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ViewSettings:
+class SweepViewSettings:
     """How keyframes and their sources are chosen. Angles are of triangulation."""
 
     stride: int = 8
@@ -41,7 +41,7 @@ class ViewSettings:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class ViewPairs:
     """What every frame sees of what every keyframe sees at the typical depth. Shape (K, F) each."""
 
     overlap: Floats
@@ -53,7 +53,7 @@ class Pairs:
 
 
 def choose_keyframes(
-    posed: NDArray[np.bool_], T_chunk_cam: Poses, depth: Floats, sharp: Floats, settings: ViewSettings
+    posed: NDArray[np.bool_], T_chunk_cam: Poses, depth: Floats, sharp: Floats, settings: SweepViewSettings
 ) -> list[int]:
     """Positions of the sharpest frame of each run that sees nearly the same. `depth` (F,) is the typical one."""
     runs: list[list[int]] = []
@@ -66,7 +66,7 @@ def choose_keyframes(
     return [run[int(np.argmax(sharp[run]))] for run in runs]
 
 
-def _near(T: Poses, first: int, second: int, depth: Floats, settings: ViewSettings) -> bool:
+def _near(T: Poses, first: int, second: int, depth: Floats, settings: SweepViewSettings) -> bool:
     shift = float(np.linalg.norm(T[first, :3, 3] - T[second, :3, 3]))
     cosine = (np.trace(T[first, :3, :3].T @ T[second, :3, :3]) - 1.0) / 2.0
     return bool(shift < settings.step * depth[first] and cosine > np.cos(np.radians(settings.turn_deg)))
@@ -74,7 +74,7 @@ def _near(T: Poses, first: int, second: int, depth: Floats, settings: ViewSettin
 
 def pair_views(
     keyframes: Sequence[int], posed: NDArray[np.bool_], T_chunk_cam: Poses, camera: Camera, depth: Floats
-) -> Pairs:
+) -> ViewPairs:
     """Overlap and parallax of keyframes with all frames, from a few rays at the typical depth."""
     u = np.linspace(0.1, 0.9, 5) * (camera.width - 1)
     v = np.linspace(0.1, 0.9, 4) * (camera.height - 1)
@@ -95,11 +95,11 @@ def pair_views(
         overlap[row, key] = 0.0
         angle[row] = np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)), axis=1))
         distance[row] = np.linalg.norm(centers - centers[key], axis=1)
-    return Pairs(overlap, angle, distance)
+    return ViewPairs(overlap, angle, distance)
 
 
 def choose_sources(
-    row: int, pairs: Pairs, T_chunk_cam: Poses, sharp: Floats, key: int, settings: ViewSettings
+    row: int, pairs: ViewPairs, T_chunk_cam: Poses, sharp: Floats, key: int, settings: SweepViewSettings
 ) -> list[int]:
     """Positions of a keyframe's sources, those of its two sides in turn. Empty where no two have parallax.
 
@@ -129,7 +129,7 @@ def _in_turn(chosen: list[int], centers: Floats, key: int) -> list[int]:
     return [chosen[k] for pair in zip(left, [*right, None], strict=False) for k in pair if k is not None]
 
 
-def choose_neighbours(row: int, keyframes: Sequence[int], pairs: Pairs, settings: ViewSettings) -> list[int]:
+def choose_neighbours(row: int, keyframes: Sequence[int], pairs: ViewPairs, settings: SweepViewSettings) -> list[int]:
     """Numbers of the keyframes that see most of the same, from not too different places."""
     overlap = pairs.overlap[row, list(keyframes)]
     angle = pairs.angle_deg[row, list(keyframes)]

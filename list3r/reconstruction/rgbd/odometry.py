@@ -34,9 +34,9 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.reconstruction.features.local import Features, FeatureSettings, detect, match, relative_pose
 from list3r.reconstruction.motion.movers import Mask, MoverMemory, MoverSettings, find_mover, fit, without
-from list3r.reconstruction.rgbd.registration import Registration, RegistrationSettings, Samples, register
-from list3r.reconstruction.rgbd.surfels import FusionSettings, SurfelModel
-from list3r.reconstruction.rgbd.view import SensorNoise, View, make_view, shrink_camera
+from list3r.reconstruction.rgbd.registration import FrameRegistration, RegistrationSettings, Samples, register
+from list3r.reconstruction.rgbd.surfels import SurfelModel, SurfelSettings
+from list3r.reconstruction.rgbd.view import SensorNoise, WorkingFrame, make_view, shrink_camera
 
 Pose = NDArray[np.float64]
 
@@ -87,14 +87,14 @@ class OdometrySettings:
     keyframe_shift: float = 0.12
     """Translation between keyframes as a share of the median depth."""
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    fusion: FusionSettings = field(default_factory=FusionSettings)
+    fusion: SurfelSettings = field(default_factory=SurfelSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)
     movers: MoverSettings = field(default_factory=MoverSettings)
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
 @dataclass(eq=False)
-class Segment:
+class TrackedSegment:
     """Consecutive frames that were followed without a break, in the coordinates of the first."""
 
     model: SurfelModel
@@ -106,7 +106,7 @@ class Segment:
     """Share of inliers that the last frames had."""
 
 
-class Tracker:
+class CameraTracker:
     """Follows one chunk. `segments` holds the outcome, in order of time."""
 
     def __init__(
@@ -119,9 +119,9 @@ class Tracker:
         """`known` are masks of any size, by position, of what is known to move: the camera is followed without it."""
         self.frames, self.camera, self.settings = frames, camera, settings
         self.small = shrink_camera(camera, settings.working_width)
-        self.segments: list[Segment] = []
+        self.segments: list[TrackedSegment] = []
         self._features: dict[int, Features] = {}
-        self._views: dict[int, View] = {}
+        self._views: dict[int, WorkingFrame] = {}
         self._moving: dict[int, Mask] = {}
         self._movers = MoverMemory(settings.movers, settings.noise)
         size = (self.small.width, self.small.height)
@@ -130,18 +130,18 @@ class Tracker:
             for k, mask in (known or {}).items()
         }
 
-    def run(self) -> list[Segment]:
+    def run(self) -> list[TrackedSegment]:
         """Follow all frames, then join the segments that can be joined; the largest comes first."""
         for position in range(len(self.frames)):
             self._step(position)
         return self._join()
 
-    def view(self, position: int) -> View:
+    def view(self, position: int) -> WorkingFrame:
         """The frame at working resolution, without what moves of its own."""
         view = self._whole_view(position)
         return without(view, self._moving[position]) if position in self._moving else view
 
-    def _whole_view(self, position: int) -> View:
+    def _whole_view(self, position: int) -> WorkingFrame:
         if position not in self._views:
             self._views.clear()
             frame = self.frames[position]
@@ -180,17 +180,17 @@ class Tracker:
                 self._accept(segment, position, found)
                 return
         self._set_moving(position, moving)
-        self.segments.append(Segment(SurfelModel(self.settings.fusion, self.settings.noise)))
+        self.segments.append(TrackedSegment(SurfelModel(self.settings.fusion, self.settings.noise)))
         self._accept(self.segments[-1], position, np.eye(4))
 
-    def _open_segments(self) -> list[Segment]:
+    def _open_segments(self) -> list[TrackedSegment]:
         """The last segment, and the longest one while the last may be no more than a few spoilt frames."""
         last = self.segments[-1:]
         longest = max(self.segments, key=lambda s: len(s.T_segment_cam), default=None)
         short = bool(last) and len(last[0].T_segment_cam) < self.settings.short_segment
         return [*last, longest] if short and longest is not None and longest is not last[0] else last
 
-    def _accept(self, segment: Segment, position: int, T_segment_cam: Pose) -> None:
+    def _accept(self, segment: TrackedSegment, position: int, T_segment_cam: Pose) -> None:
         if position in self._moving:
             self._keep_movers(segment, position, T_segment_cam)
         else:
@@ -205,7 +205,7 @@ class Tracker:
         if moving is not None:
             self._moving[position] = moving
 
-    def _keep_movers(self, segment: Segment, position: int, T_segment_cam: Pose) -> None:
+    def _keep_movers(self, segment: TrackedSegment, position: int, T_segment_cam: Pose) -> None:
         """Take what moves out of the model, and carry it on to the next frame until it stands still."""
         view, mask = self._whole_view(position), self._moving[position]
         samples = segment.model.samples(T_segment_cam, self.small, self.settings.sweep_samples)
@@ -216,7 +216,7 @@ class Tracker:
         self._moving[position] = mask
         segment.model.forget(view, mask, T_segment_cam)
 
-    def _moved(self, segment: Segment, position: int) -> bool:
+    def _moved(self, segment: TrackedSegment, position: int) -> bool:
         step = np.linalg.inv(segment.T_segment_cam[segment.keyframes[-1]]) @ segment.T_segment_cam[position]
         depth = self.view(position).depth
         far = float(np.median(depth[depth > 0]))
@@ -225,11 +225,11 @@ class Tracker:
             np.linalg.norm(step[:3, 3]) > self.settings.keyframe_shift * far
         )
 
-    def _follow(self, segment: Segment, position: int) -> Pose | None:
+    def _follow(self, segment: TrackedSegment, position: int) -> Pose | None:
         """The frame's pose in the segment, or None when nothing trustworthy is found."""
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
-        found: list[Registration | None] = []
+        found: list[FrameRegistration | None] = []
         if gap_s <= self.settings.gap_s:
             predicted = self._predict(segment, last, gap_s)
             for T in (predicted, segment.T_segment_cam[last]):
@@ -248,11 +248,11 @@ class Tracker:
         segment.usual_inliers = max(best.inliers, self.settings.forget * segment.usual_inliers)
         return best.T_model_cam
 
-    def _doubtful(self, segment: Segment, found: Registration | None) -> bool:
+    def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
         """Whether much less agrees than did in the frames before, as in a false minimum."""
         return found is None or found.inliers < self.settings.doubt * segment.usual_inliers
 
-    def _predict(self, segment: Segment, last: int, gap_s: float) -> Pose | None:
+    def _predict(self, segment: TrackedSegment, last: int, gap_s: float) -> Pose | None:
         """Constant velocity from the last two frames; None at the beginning and after a gap, where it is not known."""
         before = [p for p in segment.T_segment_cam if p < last][-1:]
         T_last = segment.T_segment_cam[last]
@@ -268,7 +268,9 @@ class Tracker:
         moved[:3, 3] = step[:3, 3] * ratio
         return T_last @ moved
 
-    def _place(self, segment: Segment, position: int, T_guess: Pose, blind: bool = False) -> Registration | None:
+    def _place(
+        self, segment: TrackedSegment, position: int, T_guess: Pose, blind: bool = False
+    ) -> FrameRegistration | None:
         """Register the frame to the segment's model from a guess, kept only when it can be trusted."""
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         s, view = self.settings, self.view(position)
@@ -280,7 +282,7 @@ class Tracker:
                 found = mover[1]
         return found if found is not None and self._trusted(found, samples, position, blind) else None
 
-    def _trusted(self, found: Registration, samples: Samples, position: int, blind: bool) -> bool:
+    def _trusted(self, found: FrameRegistration, samples: Samples, position: int, blind: bool) -> bool:
         """Whether a registration can be believed; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
         share = float(view.valid.mean())
@@ -294,7 +296,7 @@ class Tracker:
             and found.looseness_m(float(np.median(view.depth[view.depth > 0]))) <= s.most_looseness_m
         )
 
-    def _possible(self, segment: Segment, last: int, found: Registration | None, gap_s: float) -> bool:
+    def _possible(self, segment: TrackedSegment, last: int, found: FrameRegistration | None, gap_s: float) -> bool:
         if found is None:
             return False
         step = np.linalg.inv(segment.T_segment_cam[last]) @ found.T_model_cam
@@ -304,7 +306,7 @@ class Tracker:
             and _angle_deg(step) <= self.settings.most_turn_deg_per_s * gap_s
         )
 
-    def _search(self, segment: Segment, position: int, nearby: bool) -> Registration | None:
+    def _search(self, segment: TrackedSegment, position: int, nearby: bool) -> FrameRegistration | None:
         """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`."""
         last = max(segment.T_segment_cam)
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
@@ -315,7 +317,7 @@ class Tracker:
         placed = [self._place(segment, position, T, blind) for T, blind in starts]
         return max((p for p in placed if p is not None), key=lambda p: p.overlap * p.inliers, default=None)
 
-    def _sweep(self, segment: Segment, last: int, position: int) -> list[Pose]:
+    def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from motions that a slow video makes between frames."""
         view, T_last = self.view(position), segment.T_segment_cam[last]
         far = float(np.median(view.depth[view.depth > 0]))
@@ -332,10 +334,10 @@ class Tracker:
         )
         return None if pose is None else pose.T_a_b
 
-    def _join(self) -> list[Segment]:
+    def _join(self) -> list[TrackedSegment]:
         """Attach segments to the largest one, over and over until no more can be."""
         left = sorted(self.segments, key=lambda s: -len(s.T_segment_cam))
-        done: list[Segment] = []
+        done: list[TrackedSegment] = []
         while left:
             base = left.pop(0)
             attached = True
@@ -351,14 +353,14 @@ class Tracker:
             break
         return done + left
 
-    def _connect(self, base: Segment, other: Segment) -> Pose | None:
+    def _connect(self, base: TrackedSegment, other: TrackedSegment) -> Pose | None:
         for position in other.keyframes[:4]:
             found = self._search(base, position, nearby=False)
             if found is not None:
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
         return None
 
-    def _attach(self, base: Segment, other: Segment, T_base_other: Pose) -> None:
+    def _attach(self, base: TrackedSegment, other: TrackedSegment, T_base_other: Pose) -> None:
         for position, T in other.T_segment_cam.items():
             base.T_segment_cam[position] = T_base_other @ T
         for position in other.keyframes:

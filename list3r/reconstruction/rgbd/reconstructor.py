@@ -17,10 +17,10 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion.follow import FollowSettings, follow_movers
-from list3r.reconstruction.motion.moving import MovingSettings, SmallFrames, find_moving
+from list3r.reconstruction.motion.moving import MovingSurfaceSettings, SmallFrames, find_moving
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import ConfidenceSettings, depth_confidence
-from list3r.reconstruction.rgbd.odometry import OdometrySettings, Tracker
+from list3r.reconstruction.rgbd.odometry import CameraTracker, OdometrySettings
 
 
 def make(options: ModelOptions) -> RgbdReconstructor:
@@ -34,7 +34,7 @@ class RgbdSettings:
 
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
-    moving: MovingSettings = field(default_factory=MovingSettings)
+    moving: MovingSurfaceSettings = field(default_factory=MovingSurfaceSettings)
     follow: FollowSettings = field(default_factory=FollowSettings)
 
 
@@ -108,7 +108,7 @@ class RgbdReconstructor:
         self, frames: Sequence[Frame], camera: Camera, known: Mapping[int, NDArray[np.bool_]] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], Mapping[int, NDArray[np.bool_]]]:
         """Poses, which frames have one, keyframes, and what was left out of each frame; without what `known` holds."""
-        tracker = Tracker(frames, camera, self.settings.odometry, known)
+        tracker = CameraTracker(frames, camera, self.settings.odometry, known)
         segments = tracker.run()
         if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
             raise TrackingError(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import skew
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, View
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise, WorkingFrame
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Anchors:
 
 
 @dataclass(frozen=True)
-class Registration:
+class FrameRegistration:
     """A view placed against a model."""
 
     T_model_cam: NDArray[np.float64]
@@ -98,12 +98,12 @@ class Registration:
 
 def register(
     model: Samples,
-    view: View,
+    view: WorkingFrame,
     T_model_cam: NDArray[np.float64],
     settings: RegistrationSettings,
     noise: SensorNoise,
     anchors: Anchors | None = None,
-) -> Registration | None:
+) -> FrameRegistration | None:
     """Refine `T_model_cam`; None when too few points meet."""
     frame = _Frame(view, noise)
     photometric = model.gray is not None and settings.photometric_weight > 0
@@ -132,14 +132,14 @@ def register(
     information = _solid_information(pairs, frame, T, settings, photometric)
     if anchors is not None:
         information += _anchored(anchors, T, view.camera.fx)[0]
-    return Registration(
+    return FrameRegistration(
         T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
     )
 
 
 def steps_without(
     model: Samples,
-    view: View,
+    view: WorkingFrame,
     T_model_cam: NDArray[np.float64],
     masks: Sequence[NDArray[np.bool_]],
     settings: RegistrationSettings,
@@ -176,7 +176,7 @@ def steps_without(
 class _Frame:
     """The images of a view laid out for look-ups by pixel number."""
 
-    def __init__(self, view: View, noise: SensorNoise) -> None:
+    def __init__(self, view: WorkingFrame, noise: SensorNoise) -> None:
         self.camera = view.camera
         self.points = view.points.reshape(-1, 3)
         self.normals = view.normals.reshape(-1, 3)
@@ -188,7 +188,7 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class _SurfelPairs:
     """Pairs of model and view points for one iteration, M of them."""
 
     moved: Floats
@@ -212,7 +212,7 @@ class _Pairs:
         return len(self.residual)
 
 
-def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, agreement: float) -> _Pairs:
+def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, agreement: float) -> _SurfelPairs:
     camera = frame.camera
     R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
     points_cam: Floats = np.asarray((model.points - t) @ R, np.float32)
@@ -235,7 +235,7 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
     scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3 if len(keep) else 1.0
     index = index[keep]
     gray = None if model.gray is None else model.gray[index]
-    return _Pairs(
+    return _SurfelPairs(
         moved=moved[keep],
         points=model.points[index],
         normals=normals[keep],
@@ -250,18 +250,18 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
     )
 
 
-def _geometric(pairs: _Pairs, huber: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _geometric(pairs: _SurfelPairs, huber: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
     return _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, huber)
 
 
-def _geometric_slope(pairs: _Pairs) -> Floats:
+def _geometric_slope(pairs: _SurfelPairs) -> Floats:
     slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1)
     return np.asarray(slope * pairs.inverse_sigma[:, None])
 
 
 def _solid_information(
-    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], settings: RegistrationSettings, photometric: bool
+    pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], settings: RegistrationSettings, photometric: bool
 ) -> NDArray[np.float64]:
     """Information without the share that comes from noise alone.
 
@@ -279,7 +279,7 @@ def _solid_information(
 
 
 def _photometric(
-    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
+    pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
     slope, error = _photometric_slope(pairs, frame, T, least_gradient)
@@ -288,7 +288,7 @@ def _photometric(
 
 
 def _photometric_slope(
-    pairs: _Pairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
+    pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
 ) -> tuple[Floats, Floats]:
     assert pairs.gray is not None
     value, dx, dy = _sample(frame, pairs.uv)
@@ -335,7 +335,7 @@ def _normal_equations(
     return (weighted.T @ slope).astype(np.float64), (weighted.T @ error).astype(np.float64)
 
 
-def _correlation(pairs: _Pairs, frame: _Frame) -> float:
+def _correlation(pairs: _SurfelPairs, frame: _Frame) -> float:
     if pairs.gray is None or pairs.count < 2:
         return float("nan")
     value = _sample(frame, pairs.uv)[0]

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.rgbd.registration import Samples
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, View
+from list3r.reconstruction.rgbd.view import Floats, SensorNoise, WorkingFrame
 
 
 @dataclass(frozen=True)
-class FusionSettings:
+class SurfelSettings:
     """How views are fused into a model."""
 
     weight_cap: float = 50.0
@@ -31,7 +31,7 @@ class FusionSettings:
 class SurfelModel:
     """Surface elements in the coordinates of the first view, N of them."""
 
-    def __init__(self, settings: FusionSettings, noise: SensorNoise) -> None:
+    def __init__(self, settings: SurfelSettings, noise: SensorNoise) -> None:
         self._settings, self._noise = settings, noise
         self.points = np.zeros((0, 3), np.float32)
         self.normals = np.zeros((0, 3), np.float32)
@@ -64,7 +64,7 @@ class SurfelModel:
             index = index[np.arange(count) * len(index) // count]
         return Samples(self.points[index], self.normals[index], self.gray[index])
 
-    def fuse(self, view: View, T_model_cam: NDArray[np.float64]) -> None:
+    def fuse(self, view: WorkingFrame, T_model_cam: NDArray[np.float64]) -> None:
         """Average the view into the elements that it agrees with, add what is new, weaken what it sees through."""
         pixel = np.flatnonzero(view.valid)
         R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
@@ -89,7 +89,7 @@ class SurfelModel:
             self._drop()
         self._append(points[new], normals[new], gray[new], weight[new])
 
-    def forget(self, view: View, mask: NDArray[np.bool_], T_model_cam: NDArray[np.float64]) -> None:
+    def forget(self, view: WorkingFrame, mask: NDArray[np.bool_], T_model_cam: NDArray[np.float64]) -> None:
         """Drop the elements at the surface that the view shows inside a mask."""
         pixel = np.flatnonzero(view.valid & mask)
         if not len(pixel) or not len(self):

@@ -35,7 +35,7 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
-class View:
+class WorkingFrame:
     """A frame at working resolution."""
 
     camera: Camera
@@ -117,14 +117,14 @@ def surface(depth: Floats, camera: Camera) -> tuple[Floats, Floats, NDArray[np.b
     return points, normals, valid
 
 
-def make_view(color: NDArray[np.uint8], depth: Floats, camera: Camera, noise: SensorNoise) -> View:
+def make_view(color: NDArray[np.uint8], depth: Floats, camera: Camera, noise: SensorNoise) -> WorkingFrame:
     """The view of a frame for `camera`, which is the frame's own camera shrunk. `color` is RGB (H, W, 3)."""
     small = shrink_depth(depth, camera, noise)
     points, normals, valid = surface(small, camera)
     gray = cv2.cvtColor(
         cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
     )
-    return View(camera, small, points, normals, valid, gray.astype(np.float32))
+    return WorkingFrame(camera, small, points, normals, valid, gray.astype(np.float32))
 
 
 def _norm(vectors: Floats) -> Floats:

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
 from list3r.reconstruction.sfm.colmap import pycolmap
 from list3r.reconstruction.sfm.links import LinkSettings, keyframe_problem
-from list3r.reconstruction.sfm.mapping import MappingSettings, MapProblem, Poses, SparseMap, View, build_maps
-from list3r.reconstruction.sfm.tracks import Tracks, TrackSettings, follow_corners
+from list3r.reconstruction.sfm.mapping import KeyframeView, MappingSettings, MapProblem, Poses, SparseMap, build_maps
+from list3r.reconstruction.sfm.tracks import CornerSettings, CornerTracks, follow_corners
 
 
 @dataclass(frozen=True)
-class CalibrationSettings:
+class CameraCalibrationSettings:
     """Which frames are looked at, and what is believed."""
 
     windows: int = 5
@@ -60,13 +60,13 @@ class CalibrationSettings:
     """So many windows' worth is that belief when the windows of a video tell their own spread."""
     doubted_sigmas: float = 2.5
     """A given focal length farther off than this is doubted aloud."""
-    tracks: TrackSettings = field(default_factory=TrackSettings)
+    tracks: CornerSettings = field(default_factory=CornerSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CameraCalibration:
     """What was found of a source's camera."""
 
     camera: Camera
@@ -83,15 +83,15 @@ class Calibration:
 
 def calibrate(
     source: FrameSource,
-    settings: CalibrationSettings | None = None,
+    settings: CameraCalibrationSettings | None = None,
     progress: Progress | None = None,
     stored_px: float = 1.0,
-) -> Calibration:
+) -> CameraCalibration:
     """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given.
 
     `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes speak of those.
     """
-    chosen = settings or CalibrationSettings()
+    chosen = settings or CameraCalibrationSettings()
     info = source.info
     known = info.camera is not None
     start = info.camera or guessed_camera(info)
@@ -106,16 +106,16 @@ def calibrate(
     if not known:
         said = f"the camera was estimated from the pictures: focal length {told}; distortion k1 {k1:.3f}"
         notes = (said, *_parted(found, stored_px, chosen))
-        return Calibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
+        return CameraCalibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
     if abs(np.log(free.fx / start.fx)) > chosen.doubted_sigmas * sigma:
         said = (
             f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which say about {told}; "
             "check --intrinsics, or leave it out"
         )
-        return Calibration(start, len(windows), free.fx, sigma, (said,))
+        return CameraCalibration(start, len(windows), free.fx, sigma, (said,))
     _, k1 = _adjust_together(windows, start, False, chosen)
     lens = _lens(start, k1, chosen) if _believable(start, k1, chosen) else start
-    return Calibration(lens, len(windows), free.fx, sigma, _parted(found, stored_px, chosen))
+    return CameraCalibration(lens, len(windows), free.fx, sigma, _parted(found, stored_px, chosen))
 
 
 _Windows = list[tuple[MapProblem, SparseMap]]
@@ -138,7 +138,7 @@ class _Estimate:
 
 
 def _estimated(
-    source: FrameSource, start: Camera, settings: CalibrationSettings, progress: Progress | None
+    source: FrameSource, start: Camera, settings: CameraCalibrationSettings, progress: Progress | None
 ) -> _Estimate | None:
     """What is said by the windows that could be mapped and can be believed; None where they make no sense."""
     windows, begins, spans = [], [], _spans(source.info.frame_count, settings)
@@ -160,14 +160,14 @@ def _estimated(
     return _Estimate(kept, free, k1, others, spans[0][1] - spans[0][0]) if _believable(free, k1, settings) else None
 
 
-def _believable(camera: Camera, k1: float, settings: CalibrationSettings) -> bool:
+def _believable(camera: Camera, k1: float, settings: CameraCalibrationSettings) -> bool:
     """Whether a camera has such a lens."""
     share = camera.fx / max(camera.width, camera.height)
     (short, long), (least, most) = settings.focal_range, settings.distortion_range
     return short < share < long and least <= k1 <= most
 
 
-def _agreeing(focals: NDArray[np.float64], settings: CalibrationSettings) -> NDArray[np.bool_]:
+def _agreeing(focals: NDArray[np.float64], settings: CameraCalibrationSettings) -> NDArray[np.bool_]:
     """Windows that are near the middle of all; where fewer than half are, those near the one with most around it."""
     logs = np.log(focals)
     near = np.abs(logs[:, None] - np.r_[np.median(logs), logs][None]) < np.log(settings.most_window_ratio)
@@ -180,7 +180,7 @@ def _index_at(source: FrameSource, position: int) -> int:
     return next((f.index for f in source.read(position, position + 1)), position)
 
 
-def _parted(found: _Estimate, stored_px: float, settings: CalibrationSettings) -> tuple[str, ...]:
+def _parted(found: _Estimate, stored_px: float, settings: CameraCalibrationSettings) -> tuple[str, ...]:
     """What is said where windows that can be believed tell clearly different focal lengths."""
     if found.frames < settings.frames:
         return ()
@@ -199,22 +199,22 @@ def _parted(found: _Estimate, stored_px: float, settings: CalibrationSettings) -
     )
 
 
-def _nothing(start: Camera, known: bool, stored_px: float) -> Calibration:
+def _nothing(start: Camera, known: bool, stored_px: float) -> CameraCalibration:
     if known:
-        return Calibration(start, 0, None)
+        return CameraCalibration(start, 0, None)
     guess = f"a focal length of {start.fx * stored_px:.0f} px is a guess: give --intrinsics"
     said = f"the camera could not be estimated; {guess}"
-    return Calibration(start, 0, None, notes=(said,))
+    return CameraCalibration(start, 0, None, notes=(said,))
 
 
-def _focal_sigma(windows: _Windows, settings: CalibrationSettings) -> float:
+def _focal_sigma(windows: _Windows, settings: CameraCalibrationSettings) -> float:
     """Standard deviation of the logarithm of the focal length of all windows, from how far they differ."""
     logs = np.log([found.camera.fx for _, found in windows])
     square = settings.window_weight * settings.window_sigma**2 + float(((logs - logs.mean()) ** 2).sum())
     return float(np.sqrt(square / (settings.window_weight + len(logs) - 1) / len(logs)))
 
 
-def _spans(count: int, settings: CalibrationSettings) -> list[tuple[int, int]]:
+def _spans(count: int, settings: CameraCalibrationSettings) -> list[tuple[int, int]]:
     """Windows spread evenly over a source; those of a short one overlap."""
     frames = int(np.clip(count // 2, settings.least_frames, settings.frames))
     last = max(0, count - frames)
@@ -225,7 +225,7 @@ def _spans(count: int, settings: CalibrationSettings) -> list[tuple[int, int]]:
 
 
 def _window(
-    source: FrameSource, start: int, stop: int, camera: Camera, settings: CalibrationSettings
+    source: FrameSource, start: int, stop: int, camera: Camera, settings: CameraCalibrationSettings
 ) -> tuple[MapProblem, SparseMap] | None:
     """The largest map of a window with a camera of its own."""
     frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
@@ -240,7 +240,7 @@ def _window(
     return (problem, maps[0]) if maps and len(maps[0].T_map_cam) >= 3 else None
 
 
-def _longest_run(tracks: Tracks) -> Tracks:
+def _longest_run(tracks: CornerTracks) -> CornerTracks:
     """The tracks with the keyframes of their longest run alone, where it has half of the frames: what a jump or a wall
     parts from it would be tied by features and says nothing more of the lens."""
     followed = tracks.run[tracks.run >= 0]
@@ -251,7 +251,10 @@ def _longest_run(tracks: Tracks) -> Tracks:
 
 
 def _adjust_together(
-    windows: Sequence[tuple[MapProblem, SparseMap]], camera: Camera, free_focal: bool, settings: CalibrationSettings
+    windows: Sequence[tuple[MapProblem, SparseMap]],
+    camera: Camera,
+    free_focal: bool,
+    settings: CameraCalibrationSettings,
 ) -> tuple[Camera, float]:
     """One camera and its k1 for all windows, by bundle adjustment of all of them."""
     made = pycolmap.Reconstruction()
@@ -285,7 +288,7 @@ def _add_window(made: pycolmap.Reconstruction, number: int, problem: MapProblem,
     base = 1 + 10_000 * number
     seen: dict[int, list[tuple[int, int]]] = {}
     for key, T in sorted(found.T_map_cam.items()):
-        view: View = problem.views[key]
+        view: KeyframeView = problem.views[key]
         image = pycolmap.Image(f"{base + key}", view.xy.astype(np.float64) + 0.5, 1, base + key)
         made.add_image_with_trivial_frame(image, _cam_from_map(T))
         for row, track in enumerate(view.ids.tolist()):
@@ -300,7 +303,7 @@ def _cam_from_map(T_map_cam: Poses) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(np.linalg.inv(T_map_cam)[:3])
 
 
-def _lens(camera: Camera, k1: float, settings: CalibrationSettings) -> Camera:
+def _lens(camera: Camera, k1: float, settings: CameraCalibrationSettings) -> Camera:
     """The camera with its distortion, unless that shifts nothing."""
     x, y = max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)
     square = (x / camera.fx) ** 2 + (y / camera.fy) ** 2

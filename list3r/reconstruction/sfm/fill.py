@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.mapping import MappingSettings, Poses, SparseMap
-from list3r.reconstruction.sfm.tracks import Gray, Tracks
+from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class FillSettings:
+class FramePoseSettings:
     """How the frames between keyframes are posed."""
 
     bridge: int = 4
@@ -31,7 +31,7 @@ class FillSettings:
 
 
 @dataclass
-class Segment:
+class PosedSegment:
     """Frames posed in one map."""
 
     found: SparseMap
@@ -49,10 +49,10 @@ class Segment:
 
 
 def fill_segments(
-    maps: Sequence[SparseMap], tracks: Tracks, grays: Sequence[Gray], settings: FillSettings | None = None
-) -> list[Segment]:
+    maps: Sequence[SparseMap], tracks: CornerTracks, grays: Sequence[Gray], settings: FramePoseSettings | None = None
+) -> list[PosedSegment]:
     """Pose all frames that can be posed in one of the maps, each in the first that holds it; largest segment first."""
-    chosen = settings or FillSettings()
+    chosen = settings or FramePoseSettings()
     left = set(range(len(grays)))
     segments = []
     for found in maps:
@@ -64,10 +64,12 @@ def fill_segments(
     return sorted(segments, key=lambda s: (-len(s.T_map_cam), min(s.T_map_cam)))
 
 
-def _fill(found: SparseMap, tracks: Tracks, positions: Iterable[int], settings: FillSettings) -> Segment:
+def _fill(
+    found: SparseMap, tracks: CornerTracks, positions: Iterable[int], settings: FramePoseSettings
+) -> PosedSegment:
     numbers = np.array(sorted(found.points), np.int64)
     places = np.array([found.points[int(n)] for n in numbers]).reshape(-1, 3)
-    segment = Segment(found, {}, {})
+    segment = PosedSegment(found, {}, {})
     registered = sorted(found.T_map_cam)
     for position in positions:
         known = np.isin(tracks.ids[position], numbers)
@@ -89,7 +91,7 @@ def _fill(found: SparseMap, tracks: Tracks, positions: Iterable[int], settings: 
 
 
 def _with_features(
-    found: SparseMap, position: int, tracks: Tracks, xy: Floats, points: NDArray[np.float64]
+    found: SparseMap, position: int, tracks: CornerTracks, xy: Floats, points: NDArray[np.float64]
 ) -> tuple[Floats, NDArray[np.float64]]:
     """What a keyframe sees of the map by its corners, and what it sees by other features."""
     seen = found.seen[position]
@@ -152,7 +154,9 @@ def _refined(
     return inverse(T_cam_map), rows
 
 
-def _bridge(segment: Segment, grays: Sequence[Gray], positions: Sequence[int], settings: FillSettings) -> None:
+def _bridge(
+    segment: PosedSegment, grays: Sequence[Gray], positions: Sequence[int], settings: FramePoseSettings
+) -> None:
     """Pose frames that lost their corners, in place, by looking for the structure that the neighbours see."""
     posed = sorted(segment.T_map_cam)
     for before, behind in pairwise(posed):
@@ -165,7 +169,9 @@ def _bridge(segment: Segment, grays: Sequence[Gray], positions: Sequence[int], s
                 _look_for(segment, grays, near, position, settings)
 
 
-def _look_for(segment: Segment, grays: Sequence[Gray], near: int, position: int, settings: FillSettings) -> None:
+def _look_for(
+    segment: PosedSegment, grays: Sequence[Gray], near: int, position: int, settings: FramePoseSettings
+) -> None:
     xy, points = segment.seen[near]
     if len(xy) < settings.mapping.least_matches:
         return

@@ -36,8 +36,8 @@ from list3r.reconstruction.sfm.keyframe_features import (
     make_finder,
     match_features,
 )
-from list3r.reconstruction.sfm.mapping import MapProblem, View, shared_rows
-from list3r.reconstruction.sfm.tracks import Gray, Tracks
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, shared_rows
+from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,14 @@ _AHEAD_IDS = 500_000
 
 
 def keyframe_problem(
-    tracks: Tracks, grays: Sequence[Gray], settings: LinkSettings | None = None, finder: Finder | None = None
+    tracks: CornerTracks, grays: Sequence[Gray], settings: LinkSettings | None = None, finder: Finder | None = None
 ) -> MapProblem:
     """The keyframes of a chunk as a problem for the mapper, by position in the chunk.
 
     `finder` finds features where tracks do not reach; None takes SIFT.
     """
     chosen = settings or LinkSettings()
-    views = {k: View(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
+    views = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     pairs = {}
     for n, a in enumerate(tracks.keyframes):
         for b in tracks.keyframes[n + 1 :]:
@@ -85,7 +85,7 @@ def keyframe_problem(
     return with_features(problem, finder or make_finder(grays, None, None, chosen.features), chosen)
 
 
-def step_beside(tracks: Tracks, settings: LinkSettings) -> int:
+def step_beside(tracks: CornerTracks, settings: LinkSettings) -> int:
     """How many frames apart those that are mapped beside a chunk are."""
     apart = settings.beside_step * len(tracks.run) / max(1, len(tracks.keyframes))
     return int(np.clip(round(apart), 1, settings.most_step))
@@ -100,14 +100,14 @@ def with_neighbours(
     """
     order = [*before, *sorted(problem.views), *behind]
     found = {key: finder(key) for key in order}
-    none = View(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    none = KeyframeView(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
     views, first = {}, {}
     for key, features in found.items():
         view = problem.views.get(key, none)
         first[key] = len(view.ids)
         ids = _FEATURE_IDS * (key + 1) + _AHEAD_IDS + np.arange(len(features.xy))
         xy = np.concatenate([view.xy, features.xy]).astype(np.float32)
-        views[key] = View(np.concatenate([view.ids, ids]), xy)
+        views[key] = KeyframeView(np.concatenate([view.ids, ids]), xy)
     pairs, matched = dict(problem.pairs), set(problem.matched)
     for n, one in enumerate(order):
         for other in order[n + 1 : n + 1 + settings.ahead]:
@@ -130,7 +130,7 @@ def with_features(problem: MapProblem, finder: Finder, settings: LinkSettings) -
     for key, features in found.items():
         view, ids = views[key], _FEATURE_IDS * (key + 1) + np.arange(len(features.xy))
         xy = np.concatenate([view.xy, features.xy]).astype(np.float32)
-        views[key] = View(np.concatenate([view.ids, ids]), xy)
+        views[key] = KeyframeView(np.concatenate([view.ids, ids]), xy)
     for a, b in likely_pairs(found, set(pairs), settings.features):
         rows = match_features(found[a], found[b])
         if len(rows) >= settings.least_matches:

@@ -70,7 +70,7 @@ class MappingSettings:
 
 
 @dataclass(frozen=True)
-class View:
+class KeyframeView:
     """Correspondences seen in a keyframe."""
 
     ids: Ints
@@ -78,10 +78,10 @@ class View:
     xy: Floats
     """px. Shape (N, 2)."""
 
-    def where(self, rows: Sequence[int]) -> View:
+    def where(self, rows: Sequence[int]) -> KeyframeView:
         """Some of the correspondences."""
         chosen = np.array(rows, np.int64)
-        return View(self.ids[chosen], self.xy[chosen])
+        return KeyframeView(self.ids[chosen], self.xy[chosen])
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class SparseMap:
     """Radial distortion left in the pictures, where it was free."""
     error_px: float = 0.0
     """Mean reprojection error."""
-    seen: dict[int, View] = field(default_factory=dict)
+    seen: dict[int, KeyframeView] = field(default_factory=dict)
     """What each view sees of the points, by key of the view."""
 
 
@@ -109,7 +109,7 @@ Matches = Mapping[tuple[int, int], NDArray[np.int64]]
 class MapProblem:
     """Keyframes and what they see in common."""
 
-    views: dict[int, View]
+    views: dict[int, KeyframeView]
     pairs: dict[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
     """Rows of the views that show the same point, by keys, the smaller first. Shape (M, 2)."""
     matched: frozenset[tuple[int, int]] = frozenset()
@@ -118,7 +118,7 @@ class MapProblem:
     """Views that help to make the map and are no part of it afterwards."""
 
 
-def shared_rows(a: View, b: View) -> NDArray[np.int64]:
+def shared_rows(a: KeyframeView, b: KeyframeView) -> NDArray[np.int64]:
     """Rows of the tracks that two views share. Shape (M, 2)."""
     _, at_a, at_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     return np.stack([at_a, at_b], axis=1).astype(np.int64)
@@ -296,8 +296,8 @@ def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: Mapp
 
 
 def _two_view(
-    a: View,
-    b: View,
+    a: KeyframeView,
+    b: KeyframeView,
     rows: NDArray[np.int64],
     lens: Any,
     camera: Camera,

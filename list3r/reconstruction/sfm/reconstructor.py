@@ -30,11 +30,11 @@ from list3r.reconstruction.mvs.stereo import MvsSettings, dense_depth, stereo_no
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.odometry import OdometrySettings
 from list3r.reconstruction.rgbd.reconstructor import is_rigid, select_keyframes
-from list3r.reconstruction.sfm.fill import FillSettings, Segment, fill_segments
+from list3r.reconstruction.sfm.fill import FramePoseSettings, PosedSegment, fill_segments
 from list3r.reconstruction.sfm.keyframe_features import make_finder
 from list3r.reconstruction.sfm.links import LinkSettings, keyframe_problem, step_beside, with_neighbours
 from list3r.reconstruction.sfm.mapping import MappingSettings, MapProblem, SparseMap, build_maps, triangulate
-from list3r.reconstruction.sfm.tracks import Gray, Tracks, TrackSettings, follow_corners
+from list3r.reconstruction.sfm.tracks import CornerSettings, CornerTracks, Gray, follow_corners
 
 Poses = NDArray[np.float64]
 
@@ -58,10 +58,10 @@ def make(options: ModelOptions) -> SfmReconstructor:
 class SfmSettings:
     """How a chunk of RGB frames is reconstructed."""
 
-    tracks: TrackSettings = field(default_factory=TrackSettings)
+    tracks: CornerSettings = field(default_factory=CornerSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
-    fill: FillSettings = field(default_factory=FillSettings)
+    fill: FramePoseSettings = field(default_factory=FramePoseSettings)
     dense: MvsSettings = field(default_factory=MvsSettings)
     least_flow: float = 0.01
     """A camera whose picture moves less than this through a whole chunk, by the longer side, stands still."""
@@ -119,7 +119,7 @@ class SfmReconstructor:
 
     def _segments(
         self, frames: Sequence[Frame], grays: Sequence[Gray], camera: Camera, around: Around | None = None
-    ) -> list[Segment]:
+    ) -> list[PosedSegment]:
         """Posed frames with their points, the largest segment first."""
         s = self.settings
         tracks = follow_corners(grays, s.tracks)
@@ -138,7 +138,7 @@ class SfmReconstructor:
         self,
         frames: Sequence[Frame],
         grays: Sequence[Gray],
-        tracks: Tracks,
+        tracks: CornerTracks,
         problem: MapProblem,
         camera: Camera,
         around: Around | None,
@@ -154,7 +154,9 @@ class SfmReconstructor:
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         return build_maps(wider, camera, free_camera=free, settings=s.mapping)
 
-    def _given(self, frames: Sequence[Frame], tracks: Tracks, problem: MapProblem, camera: Camera) -> Segment:
+    def _given(
+        self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera
+    ) -> PosedSegment:
         poses = {
             k: f.T_source_cam for k, f in enumerate(frames) if f.T_source_cam is not None and is_rigid(f.T_source_cam)
         }
@@ -163,7 +165,9 @@ class SfmReconstructor:
         found = triangulate(problem, camera, poses, self.settings.mapping)
         return _with_given_poses(found or SparseMap({}, {}, camera), poses, tracks)
 
-    def _finish(self, frames: Sequence[Frame], segment: Segment, deep: Collection[int] | None = None) -> Reconstruction:
+    def _finish(
+        self, frames: Sequence[Frame], segment: PosedSegment, deep: Collection[int] | None = None
+    ) -> Reconstruction:
         """Dense depth, units, keyframes."""
         T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
         for position, pose in segment.T_map_cam.items():
@@ -202,27 +206,27 @@ def _gray(frame: Frame) -> Gray:
     return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _renumbered(segment: Segment, kept: Sequence[int]) -> Segment:
+def _renumbered(segment: PosedSegment, kept: Sequence[int]) -> PosedSegment:
     """The segment with its frames numbered by their place in `kept`."""
     place = {k: n for n, k in enumerate(kept)}
-    return Segment(
+    return PosedSegment(
         segment.found,
         {place[k]: T for k, T in segment.T_map_cam.items()},
         {place[k]: seen for k, seen in segment.seen.items()},
     )
 
 
-def _with_given_poses(found: SparseMap, poses: dict[int, Poses], tracks: Tracks) -> Segment:
+def _with_given_poses(found: SparseMap, poses: dict[int, Poses], tracks: CornerTracks) -> PosedSegment:
     numbers = np.array(sorted(found.points), np.int64)
     places = np.array([found.points[int(n)] for n in numbers]).reshape(-1, 3)
     seen = {}
     for position in poses:
         known = np.isin(tracks.ids[position], numbers)
         seen[position] = tracks.xy[position][known], places[np.searchsorted(numbers, tracks.ids[position][known])]
-    return Segment(found, poses, seen)
+    return PosedSegment(found, poses, seen)
 
 
-def _check_motion(frames: Sequence[Frame], tracks: Tracks, settings: SfmSettings) -> None:
+def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSettings) -> None:
     """Raise `TrackingError` for frames in which nothing can be followed or nothing moves."""
     if len(frames) < 2:
         raise BaselineError(f"{_span(frames)}: depth from colour needs at least two frames from different places")
@@ -236,7 +240,7 @@ def _check_motion(frames: Sequence[Frame], tracks: Tracks, settings: SfmSettings
         raise BaselineError(f"{_span(frames)}: the camera stands still; depth from colour needs it to move")
 
 
-def _no_map(frames: Sequence[Frame], tracks: Tracks) -> TrackingError:
+def _no_map(frames: Sequence[Frame], tracks: CornerTracks) -> TrackingError:
     """What is wrong with frames of which no map could be made."""
     if int(tracks.run.max()) > len(tracks.run) // 4:
         why = "the camera moves too fast to be followed; film slower, or take more frames"

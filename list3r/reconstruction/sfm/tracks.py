@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class TrackSettings:
+class CornerSettings:
     """How corners are found and followed."""
 
     width: int = 1024
@@ -61,7 +61,7 @@ class TrackSettings:
 
 
 @dataclass(frozen=True)
-class Tracks:
+class CornerTracks:
     """Observations of corners in F frames."""
 
     ids: tuple[Ints, ...]
@@ -76,9 +76,9 @@ class Tracks:
     """Median motion of the corners since the frame before, by the longer side; NaN where unknown. Shape (F,)."""
 
 
-def follow_corners(grays: Sequence[Gray], settings: TrackSettings | None = None) -> Tracks:
+def follow_corners(grays: Sequence[Gray], settings: CornerSettings | None = None) -> CornerTracks:
     """Follow corners through grey pictures of one size."""
-    chosen = settings or TrackSettings()
+    chosen = settings or CornerSettings()
     follower = _Follower(chosen, grays[0].shape)
     while (at := len(follower.ids)) < len(grays):
         ahead = grays[at : at + 1 + chosen.look_past]
@@ -163,7 +163,7 @@ class _Alive:
 
 @dataclass
 class _Follower:
-    settings: TrackSettings
+    settings: CornerSettings
     shape: tuple[int, ...]
     alive: _Alive = field(default_factory=_Alive.none)
     pictures: dict[int, Gray] = field(default_factory=dict)
@@ -234,12 +234,12 @@ class _Follower:
         self.runs.append(self.run if len(seen.ids) else -1)
         self.flows.append(flow)
 
-    def tracks(self) -> Tracks:
+    def tracks(self) -> CornerTracks:
         """All that was followed. The last frame of each run is a keyframe."""
         run = np.array(self.runs, np.int64)
         ends = {int(np.flatnonzero(run == r)[-1]) for r in np.unique(run[run >= 0])}
         keyframes = tuple(sorted(ends | set(self.keyframes)))
-        return Tracks(tuple(self.ids), tuple(self.xy), keyframes, run, np.array(self.flows, np.float32))
+        return CornerTracks(tuple(self.ids), tuple(self.xy), keyframes, run, np.array(self.flows, np.float32))
 
     def _followed(self, gray: Gray) -> _Alive:
         s, alive = self.settings, self.alive

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.worlds.things import Thing, stack_solids
+from list3r.simulation.worlds.things import SimulatedThing, stack_solids
 
 Array = NDArray[np.float64]
 
@@ -16,10 +16,10 @@ NEAR_M = 0.05
 _EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)])
 
 
-class Scene:
+class SolidScene:
     """The solids of things that stand still and of things that are put elsewhere from frame to frame."""
 
-    def __init__(self, things: Sequence[Thing], moving: Sequence[Thing] = ()) -> None:
+    def __init__(self, things: Sequence[SimulatedThing], moving: Sequence[SimulatedThing] = ()) -> None:
         self.solids = stack_solids((*things, *moving))
         self.corners = self.solids.corners()
         """World, metres. Shape (N, 8, 3)."""

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.rendering.projection import NEAR_M, Scene, screen_rectangles
+from list3r.simulation.rendering.projection import NEAR_M, SolidScene, screen_rectangles
 from list3r.simulation.rendering.shading import ContactShadows, TextureAtlas, illumination, surface
-from list3r.simulation.worlds.things import BOX, CYLINDER, Thing, stack_solids
-from list3r.simulation.worlds.world import World
+from list3r.simulation.worlds.things import BOX, CYLINDER, SimulatedThing, stack_solids
+from list3r.simulation.worlds.world import SimulatedWorld
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -41,10 +41,10 @@ class Renderer:
     Things in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
     """
 
-    def __init__(self, world: World, camera: Camera, moving: Sequence[Thing] = ()) -> None:
+    def __init__(self, world: SimulatedWorld, camera: Camera, moving: Sequence[SimulatedThing] = ()) -> None:
         self._world = world
         self._camera = camera
-        self.scene = Scene(world.things, moving)
+        self.scene = SolidScene(world.things, moving)
         self._solids = self.scene.solids
         self._atlas = TextureAtlas(self._solids)
         self._shadows = ContactShadows(world, stack_solids(world.things))

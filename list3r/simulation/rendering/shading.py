@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from list3r.simulation.worlds.layout import Room
 from list3r.simulation.worlds.materials import TEXTURE_PX, bake, mip_levels
 from list3r.simulation.worlds.things import BOX, Solids
-from list3r.simulation.worlds.world import HEIGHT_M, World
+from list3r.simulation.worlds.world import HEIGHT_M, SimulatedWorld
 
 Floats = NDArray[np.float32]
 
@@ -61,7 +61,7 @@ class TextureAtlas:
 class ContactShadows:
     """Soft darkness on floors and table tops under and beside what stands on them or hangs low above them."""
 
-    def __init__(self, world: World, solids: Solids) -> None:
+    def __init__(self, world: SimulatedWorld, solids: Solids) -> None:
         supports = {t.support for t in world.things if t.support is not None and t.container is None}
         tops = {0.0} | {
             round(float(t.box().center[2] + t.box().size[2] / 2), 3)
@@ -145,7 +145,7 @@ def _lamps(room: Room) -> list[Floats]:
     return [np.array([room.x0 + s * (room.x1 - room.x0), y, z], np.float32) for s in share]
 
 
-def illumination(world: World, points: Floats, normals: Floats) -> Floats:
+def illumination(world: SimulatedWorld, points: Floats, normals: Floats) -> Floats:
     """Light on surface points: sky from above, lamps under each ceiling, gloom near the skirting. Shape (N,)."""
     light = 0.50 + 0.12 * normals[:, 2]
     for room, lamp in [(r, each) for r in world.rooms for each in _lamps(r)]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.materials import Material, Rgb
-from list3r.simulation.worlds.things import Thing
+from list3r.simulation.worlds.things import SimulatedThing
 
 WOODS: tuple[tuple[Rgb, Rgb], ...] = (
     ((112, 74, 44), (158, 110, 68)),
@@ -57,7 +57,7 @@ class Placer:
     """Collects things with rising ids, in room coordinates."""
 
     rng: np.random.Generator
-    things: list[Thing] = field(default_factory=list)
+    things: list[SimulatedThing] = field(default_factory=list)
 
     def add(
         self,
@@ -72,17 +72,17 @@ class Placer:
         on: int | None = None,
         inside: int | None = None,
         attached: int | None = None,
-    ) -> Thing:
+    ) -> SimulatedThing:
         """Put a thing at (x, y) of a room; `yaw_deg` turns its front from the room's +y."""
         yaw = np.deg2rad(180.0 - yaw_deg if room.mirrored else yaw_deg)
         wx, wy = room.world_xy(x, y)
-        thing = Thing(len(self.things) + 1, label, parts, (wx, wy, z), float(yaw), on, inside, attached)
+        thing = SimulatedThing(len(self.things) + 1, label, parts, (wx, wy, z), float(yaw), on, inside, attached)
         self.things.append(thing)
         return thing
 
-    def add_structure(self, label: str, parts: f.Parts) -> Thing:
+    def add_structure(self, label: str, parts: f.Parts) -> SimulatedThing:
         """A floor, wall or ceiling, whose parts are in world coordinates."""
-        thing = Thing(len(self.things) + 1, label, parts, (0.0, 0.0, 0.0), structure=label)
+        thing = SimulatedThing(len(self.things) + 1, label, parts, (0.0, 0.0, 0.0), structure=label)
         self.things.append(thing)
         return thing
 
@@ -125,8 +125,14 @@ class Placer:
         return f.vase(radius, rng.uniform(0.22, 0.28), self.bright("print", 0.4)), radius
 
     def scatter(
-        self, room: Room, support: Thing, kinds: tuple[str, ...], width: float, depth: float, keep_xy: float = 0.0
-    ) -> list[Thing]:
+        self,
+        room: Room,
+        support: SimulatedThing,
+        kinds: tuple[str, ...],
+        width: float,
+        depth: float,
+        keep_xy: float = 0.0,
+    ) -> list[SimulatedThing]:
         """Small things on the top of `support` at least 5 cm apart; the back `keep_xy` metres stay free."""
         top = support.box().center[2] + support.box().size[2] / 2
         placed: list[tuple[float, float, float]] = []
@@ -140,7 +146,7 @@ class Placer:
             offset = support.rotation()[:2, :2] @ np.array(spot)
             yaw = float(self.rng.uniform(0, 2 * np.pi))
             at = (support.position[0] + float(offset[0]), support.position[1] + float(offset[1]), float(top))
-            thing = Thing(len(self.things) + 1, kind, parts, at, yaw, support.id)
+            thing = SimulatedThing(len(self.things) + 1, kind, parts, at, yaw, support.id)
             self.things.append(thing)
             out.append(thing)
         return out
@@ -162,9 +168,11 @@ def _pick(rng: np.random.Generator, *names: str) -> str:
     return names[rng.integers(len(names))]
 
 
-def _fill(placer: Placer, container: Thing, parts: f.Parts, label: str, z: float) -> None:
+def _fill(placer: Placer, container: SimulatedThing, parts: f.Parts, label: str, z: float) -> None:
     x, y, base = container.position
-    placer.things.append(Thing(len(placer.things) + 1, label, parts, (x, y, base + z), 0.0, container.id, container.id))
+    placer.things.append(
+        SimulatedThing(len(placer.things) + 1, label, parts, (x, y, base + z), 0.0, container.id, container.id)
+    )
 
 
 def furnish_living_room(p: Placer, room: Room, walls: dict[str, int], floor: int) -> None:
@@ -207,7 +215,7 @@ def _bookshelf(p: Placer, room: Room, floor: int) -> None:
         parts, label = what
         offset = shelf.rotation()[:2, :2] @ np.array([x, 0.02])
         at = (shelf.position[0] + float(offset[0]), shelf.position[1] + float(offset[1]), level)
-        p.things.append(Thing(len(p.things) + 1, label, parts, at, shelf.yaw, shelf.id, shelf.id))
+        p.things.append(SimulatedThing(len(p.things) + 1, label, parts, at, shelf.yaw, shelf.id, shelf.id))
 
 
 def _shelf_plan(p: Placer) -> list[tuple[float, tuple[f.Parts, str]]]:

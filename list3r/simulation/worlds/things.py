@@ -46,7 +46,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Thing:
+class SimulatedThing:
     """One physical thing with what is true of it."""
 
     id: int
@@ -86,7 +86,7 @@ class Thing:
 class MovingThing:
     """A thing with a pose of its own in every frame."""
 
-    thing: Thing
+    thing: SimulatedThing
     """At the origin."""
     T_world_object: Array
     """Upright poses. Shape (F, 4, 4)."""
@@ -123,7 +123,7 @@ class Solids:
         return np.asarray(turned + self.center[:, None, :])
 
 
-def stack_solids(things: Sequence[Thing]) -> Solids:
+def stack_solids(things: Sequence[SimulatedThing]) -> Solids:
     """The parts of all things in the world frame."""
     pairs = [(thing, part) for thing in things for part in thing.parts]
     materials = tuple(dict.fromkeys(part.material for _, part in pairs))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.simulation.worlds.gaps import surface_gap
-from list3r.simulation.worlds.things import Thing
-from list3r.simulation.worlds.world import World
+from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.world import SimulatedWorld
 
 NEXT_TO_M = (0.1, 0.4)
 """Things are next to each other up to half the mean of their longest edges, within these bounds, metres."""
@@ -20,7 +20,7 @@ SHARED_HEIGHT = 0.3
 """Least share of the shorter one's height that two things side by side have in common."""
 
 
-def world_truth(world: World, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
+def world_truth(world: SimulatedWorld, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
     """The content of `truth.json`: frame, instances with boxes, relations.
 
     `seen` maps the id of a thing to counts of the walk: frames in which it shows, and its largest area in pixels.
@@ -35,7 +35,7 @@ def world_truth(world: World, seen: dict[int, dict[str, int]] | None = None) -> 
     }
 
 
-def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
+def _instance(thing: SimulatedThing, seen: dict[str, int]) -> dict[str, Any]:
     box = thing.box()
     return {
         "id": thing.id,
@@ -55,7 +55,7 @@ def _instance(thing: Thing, seen: dict[str, int]) -> dict[str, Any]:
     }
 
 
-def true_relations(world: World) -> list[tuple[int, str, int]]:
+def true_relations(world: SimulatedWorld) -> list[tuple[int, str, int]]:
     """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `near` and `next_to` both ways.
 
     `near` is the gap between surfaces against the size of the two, among things of which neither holds the other;
@@ -77,7 +77,7 @@ def true_relations(world: World) -> list[tuple[int, str, int]]:
     return sorted(triples)
 
 
-def _close(a: Thing, b: Thing) -> list[str]:
+def _close(a: SimulatedThing, b: SimulatedThing) -> list[str]:
     """Which of near and next_to two things are."""
     if a.id in (b.support, b.container) or b.id in (a.support, a.container):
         return []

@@ -9,7 +9,7 @@ import numpy as np
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, Room, furnish_bedroom, furnish_living_room, wall_paint
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import Thing, Vec3
+from list3r.simulation.worlds.things import SimulatedThing, Vec3
 
 WALL_M = 0.10
 DOOR_M = (0.95, 2.05)
@@ -26,21 +26,21 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class World:
+class SimulatedWorld:
     """Rooms, things, lamps, and a way through."""
 
     seed: int
     rooms: tuple[Room, ...]
-    things: tuple[Thing, ...]
+    things: tuple[SimulatedThing, ...]
     tour: tuple[Stop, ...]
     """A round through both rooms that comes back to where it starts."""
 
-    def thing(self, thing_id: int) -> Thing:
+    def thing(self, thing_id: int) -> SimulatedThing:
         """The thing of an id. Raises `KeyError`."""
         return {t.id: t for t in self.things}[thing_id]
 
 
-def make_world(seed: int = 0) -> World:
+def make_world(seed: int = 0) -> SimulatedWorld:
     """The world of a seed: sizes, colours, mirroring and small things are drawn from it."""
     rng = np.random.default_rng([seed, 1])
     depth = 3.8
@@ -50,7 +50,7 @@ def make_world(seed: int = 0) -> World:
     floors, walls = _shell(placer, (living, bedroom))
     furnish_living_room(placer, living, walls[0], floors[0])
     furnish_bedroom(placer, bedroom, walls[1], floors[1])
-    return World(seed, (living, bedroom), tuple(placer.things), _tour(living, bedroom))
+    return SimulatedWorld(seed, (living, bedroom), tuple(placer.things), _tour(living, bedroom))
 
 
 def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[str, int]]]:
