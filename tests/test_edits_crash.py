@@ -16,7 +16,7 @@ from tests.test_edits import built
 
 EDITOR = """
 import sys
-from list3r.memory import edits
+from list3r.memory.maintenance import edits
 from list3r.memory.constraints import standing
 from list3r.memory.store.store import Store
 

@@ -55,7 +55,7 @@ ROWS = {
 def test_verify_finds_any_row_that_is_not_as_it_was_written(case: str, tmp_path: Path) -> None:
     path = tmp_path / "old.l3r"
     shutil.copy(FIXTURES / "schema2.l3r", path)
-    with Store.open(path) as store:
+    with Store.open(path, writable=True) as store:
         assert store.verify() == []
     spoil(path, ROWS[case])
     with Store.open(path) as store:
@@ -162,7 +162,7 @@ def test_what_was_measured_and_is_damaged_is_named(make_memory: Make) -> None:
 def test_a_lost_chunk_takes_along_what_hung_on_it(tmp_path: Path) -> None:
     path = tmp_path / "old.l3r"
     shutil.copy(FIXTURES / "schema2.l3r", path)
-    Store.open(path).close()
+    Store.open(path, writable=True).close()
     spoil(path, "UPDATE chunks SET fx = 7 WHERE chunk_id = 2")
     report = repair(path, tmp_path / "sound.l3r")
     assert report.lost["chunks"] == ["2"] and report.lost["edges"] and report.chunks == 1

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -12,8 +14,12 @@ from list3r.frames.base import SourceInfo
 from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.store.codec import to_json
 from list3r.memory.store.connection import remove_memory
+from list3r.memory.store.file import rename_exclusively, taken
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunk import BuildSettings
+
+_MARK = "replaces"
+"""Under this key a new memory says which file it replaces."""
 
 
 class Target:
@@ -27,9 +33,11 @@ class Target:
     def keep(self) -> None:
         """From now on the new memory stays, whatever happens."""
         self._fresh = False
-        if self._replaced is not None:
+        if self._replaced is not None and _is_marked(self.store, self._replaced):
             self._replaced.unlink(missing_ok=True)
-            self._replaced = None
+            with self.store.transaction():
+                self.store.drop_value(_MARK)
+        self._replaced = None
 
     def __enter__(self) -> Self:
         return self
@@ -41,7 +49,7 @@ class Target:
         if kind is not None and self._fresh:
             remove_memory(self.store.path)
             if self._replaced is not None:
-                self._replaced.rename(self.store.path)
+                rename_exclusively(self._replaced, self.store.path)
 
 
 def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume: bool, force: bool) -> Target:
@@ -53,23 +61,48 @@ def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume
         raise MemoryFileError(f"{path} is a device or pipe, no ordinary file; name another file for the memory")
     if path.exists() and path.stat().st_size == 0:
         path.unlink()
-    replaced = _left_aside(path)
+    aside = _aside(path)
     if not path.exists():
-        return Target(Store.create(path), fresh=True)
+        if not _is_memory(aside):
+            return Target(Store.create(path), fresh=True)
+        rename_exclusively(aside, path)  # a replacement was killed before the new memory was there
     if resume and not force:
         with Store.open(path) as store:
             _check_same(store, info, settings)
-            begun = _holds_something(store)
-        return Target(Store.open(path, writable=True), fresh=not begun, replaced=replaced)
+            begun, replaced = _holds_something(store), aside if _is_marked(store, aside) else None
+        return _kept(Target(Store.open(path, writable=True), fresh=not begun, replaced=replaced), begun)
     if not force:
-        raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
+        raise MemoryFileError(taken(path))
+    return _replacing(path, aside)
+
+
+def _kept(target: Target, begun: bool) -> Target:
+    """The target of a build that goes on; what it had replaced goes where the new memory holds something."""
+    if begun:
+        target.keep()
+    return target
+
+
+def _replacing(path: Path, aside: Path) -> Target:
+    """A new memory in the place of an old one, which is set aside. Raises `MemoryFileError` where that cannot be."""
+    with Store.open(path) as store:
+        begun, ours = _holds_something(store), _is_marked(store, aside)
+    if os.path.lexists(aside) and not ours:
+        raise MemoryFileError(f"{aside} has the name under which --force keeps {path.name}; move it away")
     Store.open(path, writable=True).close()
-    if replaced is None:
-        replaced = _aside(path)
-        path.rename(replaced)
-    else:
+    if ours and not begun:
         remove_memory(path)
-    return Target(Store.create(path), fresh=True, replaced=replaced)
+    else:
+        aside.unlink(missing_ok=True)
+        rename_exclusively(path, aside)
+    try:
+        target = Target(Store.create(path), fresh=True, replaced=aside)
+    except BaseException:
+        rename_exclusively(aside, path)
+        raise
+    with target.store.transaction():
+        target.store.set_value(_MARK, _identity(aside))
+    return target
 
 
 def _holds_something(store: Store) -> bool:
@@ -82,23 +115,28 @@ def _aside(path: Path) -> Path:
     return path.with_name(f"{path.name}.replaced")
 
 
-def _left_aside(path: Path) -> Path | None:
-    """The old memory that a killed `--force` left aside: put back where no new one is, removed where one has begun."""
-    aside = _aside(path)
-    if not aside.is_file():
-        return None
+def _identity(path: Path) -> list[int] | None:
+    """What tells an ordinary file from any other that may take its name."""
     try:
-        Store.open(aside).close()
-    except MemoryFileError:
-        raise MemoryFileError(f"{aside} is no memory, but has the name that --force needs; move it away") from None
-    if not path.exists():
-        aside.rename(path)
+        found = path.lstat()
+    except OSError:
         return None
-    with Store.open(path) as store:
-        begun = _holds_something(store)
-    if begun:
-        aside.unlink()
-    return None if begun else aside
+    return [found.st_ino, found.st_size, found.st_mtime_ns] if stat.S_ISREG(found.st_mode) else None
+
+
+def _is_marked(store: Store, aside: Path) -> bool:
+    """Whether a file is the very one that this memory replaces, and no other of that name."""
+    return _identity(aside) is not None and store.get_value(_MARK) == _identity(aside)
+
+
+def _is_memory(path: Path) -> bool:
+    if _identity(path) is None:
+        return False
+    try:
+        Store.open(path).close()
+    except MemoryFileError:
+        return False
+    return True
 
 
 def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None:

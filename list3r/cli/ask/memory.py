@@ -47,7 +47,7 @@ def info(
         print_json({**report, **chunks})
         return
     for key, value in report.items():
-        if key != "sessions":
+        if key != "sessions" and (key, value) != ("beside", None):
             print(f"{key.replace('_', ' '):20} {value}")
     for session in report["sessions"]:
         print(
@@ -65,6 +65,7 @@ def memory_report(scene: SceneMemory) -> dict[str, Any]:
     return {
         "memory": str(scene.path),
         "size_mb": round(scene.path.stat().st_size / 1e6, 2),
+        "beside": store.beside(),
         "created_by": store.get_value("created_by"),
         "scale": store.get_value("scale_kind"),
         "scale_source": store.get_value("scale_source"),

@@ -44,9 +44,10 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
     """
     from list3r.memory.errors import MemoryFileError
 
-    found, state, chunks = [], [], None
+    found, state, chunks, beside = [], [], None, None
     try:
         with open_memory(memory) as scene:
+            beside = scene.store.beside()
             found = scene.store.verify()
             if not found:
                 chunks = len(scene.store.chunks())
@@ -56,7 +57,8 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
             raise
         found = [f"it cannot be opened: {error.__cause__}"]
     if json:
-        print_json({"memory": str(memory), "sound": not found, "damage": found, "sessions": state, "chunks": chunks})
+        facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": beside}
+        print_json({**facts, "sessions": state, "chunks": chunks})
     elif found:
         print("\n".join(found))
         print(f"`list3r repair {memory}` saves what is sound")
@@ -65,6 +67,8 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
             "; the build is unfinished, go on with --resume" if any(s["state"] == "building" for s in state) else ""
         )
         print(f"{memory} is sound: {chunks} chunks{unfinished}")
+    if beside and not json:
+        print(beside)
     if found:
         raise typer.Exit(1)
 

@@ -14,9 +14,18 @@ from typing import Any
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.store.checksums import OWN_CRC, SummedTable, row_crc, stored_sums, summed_tables
+from list3r.memory.store.checksums import (
+    OWN_CRC,
+    SUMS_SINCE,
+    SummedTable,
+    bad_rows,
+    row_crc,
+    stored_sums,
+    summed_tables,
+    write_part,
+)
 from list3r.memory.store.codec import checksum, pack_sim3, unpack
-from list3r.memory.store.file import check_schema, protect
+from list3r.memory.store.file import check_schema, connected, fold_in, migrate, protect
 from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
@@ -84,9 +93,13 @@ def _repair(path: Path, target: Path) -> RepairReport:
         _copy(path, copy)
         damage = _damage(copy)
         if not damage and target == path:
+            if Path(f"{path}-wal").exists():
+                with contextlib.closing(connected(path, "rw")) as database:
+                    fold_in(database, 2000)
             return _report(path, path, (), _Lost(), rebuilt=False)
-        with contextlib.closing(_connect(path, copy)) as damaged, Store.create(made) as store:
-            lost = _salvage(damaged, store)
+        lost = _Lost()
+        with contextlib.closing(_connect(path, copy, lost)) as damaged, Store.create(made) as store:
+            _salvage(damaged, store, lost)
             rebuilt = bool(damage) and _needs_deriving(lost)
             if rebuilt:
                 _derive(store)
@@ -125,12 +138,20 @@ def _damage(copy: Path) -> list[str]:
         return [str(error).replace(str(copy), "the file")]
 
 
-def _connect(path: Path, copy: Path) -> sqlite3.Connection:
-    """The damaged file as SQLite sees it; its schema must be ours, the rest need not."""
+def _connect(path: Path, copy: Path, lost: _Lost) -> sqlite3.Connection:
+    """The damaged file as SQLite sees it; its schema must be ours, the rest need not.
+
+    Of a file of an older schema what is not as it was written is left out, and the rest is brought forward.
+    """
     database = sqlite3.connect(copy, isolation_level=None)
     try:
         protect(database)
         database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
+        version = int(database.execute("PRAGMA user_version").fetchone()[0])
+        if SUMS_SINCE <= version < SCHEMA_VERSION:
+            check_schema(path, database, version)
+            _drop_bad_rows(database, version, lost)
+            migrate(database, version)
         check_schema(path, database, SCHEMA_VERSION)
     except (*FAILURES, MemoryFileError) as error:
         with contextlib.closing(database):
@@ -139,6 +160,25 @@ def _connect(path: Path, copy: Path) -> sqlite3.Connection:
             f"{path} cannot be repaired: what says which tables it holds is damaged ({error}); use a backup"
         ) from error
     return database
+
+
+def _drop_bad_rows(database: sqlite3.Connection, version: int, lost: _Lost) -> None:
+    """Take rows out of a file of an older schema that are not as they were written, and all that was said of those."""
+    tables = summed_tables(version)
+    for bad in list(bad_rows(database, version)):
+        table = tables.get(bad.table)
+        if table is not None and bad.key is not None:
+            lost.add(bad.table, bad.key)
+            where = " AND ".join(f"{c} IS ?" for c in table.key)
+            database.execute(f"DELETE FROM {bad.table} WHERE {where}", bad.key)
+        elif table is not None:
+            lost.unnamed[bad.table] = lost.unnamed.get(bad.table, 0) + 1
+    for name, table in tables.items():
+        for (part,) in database.execute(f"SELECT DISTINCT {table.part_of(name)} FROM {name}").fetchall():
+            write_part(database, table, part)
+        database.execute(
+            f"DELETE FROM sums WHERE name = ? AND part NOT IN (SELECT {table.part_of(name)} FROM {name})", (name,)
+        )
 
 
 def _check_ours(path: Path, database: sqlite3.Connection) -> None:
@@ -173,9 +213,8 @@ class _Lost:
         self.keys.setdefault(table, {})[key] = None
 
 
-def _salvage(damaged: sqlite3.Connection, store: Store) -> _Lost:
+def _salvage(damaged: sqlite3.Connection, store: Store, lost: _Lost) -> None:
     """Write all rows that are as they were written, and what hangs together with them, into an empty store."""
-    lost = _Lost()
     tables = {name: table for name, table in summed_tables().items() if name not in _PASSING}
     kept = {name: _sound_rows(damaged, table, lost) for name, table in tables.items()}
     lost.instances = {key[0] for key in (*kept["instances"], *lost.keys.get("instances", ()))}
@@ -190,7 +229,6 @@ def _salvage(damaged: sqlite3.Connection, store: Store) -> _Lost:
             )
         store.index_boxes()
         _stand_in_for_lost(store, lost)
-    return lost
 
 
 def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) -> dict[Row, Row]:

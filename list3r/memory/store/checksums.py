@@ -27,6 +27,8 @@ OWN_CRC: Mapping[str, tuple[str, ...]] = {
 }
 """Blobs that the column `crc` of their own row covers."""
 
+SUMS_SINCE = 3
+"""The first schema whose rows are summed."""
 _ROWS_OF_A_PART = 4
 """Two to the power of this: how many neighbouring ids share a part."""
 _FRAMES_OF_A_PART = 6
@@ -93,9 +95,9 @@ class BadRow:
 
 
 @cache
-def summed_tables() -> dict[str, SummedTable]:
-    """Every table of the schema by name, but `sums` and what is derived from the instances: the R*Tree and `words`."""
-    with scratch_database(SCHEMA_VERSION) as database:
+def summed_tables(version: int = SCHEMA_VERSION) -> dict[str, SummedTable]:
+    """Every table of a schema by name, but `sums` and what is derived from the instances: the R*Tree and `words`."""
+    with scratch_database(version) as database:
         names = database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'instance_boxes%' AND name != 'sums'"
             " AND name != 'words' AND name NOT LIKE 'sqlite_%' ORDER BY name"
@@ -129,6 +131,15 @@ class Sums:
 
     def _touch(self, table: str, part: int) -> None:
         self._touched.add((table, part))
+
+    def touched(self, table: str) -> frozenset[int]:
+        """Parts of a table that were changed since the last call of `write`."""
+        return frozenset(part for name, part in self._touched if name == table)
+
+    def damaged_before(self, committed: sqlite3.Connection) -> Iterator[BadRow]:
+        """Rows of the parts that were touched that were damaged before, in the file as it was last committed."""
+        for name, part in sorted(self._touched):
+            yield from bad_rows_of_part(committed, summed_tables()[name], part)
 
     def write(self) -> None:
         """Sum what was touched since the last call; inside the transaction that touched it."""
@@ -182,21 +193,29 @@ def stored_sums(database: sqlite3.Connection, table: SummedTable) -> tuple[dict[
     good: dict[int, list[bytes]] = {}
     bad: list[int] = []
     for part, sealed in database.execute("SELECT part, crcs FROM sums WHERE name = ? ORDER BY part", (table.name,)):
-        crcs = bytes(sealed[:-4]) if isinstance(sealed, bytes) else b""
-        if crcs and len(crcs) % 4 == 0 and isinstance(part, int) and sealed[-4:] == _seal(table.name, part, crcs):
-            good[part] = [crcs[i : i + 4] for i in range(0, len(crcs), 4)]
-        else:
+        crcs = _unsealed(table.name, part, sealed)
+        if crcs is None:
             bad.append(part)
+        else:
+            good[part] = crcs
     return good, bad
+
+
+def _unsealed(name: str, part: object, sealed: object) -> list[bytes] | None:
+    """Sums of the rows of a part; None where they are damaged themselves."""
+    crcs = bytes(sealed[:-4]) if isinstance(sealed, bytes) else b""
+    if not crcs or len(crcs) % 4 or not isinstance(part, int) or not isinstance(sealed, bytes):
+        return None
+    return [crcs[i : i + 4] for i in range(0, len(crcs), 4)] if sealed[-4:] == _seal(name, part, crcs) else None
 
 
 def _seal(name: str, part: int, crcs: bytes) -> bytes:
     return zlib.crc32(f"{name}:{part}:".encode() + crcs).to_bytes(4, "little")
 
 
-def bad_rows(database: sqlite3.Connection) -> Iterator[BadRow]:
+def bad_rows(database: sqlite3.Connection, version: int = SCHEMA_VERSION) -> Iterator[BadRow]:
     """Every row that is damaged, not as it was written, or missing. Raises `sqlite3.Error` where a page is broken."""
-    for table in summed_tables().values():
+    for table in summed_tables(version).values():
         yield from bad_rows_of(database, table)
 
 
@@ -216,6 +235,21 @@ def bad_rows_of(database: sqlite3.Connection, table: SummedTable) -> Iterator[Ba
             yield from compare(table.name, found, sums.pop(part, []))
     for crcs in sums.values():
         yield BadRow(table.name, None, _missing(len(crcs)))
+
+
+def bad_rows_of_part(database: sqlite3.Connection, table: SummedTable, part: int) -> Iterator[BadRow]:
+    """`bad_rows` of one part of a table."""
+    sealed = database.execute("SELECT crcs FROM sums WHERE name = ? AND part = ?", (table.name, part)).fetchall()
+    written = _unsealed(table.name, part, sealed[0][0]) if sealed else []
+    if written is None:
+        yield BadRow("sums", (table.name, part), "the checksums of these rows are damaged")
+        return
+    clause, arguments = table.where(part)
+    keys = len(table.key)
+    names = ", ".join((*table.key, *table.summed))
+    query = f"SELECT {names} FROM {table.name} WHERE {clause} ORDER BY {', '.join(table.key)}"
+    found = [(row[:keys], row_crc(row[keys:])) for row in database.execute(query, arguments)]
+    yield from compare(table.name, found, written)
 
 
 def compare(table: str, found: list[tuple[Row, bytes]], written: list[bytes]) -> Iterator[BadRow]:

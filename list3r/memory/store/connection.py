@@ -14,20 +14,29 @@ from typing import Any, Self
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.checksums import Sums
 from list3r.memory.store.codec import checksum, from_json, to_json
+from list3r.memory.store.committed import Committed
 from list3r.memory.store.derived import Derived
 from list3r.memory.store.file import (
+    check_beside,
     connected,
     explained,
+    fold_in,
     identified,
     migrate,
     migrated_copy,
+    not_alone,
+    reader,
+    taken,
     use_write_ahead_log,
     write_empty,
 )
-from list3r.memory.store.lock import WriterLock, lock_path
+from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, unbelieved
 from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.word_index import WordIndex, up_to_date, write_words
+
+_LAST_WAIT_MS = 2000
+"""How long a writer that closes waits for readers."""
 
 
 class Connection:
@@ -40,9 +49,11 @@ class Connection:
         self.path = path
         self._database = database
         self._lock = lock
-        self._followers = () if lock is None else (WordIndex(database), Sums(database))
+        self._committed = None if lock is None else Committed(path)
+        self._sums = None if lock is None else Sums(database)
+        self._followers = () if self._sums is None else (WordIndex(database), self._sums)
         """What follows the rows that a transaction changes; in this order as it commits."""
-        self._checks = ReadChecks(database) if _size(database) <= WHOLE_BYTES else None
+        self._checks = ReadChecks(database, self._committed) if _size(database) <= WHOLE_BYTES else None
         self._writing = False
         self._guard = threading.RLock()
         self.derived = Derived()
@@ -56,6 +67,13 @@ class Connection:
         """Whether this is the one connection that may write."""
         return self._lock is not None
 
+    def beside(self) -> str | None:
+        """What is to be known of a file that is not whole by itself; None where it is."""
+        try:
+            return not_alone(self.path, self._database)
+        except FAILURES as error:
+            raise MemoryFileError(explained(self.path, error)) from error
+
     @classmethod
     def create(cls, path: str | Path) -> Self:
         """A new, empty memory, open for writing. Raises `MemoryFileError` when the path is taken or not writable.
@@ -66,18 +84,16 @@ class Connection:
         if not path.parent.is_dir():
             raise MemoryFileError(f"the folder {path.parent} does not exist; create it first")
         if path.exists():
-            raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
-        lock = WriterLock(path.resolve())
-        new = path.resolve().with_name(f"{path.resolve().name}-new")
+            raise MemoryFileError(taken(path))
+        real = path.resolve()
+        lock = WriterLock(real)
         try:
-            if path.exists():
-                raise MemoryFileError(f"{path} exists already; use --resume to go on with it or --force to replace it")
-            remove_memory(new)
-            write_empty(path, new)
-            new.rename(path.resolve())
+            if os.path.lexists(real):
+                raise MemoryFileError(taken(path))
+            check_beside(real)
+            write_empty(real)
             return cls._connect(path, lock)
         except BaseException:
-            remove_memory(new)
             lock.release()
             raise
 
@@ -85,8 +101,8 @@ class Connection:
     def open(cls, path: str | Path, *, writable: bool = False) -> Self:
         """An existing memory. Raises `MemoryFileError` for anything else, and for a memory of a newer schema.
 
-        A memory of an older schema is migrated where it lies, or, where it may not be written or another process
-        writes it, in a copy that ends with the connection. Nothing in the file is executed: a trigger or view, or
+        Reading writes nothing: a memory of an older schema is migrated where it lies only when it is opened to be
+        written, else in a copy that ends with the connection. Nothing in the file is executed: a trigger or view, or
         anything else that the schema does not have, is refused.
         """
         path = Path(path)
@@ -96,6 +112,7 @@ class Connection:
             raise MemoryFileError(f"{path} is a folder, not a memory file")
         if not path.is_file():
             raise MemoryFileError(f"{path} is a device or pipe, not a memory file")
+        check_beside(path.resolve())
         if not writable:
             return cls._open_to_read(path)
         try:
@@ -105,20 +122,20 @@ class Connection:
 
     @classmethod
     def _open_to_read(cls, path: Path) -> Self:
+        database: sqlite3.Connection | None = None
         try:
-            try:
-                database, version = _identified_reader(path)
-            except sqlite3.OperationalError as error:
-                if getattr(error, "sqlite_errorname", "") not in _UNFINISHED or not _writable_now(cls, path):
-                    raise
-                database, version = _identified_reader(path)
-            if version < SCHEMA_VERSION:
-                database.close()
-                database = connected(path, "ro") if _writable_now(cls, path) else migrated_copy(path)
+            database = reader(path.resolve())
+            if identified(path, database) < SCHEMA_VERSION:
+                with contextlib.closing(database) as older:
+                    database = migrated_copy(path, older)
             database.execute("PRAGMA query_only=ON")
             return cls(path, database, None)
-        except FAILURES as error:
-            raise MemoryFileError(explained(path, error)) from error
+        except BaseException as error:
+            if database is not None:
+                database.close()
+            if isinstance(error, FAILURES):
+                raise MemoryFileError(explained(path, error)) from error
+            raise
 
     @classmethod
     def _connect(cls, path: Path, lock: WriterLock) -> Self:
@@ -143,16 +160,22 @@ class Connection:
                 raise MemoryFileError(explained(path, error)) from error
             raise
 
+    def __del__(self) -> None:
+        with contextlib.suppress(Exception):  # what is dropped lets go of the file
+            self.close()
+
     def close(self) -> None:
-        """Fold the write-ahead log into the one file, release the lock. A second call does nothing."""
-        if self._lock is not None:
+        """Fold the write-ahead log into the one file, release the lock. A second call does nothing.
+
+        Where a reader is amid a snapshot the log stays, beside the file, for the next that writes to fold in.
+        """
+        if self._lock is not None and self._committed is not None:
             with contextlib.suppress(sqlite3.Error):
                 if any(follower.pending for follower in self._followers):
                     with self.transaction():
                         pass
-            for statement in ("wal_checkpoint(TRUNCATE)", "journal_mode=DELETE"):
-                with contextlib.suppress(sqlite3.Error):
-                    self._database.execute(f"PRAGMA {statement}").fetchall()
+            self._committed.close()
+            fold_in(self._database, _LAST_WAIT_MS)
         self._database.close()
         if self._lock is not None:
             self._lock.release()
@@ -182,6 +205,8 @@ class Connection:
                 self._writing = True
                 try:
                     yield
+                    self._refuse(self._checks.found() if self._checks is not None else None)
+                    self._refuse(self._written_over())
                     for follower in self._followers:
                         follower.write()
                 except BaseException:
@@ -193,6 +218,16 @@ class Connection:
                 raise MemoryFileError(explained(self.path, error)) from error
             finally:
                 self._writing = False
+
+    def _written_over(self) -> str | None:
+        """The first damage of what the transaction that runs writes over, which must not be signed anew."""
+        if self._sums is None or self._committed is None:
+            return None
+        return next((str(bad) for bad in self._sums.damaged_before(self._committed())), None)
+
+    def _refuse(self, found: str | None) -> None:
+        if found is not None:
+            raise MemoryFileError(_damaged(self.path, found))
 
     def _roll_back(self) -> None:
         self.rollbacks += 1
@@ -208,7 +243,10 @@ class Connection:
             if self._database.in_transaction:
                 yield
                 return
-            self._rows("BEGIN")
+            try:
+                self._database.execute("BEGIN")
+            except FAILURES as error:
+                raise MemoryFileError(explained(self.path, error)) from error
             try:
                 yield
             finally:
@@ -238,44 +276,37 @@ class Connection:
     def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         try:
             rows = self._database.execute(query, arguments).fetchall()
-            if self._checks is not None and self._checks.pending and not self._writing:
-                found = self._checks.found()
-                if found is not None:
-                    raise MemoryFileError(_damaged(self.path, found))
+            if self._checks is not None:
+                self._refuse(self._checks.found())
             return rows
         except FAILURES as error:
             raise MemoryFileError(explained(self.path, error)) from error
 
     def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
-        if self._checks is None and not self._writing:
+        if self._checks is None:
+            written = frozenset[int]() if self._sums is None else self._sums.touched(table)
             try:
-                bad = unbelieved(self._database, table, rows)
+                bad = unbelieved(self._database, table, [row for row in rows if int(row[0]) >> 4 not in written])
             except FAILURES as error:
                 raise MemoryFileError(explained(self.path, error)) from error
-            if bad:
-                raise MemoryFileError(_damaged(self.path, f"{table} {bad[0]}: the row is not as it was written"))
+            self._refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
         return rows
 
     def _own_crc_believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Rows that begin with two keys and a count and end with blobs and their checksum: that is compared where the
         table is not checked as a whole.
         """
-        if self._checks is None and not self._writing:
+        if self._checks is None:
             for row in rows:
                 if checksum(*(blob if isinstance(blob, bytes) else b"" for blob in row[3:-1])) != row[-1]:
-                    name = f"{table} {row[0]}:{row[1]}"
-                    raise MemoryFileError(_damaged(self.path, f"{name}: the checksum does not match"))
+                    self._refuse(f"{table} {row[0]}:{row[1]}: the checksum does not match")
         return rows
 
 
-_UNFINISHED = ("SQLITE_READONLY_ROLLBACK", "SQLITE_READONLY_RECOVERY", "SQLITE_CANTOPEN", "SQLITE_READONLY")
-"""What a reader meets where a killed writer left a journal that only a writer may undo."""
-
-
 def remove_memory(path: Path) -> None:
-    """Delete a memory file and what lies beside it while it is written."""
-    for part in (path, *(Path(f"{path}{end}") for end in ("-wal", "-shm", "-journal")), lock_path(path)):
+    """Delete a memory file and what SQLite leaves beside it."""
+    for part in (path, *(Path(f"{path}{end}") for end in ("-wal", "-shm", "-journal"))):
         part.unlink(missing_ok=True)
 
 
@@ -287,24 +318,3 @@ def _size(database: sqlite3.Connection) -> int:
     """Bytes of a database, what is only in its log included."""
     pages = [database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")]
     return int(pages[0]) * int(pages[1])
-
-
-def _identified_reader(path: Path) -> tuple[sqlite3.Connection, int]:
-    """A connection for reading, and the schema version of what it reads."""
-    database = connected(path, "ro")
-    try:
-        return database, identified(path, database)
-    except BaseException:
-        database.close()
-        raise
-
-
-def _writable_now(kind: type[Connection], path: Path) -> bool:
-    """Open for writing and close, which migrates and recovers a file; False where that may not be now."""
-    if not (os.access(path, os.W_OK) and path.stat().st_mode & 0o222):
-        return False
-    try:
-        kind.open(path, writable=True).close()
-    except MemoryFileError:
-        return False
-    return True

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import sqlite3
+import stat
+import tempfile
 import time
 from pathlib import Path
 from urllib.parse import quote
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.checksums import write_all
+from list3r.memory.store.checksums import SUMS_SINCE, bad_rows, write_all
 from list3r.memory.store.codec import MAX_BLOB_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
 from list3r.memory.store.word_index import write_words
@@ -29,6 +32,22 @@ _WAIT_S = 30.0
 
 _SMALLEST = 512
 """Bytes of the smallest SQLite file."""
+_UNREADABLE_HERE = (
+    "SQLITE_READONLY_ROLLBACK",
+    "SQLITE_READONLY_RECOVERY",
+    "SQLITE_READONLY_CANTINIT",
+    "SQLITE_READONLY",
+    "SQLITE_CANTOPEN",
+    "SQLITE_IOERR_LOCK",
+)
+"""What SQLite says of a file that it could read only by writing."""
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+_BESIDE = {
+    "-wal": (bytes.fromhex("377f0682"), bytes.fromhex("377f0683")),
+    "-journal": (_JOURNAL, bytes(len(_JOURNAL))),
+    "-shm": (),
+}
+"""What SQLite writes beside a file, and how it begins."""
 
 
 def explained(path: Path, error: Exception) -> str:
@@ -47,11 +66,16 @@ def explained(path: Path, error: Exception) -> str:
     return f"{path}: {text}; run `list3r verify {path}`, `list3r repair {path}` saves what is sound"
 
 
-def connected(path: Path, mode: str) -> sqlite3.Connection:
-    """A connection that runs nothing that the file brings along and holds no value larger than a blob may be."""
+def connected(path: Path, mode: str, *, alone: bool = False) -> sqlite3.Connection:
+    """A connection that runs nothing that the file brings along and holds no value larger than a blob may be.
+
+    With `alone` it asks for the file for itself until it is told otherwise.
+    """
     uri = f"file:{quote(str(path.resolve()))}?mode={mode}"
     database = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_WAIT_S, check_same_thread=False)
     try:
+        if alone:
+            database.execute("PRAGMA locking_mode=EXCLUSIVE").fetchall()
         protect(database)
     except BaseException:
         database.close()
@@ -97,10 +121,14 @@ def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None
             )
 
 
-def write_empty(path: Path, new: Path) -> None:
-    """A memory without rows, whole and on the disk. Raises `MemoryFileError`."""
+def write_empty(path: Path) -> None:
+    """Write a memory without rows, whole and on the disk before it bears its name. Raises `MemoryFileError`."""
+    new: Path | None = None
     try:
-        os.close(os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644))
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-new-", dir=path.parent)
+        new = Path(name)
+        os.fchmod(descriptor, 0o666 & ~_umask())
+        os.close(descriptor)
         database = connected(new, "rw")
         try:
             database.execute(f"PRAGMA page_size = {PAGE_BYTES}")
@@ -108,10 +136,41 @@ def write_empty(path: Path, new: Path) -> None:
             migrate(database, 0)
         finally:
             database.close()
+        rename_exclusively(new, path)
+    except FileExistsError as error:
+        raise MemoryFileError(taken(path)) from error
     except OSError as error:
         raise MemoryFileError(f"{path} cannot be created: {error.strerror}") from error
     except sqlite3.Error as error:
         raise MemoryFileError(explained(path, error)) from error
+    finally:
+        if new is not None:
+            new.unlink(missing_ok=True)
+
+
+def taken(path: Path) -> str:
+    """What is said where a new memory is asked for under a name that is taken."""
+    return f"{path} exists already; use --resume to go on with it or --force to replace it"
+
+
+def rename_exclusively(old: Path, new: Path) -> None:
+    """Give a file a name that nothing bears. Raises `FileExistsError`; without hard links the name is looked up."""
+    try:
+        os.link(old, new, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except OSError:
+        if os.path.lexists(new):
+            raise FileExistsError(str(new)) from None
+        old.rename(new)
+    else:
+        old.unlink()
+
+
+def _umask() -> int:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def use_write_ahead_log(database: sqlite3.Connection) -> None:
@@ -129,24 +188,113 @@ def use_write_ahead_log(database: sqlite3.Connection) -> None:
     database.execute(f"PRAGMA cache_size=-{_WRITER_CACHE_KIB}")
 
 
-def migrated_copy(path: Path) -> sqlite3.Connection:
+def migrated_copy(path: Path, source: sqlite3.Connection) -> sqlite3.Connection:
     """A copy of an older file in the present schema, in a nameless file of SQLite that ends with the connection."""
-    with contextlib.closing(connected(path, "ro")) as source:
-        copy = sqlite3.connect("", isolation_level=None, check_same_thread=False)
+    copy = sqlite3.connect("", isolation_level=None, check_same_thread=False)
+    try:
+        source.backup(copy)
+        protect(copy)
+        migrate(copy, identified(path, copy))
+    except BaseException:
+        copy.close()
+        raise
+    return copy
+
+
+def private_copy(path: Path) -> sqlite3.Connection:
+    """A connection to a copy of a file and of its journals, which nobody else sees and which ends with it."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="list3r-") as folder:
+            copy = Path(folder) / "copy.l3r"
+            for end in ("", "-wal", "-journal"):
+                if Path(f"{path}{end}").exists():
+                    shutil.copyfile(f"{path}{end}", f"{copy}{end}")
+            database = connected(copy, "rw")
+            try:
+                for statement in ("SELECT count(*) FROM sqlite_master", "PRAGMA journal_mode=OFF"):
+                    database.execute(statement).fetchall()  # what a journal undoes is undone before it goes
+            except BaseException:
+                database.close()
+                raise
+            return database
+    except OSError as error:
+        raise MemoryFileError(f"{path} cannot be copied to be read: {error.strerror}") from error
+
+
+def check_beside(path: Path) -> None:
+    """Raise `MemoryFileError` where what SQLite would take for its own beside a memory is something else."""
+    for end, starts in _BESIDE.items():
+        beside = Path(f"{path}{end}")
         try:
-            source.backup(copy)
-            protect(copy)
-            migrate(copy, identified(path, copy))
+            found = beside.lstat()
+        except OSError:
+            continue
+        ours = stat.S_ISREG(found.st_mode) and found.st_nlink == 1
+        if ours and found.st_size and starts:
+            with contextlib.suppress(PermissionError), beside.open("rb") as file:
+                ours = file.read(len(starts[0])) in starts
+        if not ours:
+            raise MemoryFileError(f"{beside} has the name that {path.name} needs while it is written; move it away")
+
+
+def not_alone(path: Path, database: sqlite3.Connection) -> str | None:
+    """One sentence where a file lacks what was written last, which lies in the log beside it or did; None where not."""
+    log = Path(f"{path.resolve()}-wal")
+    size = log.stat().st_size if log.exists() else 0
+    if size:
+        return (
+            f"what was written last lies in {log.name} ({size / 1e6:.2f} MB): a copy needs both files; "
+            f"`list3r repair {path}` folds it in when nobody writes"
+        )
+    copied = database.execute("PRAGMA journal_mode").fetchone()[0] == "off"
+    return f"it was copied while {log.name} was beside it; what was written last may be missing" if copied else None
+
+
+def fold_in(database: sqlite3.Connection, wait_ms: int) -> None:
+    """Write the log into the one file and leave nothing beside it, unless somebody reads for longer than that."""
+    for statement in (f"busy_timeout={wait_ms}", "wal_checkpoint(TRUNCATE)", "journal_mode=DELETE"):
+        with contextlib.suppress(sqlite3.Error):
+            database.execute(f"PRAGMA {statement}").fetchall()
+
+
+def reader(path: Path) -> sqlite3.Connection:
+    """A connection for reading that writes nothing beside the file or into it.
+
+    A file in the mode of a write-ahead log without the memory that its readers share (which a writer makes; a file that
+    was copied away from one, or came in an archive, lacks it) is read as a private copy, and so is one whose writer was
+    killed within a commit. The lock that is asked for tells such a file, for nobody can have it on a file that is only
+    read: opening the file to look at it would drop the locks of this process when it is closed.
+    """
+    shared = _is_shared(path)
+    try:
+        database = connected(path, "ro", alone=not shared)
+        try:
+            for mode in ("EXCLUSIVE", "NORMAL")[shared:]:
+                database.execute(f"PRAGMA locking_mode={mode}").fetchall()
+                database.execute("SELECT count(*) FROM sqlite_master").fetchall()
+            return database
         except BaseException:
-            copy.close()
+            database.close()
             raise
-        return copy
+    except sqlite3.Error as error:
+        if not shared and _is_shared(path):
+            return reader(path)
+        if getattr(error, "sqlite_errorname", "") in _UNREADABLE_HERE:
+            return private_copy(path)
+        raise
+
+
+def _is_shared(path: Path) -> bool:
+    return Path(f"{path}-wal").exists() and Path(f"{path}-shm").exists()
 
 
 def migrate(database: sqlite3.Connection, version: int) -> None:
-    """Bring a file forward to the present schema, in one transaction."""
+    """Bring a file forward to the present schema, in one transaction. Raises `sqlite3.DatabaseError` on damage."""
     database.execute("BEGIN IMMEDIATE")
     try:
+        if version >= SUMS_SINCE:
+            for bad in bad_rows(database, version):
+                raise sqlite3.DatabaseError(str(bad))
         for migration in MIGRATIONS[version:]:
             for statement in migration.split(";"):
                 database.execute(statement)

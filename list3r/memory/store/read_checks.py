@@ -9,7 +9,7 @@ one by one as they are read; the rest, and rows that are missing, by `verify` al
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,12 +29,15 @@ WORDS = "words"
 
 
 class ReadChecks:
-    """Knows which tables a connection has read, and which of them are sound."""
+    """Knows which tables a connection has read, and which of them are sound; damage once found is never forgotten."""
 
-    def __init__(self, database: sqlite3.Connection) -> None:
+    def __init__(self, database: sqlite3.Connection, committed: Callable[[], sqlite3.Connection] | None = None) -> None:
+        """`committed`, for a connection that writes, leads to another that does not see what is not committed yet."""
         self._database = database
+        self._committed = committed
         self._checked: set[str] = set()
         self._read: set[str] = set()
+        self._damage: str | None = None
         self._busy = False
         self._known = {*summed_tables(), BOXES, WORDS}
         database.set_authorizer(self._note)
@@ -46,31 +49,31 @@ class ReadChecks:
                 self._read.add(name)
         return sqlite3.SQLITE_OK
 
-    @property
-    def pending(self) -> bool:
-        """Whether a table was read that was not checked."""
-        return bool(self._read)
-
     def found(self) -> str | None:
-        """The first damage of the tables that were read since the last call; outside of what is not committed yet."""
-        names = sorted(self._read)
-        self._read.clear()
-        self._busy, opened = True, not self._database.in_transaction
-        text_factory, self._database.text_factory = self._database.text_factory, any_text
+        """The first damage of the tables that this connection has read so far."""
+        if self._damage is None and self._read:
+            self._damage = self._found(sorted(self._read))
+        return self._damage
+
+    def _found(self, names: Sequence[str]) -> str | None:
+        database = self._database if self._committed is None else self._committed()
+        self._busy, opened = True, not database.in_transaction
+        text_factory, database.text_factory = database.text_factory, any_text
         try:
             if opened:
-                self._database.execute("BEGIN")
+                database.execute("BEGIN")
             for name in names:
-                for text in damage_of(self._database, name):
+                for text in damage_of(database, name):
                     return text
                 self._checked.add(name)
+                self._read.discard(name)
             return None
         except FAILURES as error:
             return str(error)
         finally:
-            self._database.text_factory = text_factory
-            if opened and self._database.in_transaction:
-                self._database.execute("ROLLBACK")
+            database.text_factory = text_factory
+            if opened and database.in_transaction:
+                database.execute("ROLLBACK")
             self._busy = False
 
 
