@@ -20,11 +20,12 @@ import gtsam
 import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from list3r.association.graph.growth import extend
 from list3r.association.graph.marginals import marginals
-from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of, optimize
 from list3r.association.graph.solver import GraphProblem, stack, take
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.records import Edge
@@ -161,6 +162,48 @@ def from_gtsam(values: gtsam.Values, count: int, metric: bool = False) -> Sim3:
     return stack([Sim3(np.array(s.scale()), s.rotation().matrix(), s.translation() * s.scale()) for s in found])
 
 
+def uncertainty(chunks: int, edges: int, seed: int) -> dict[str, Any]:
+    """Covariance of every chunk and redundancy of every edge, by our factor and by gtsam's `Marginals`; and whether
+    two runs of gtsam give the same bits."""
+    w = walk(chunks, edges, seed)
+    start = chained(w.edges, take(w.truth, np.array(0)))
+    u, v = np.array([e.u for e in w.edges]), np.array([e.v for e in w.edges])
+    unit = np.tile(np.eye(7), (len(u), 1, 1))
+    problem = GraphProblem.build(u, v, stack([e.S_v_u for e in w.edges]), unit, np.arange(chunks) == 0)
+
+    def solved() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        graph, values = gtsam_graph(w, start)
+        return graph, gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+
+    (graph, at), again = solved(), solved()[1]
+    first, second = from_gtsam(at, chunks), from_gtsam(again, chunks)
+    blocks, seconds = timed(lambda: marginals(problem, first, np.ones(len(u))), 1)
+
+    def chunk_blocks() -> gtsam.Marginals:
+        found = gtsam.Marginals(graph, at)
+        for k in range(chunks):
+            found.marginalCovariance(k)
+        return found
+
+    found, seconds_chunks = timed(chunk_blocks, 1)
+
+    def edge_blocks() -> None:
+        for e in w.edges:
+            found.jointMarginalCovariance(gtsam.KeyVector([e.u, e.v])).at(e.u, e.v)
+
+    _, seconds_edges = timed(edge_blocks, 1)
+    return {
+        "seed": seed,
+        "redundancy": float(blocks.redundancy.sum()),
+        "seconds": seconds,
+        "seconds_gtsam_chunks": seconds_chunks,
+        "seconds_gtsam_edges": seconds_edges,
+        "gtsam_twice_the_same_bits": all(
+            np.array_equal(getattr(first, part), getattr(second, part)) for part in ("scale", "rotation", "translation")
+        ),
+    }
+
+
 def full(chunks: int, edges: int, seed: int, metric: bool) -> dict[str, Any]:
     """Plain least squares from the chain, beside gtsam's Levenberg-Marquardt."""
     w = walk(chunks, edges, seed, metric=metric)
@@ -221,9 +264,28 @@ def one_more(chunks: int, edges: int, seed: int) -> dict[str, Any]:
     return out
 
 
-def false_loops(chunks: int, edges: int, seed: int, alike: bool) -> dict[str, Any]:
-    """The same graph without and with 30 % false loops; gtsam's GNC (truncated least squares) beside it."""
-    clean, spoilt = walk(chunks, edges, seed), walk(chunks, edges, seed, 0.3, alike)
+def gnc(w: Walk, start: Sim3, weights: Array | None) -> tuple[Sim3, NDArray[np.bool_]]:
+    """gtsam's graduated non-convexity with our limits: poses, and which edges it believes. Without `weights` every edge
+    has the covariance that it states, else the information that we give it. Shape (E, 7, 7)."""
+    chunks = len(start.scale)
+    graph, values = gtsam_graph(w, start, stated=True)
+    if weights is not None:
+        order, measured = [3, 4, 5, 0, 1, 2, 6], stack([e.S_v_u for e in w.edges])
+        for k, e in enumerate(w.edges):
+            noise = gtsam.noiseModel.Gaussian.Information(weights[k][np.ix_(order, order)])
+            graph.replace(k, gtsam.BetweenFactorSimilarity3(e.v, e.u, as_gtsam(measured, k), noise))
+    parameters = gtsam.GncLMParams()
+    parameters.setKnownInliers([*range(chunks - 1), len(w.edges)])
+    optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
+    optimizer.setInlierCostThresholds(float(chi2.ppf(GraphSettings().trust.loop_quantile, 7)) / 2)
+    poses = from_gtsam(optimizer.optimize(), chunks)
+    return poses, optimizer.getWeights()[: len(w.edges)] > 0.5
+
+
+def false_loops(chunks: int, edges: int, seed: int, alike: bool, drift: float = 1.0) -> dict[str, Any]:
+    """The same graph without and with 30 % false loops; gtsam's GNC (truncated least squares) beside it. `drift` times
+    as large as stated are the errors of adjacent edges."""
+    clean, spoilt = (drifting(walk(chunks, edges, seed, *bad), drift, seed) for bad in ((0.0, False), (0.3, alike)))
     first = {0: take(clean.truth, np.array(0))}
     ids = list(range(chunks))
 
@@ -234,25 +296,41 @@ def false_loops(chunks: int, edges: int, seed: int, alike: bool) -> dict[str, An
         return ate(stack([result.S_graph_chunk[k] for k in ids]), clean.truth)
 
     without, (with_false, seconds) = placed(solved(clean)), timed(lambda: solved(spoilt), 1)
-    graph, values = gtsam_graph(spoilt, chained(spoilt.edges, first[0]), stated=True)
-    parameters = gtsam.GncLMParams()
-    parameters.setKnownInliers(list(range(chunks - 1)))
-    gnc, seconds_gnc = timed(lambda: gtsam.GncLMOptimizer(graph, values, parameters).optimize(), 1)
-    kept = sum(e.accepted for e, wrong in zip(with_false.edges, spoilt.false, strict=True) if wrong)
-    lost = sum(not e.accepted for e, wrong in zip(with_false.edges, spoilt.false, strict=True) if not wrong)
-    return {
+    believed = np.array([e.accepted for e in with_false.edges])
+    start = chained(spoilt.edges, first[0])
+    row = {
         "seed": seed,
         "alike": alike,
+        "drift": drift,
         "ate": without,
         "ate_with_false": placed(with_false),
         "ratio": placed(with_false) / without,
         "ate_plain": placed(solved(spoilt, GraphSettings(weighted=False, robust=False))),
-        "ate_gtsam_gnc": ate(from_gtsam(gnc, chunks), clean.truth),
         "seconds": seconds,
-        "seconds_gtsam_gnc": seconds_gnc,
-        "false_kept": kept,
-        "true_lost": lost,
+        "false_kept": int((believed & spoilt.false).sum()),
+        "true_lost": int((~believed & ~spoilt.false).sum()),
     }
+    ours = information_of(spoilt.edges, False, GraphSettings())
+    for name, weights in (("gnc", None), ("gnc_our_weights", ours)):
+        (poses, kept), row[f"seconds_gtsam_{name}"] = timed(lambda weights=weights: gnc(spoilt, start, weights), 1)
+        row[f"ate_gtsam_{name}"] = ate(poses, clean.truth)
+        row[f"false_kept_gtsam_{name}"] = int((kept & spoilt.false).sum())
+        row[f"true_lost_gtsam_{name}"] = int((~kept & ~spoilt.false).sum())
+    return row
+
+
+def drifting(w: Walk, times: float, seed: int) -> Walk:
+    """The walk with adjacent edges whose errors are larger than they state, as those of bent chunks are."""
+    if times == 1.0:
+        return w
+    rng = np.random.default_rng(seed + 1000)
+    edges = [
+        replace(e, S_v_u=e.S_v_u @ Sim3.exp(np.sqrt((times**2 - 1.0) * np.diag(e.covariance)) * rng.normal(size=7)))
+        if e.kind == "adjacent"
+        else e
+        for e in w.edges
+    ]
+    return replace(w, edges=edges)
 
 
 def main() -> None:
@@ -271,9 +349,13 @@ def measure(seeds: list[int], path: Path | None) -> None:
     """All parts, printed and written."""
     result: dict[str, Any] = {"full": [full(1000, 5000, s, metric) for s in seeds for metric in (False, True)]}
     print(*result["full"], sep="\n")
+    result["uncertainty"] = [uncertainty(1000, 5000, seed) for seed in seeds]
+    print(*result["uncertainty"], sep="\n")
     result["one_more"] = one_more(1000, 5000, seeds[0])
     print(result["one_more"])
-    result["false_loops"] = [false_loops(200, 600, s, alike) for s in seeds for alike in (False, True)]
+    result["false_loops"] = [
+        false_loops(200, 600, s, alike, drift) for s in seeds for drift in (1.0, 5.0) for alike in (False, True)
+    ]
     print(*result["false_loops"], sep="\n")
     write_json(path, result)
 
