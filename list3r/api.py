@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.registry import export as export_memory
+from list3r.exporters.tables import Table, Value, records_of
 from list3r.memory.errors import OptionError
 from list3r.memory.maintenance.as_of import store_at
 from list3r.memory.maintenance.editing import MemoryEdits
@@ -29,7 +30,6 @@ from list3r.queries.path import path
 from list3r.queries.relations import Place, Relations, relations
 from list3r.queries.seen import Sightings, seen, visible
 from list3r.queries.similar import similar
-from list3r.queries.tables import Table, Value, records_of
 from list3r.queries.views.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame
 from list3r.queries.within import within
 

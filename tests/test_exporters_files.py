@@ -1,7 +1,8 @@
-"""PLY, GLB and TUM, read back by other hands than ours."""
+"""PLY, GLB, TUM and CSV, read back by other hands than ours."""
 
 from __future__ import annotations
 
+import csv
 import json
 import struct
 from collections.abc import Callable
@@ -12,9 +13,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+import list3r
+from list3r.exporters.csv_tables import write_csv
 from list3r.exporters.glb import T_GLTF_WORLD, GlbSettings, write_glb
 from list3r.exporters.palette import instance_color
 from list3r.exporters.ply import PlySettings, write_ply
+from list3r.exporters.tables import records_of
 from list3r.exporters.tum import write_tum
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
@@ -124,3 +128,40 @@ def test_glb_boxes_are_twelve_edges_with_facts(room: Store, tmp_path: Path) -> N
     position = accessors[primitive["attributes"]["POSITION"]]  # type: ignore[index]
     assert (primitive["mode"], position["count"]) == (1, 24)
     assert np.allclose(position["max"], room.instance(5).aabb[1])
+
+
+def expected_cell(value: object) -> str:
+    return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def test_csv_holds_the_tables_of_the_api(room: Store, tmp_path: Path) -> None:
+    written = write_csv(room, tmp_path / "room.csv")
+    assert [p.name for p in written] == ["room.csv", "room.relations.csv"]
+    for path, table in zip(written, ("instances", "relations"), strict=True):
+        with path.open(newline="", encoding="utf-8") as file:
+            read = list(csv.DictReader(file))
+        expected = records_of(room, table)  # type: ignore[arg-type]
+        assert [list(row) for row in read] == [list(row) for row in expected]
+        for row, known in zip(read, expected, strict=True):
+            for name, value in known.items():
+                if isinstance(value, float):
+                    assert float(row[name]) == value
+                else:
+                    assert row[name] == expected_cell(value)
+
+
+def test_csv_keeps_labels_with_commas_and_quotes(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    label = 'a "blue", round mug'
+    with list3r.open(make_memory(), writable=True) as memory:
+        memory.label(3, label)
+    with (
+        list3r.open(tmp_path / "room.l3r") as memory,
+        write_csv(memory.store, tmp_path / "room.csv")[0].open(newline="") as file,
+    ):
+        assert next(row for row in csv.DictReader(file) if row["id"] == "3")["label"] == label
+
+
+def test_csv_of_an_empty_memory_names_the_columns(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "empty.l3r") as store:
+        texts = [p.read_text() for p in write_csv(store, tmp_path / "out.csv")]
+    assert texts[0].startswith("id,label,") and texts[1] == "subject,predicate,object,confidence,margin\n"

@@ -6,14 +6,17 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from list3r.memory.errors import ExportError
-from list3r.memory.store.store import Store
+
+if TYPE_CHECKING:
+    from list3r.memory.store.store import Store
 
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; it takes the place of `path` when the block ends well.
+    """Yield a temporary name beside `path` to write to; it replaces `path` when the block ends without an error.
 
     Raises `ExportError` before the block when the folder is absent or not writable or when something stands at `path`
     that an export must not replace (a folder, a device, a memory file), and for every failure of the disk inside it.
@@ -34,7 +37,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def check_target(path: Path) -> None:
-    """Raises `ExportError` when `path` cannot or must not be written."""
+    """Raise `ExportError` when `path` cannot or must not be written."""
     try:
         if not path.parent.is_dir():
             raise ExportError(f"the folder {path.parent} does not exist; create it first")
@@ -59,10 +62,10 @@ def _is_database(path: Path) -> bool:
 
 
 def part_path(path: Path, name: str) -> Path:
-    """Where a further part of an export goes: `scene.component_7.ply` beside `scene.ply`; `path` for no name."""
+    """Return the path of one more file of an export: `scene.component_7.ply` beside `scene.ply`; `path` for no name."""
     return path.with_name(f"{path.stem}.{name}{path.suffix}") if name else path
 
 
 def units(store: Store) -> str:
-    """Unit of length: "m" for a metric or anchored memory, "unit" for a relative one, whose scale is arbitrary."""
+    """Return the unit of length: "m" for a metric or anchored memory, "unit" for a relative one (arbitrary scale)."""
     return "m" if store.get_value("scale_kind", "relative") in ("metric", "anchored") else "unit"

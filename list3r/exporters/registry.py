@@ -1,4 +1,4 @@
-"""Which formats there are, and which module writes each; a module is imported when its format is asked for."""
+"""The table of export formats and the module that writes each; a module is imported when its format is asked for."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from list3r.exporters.output import check_target
 from list3r.memory.errors import OptionError
-from list3r.memory.store.store import Store
 
-Writer = Callable[[Store, Path], tuple[Path, ...]]
+if TYPE_CHECKING:  # the command line reads the names of the formats before anything heavy is needed
+    from list3r.memory.store.store import Store
+
+Writer = Callable[["Store", Path], tuple[Path, ...]]
 
 
 @dataclass(frozen=True)
@@ -35,14 +37,15 @@ FORMATS: dict[str, Format] = {
     "ply": Format("ply", "write_ply", (".ply",), False, "points coloured by instance"),
     "glb": Format("glb", "write_glb", (".glb",), False, "boxes and points for any glTF viewer"),
     "tum": Format("tum", "write_tum", (".txt", ".tum"), True, "camera trajectory, one line a frame"),
+    "csv": Format("csv_tables", "write_csv", (".csv",), False, "tables of instances and of relations"),
     "plan": Format("plan.picture", "write_plan", (".png",), False, "plan view of the rooms as a picture"),
 }
 
 
 def export(store: Store, format_name: str, path: str | Path) -> tuple[Path, ...]:
-    """Write a memory to `path` in a format; the files written, `path` first.
+    """Write a memory to `path` in a format. Returns the files written, `path` first.
 
-    A memory of several components gives further files beside `path` in formats that hold one frame of reference.
+    Formats that hold one coordinate frame write a further file beside `path` for each further connected component.
     Raises `OptionError` for an unknown format or a file name that does not fit it, `ExportError` when it cannot be
     written.
     """
@@ -56,7 +59,7 @@ def export(store: Store, format_name: str, path: str | Path) -> tuple[Path, ...]
 
 
 def find_writer(format_name: str) -> Writer:
-    """The function that writes a format. Raises `OptionError` naming the formats there are."""
+    """Return the function that writes a format. Raises `OptionError` that names the known formats."""
     if format_name not in FORMATS:
         raise OptionError(f"unknown format {format_name!r}; there are {', '.join(FORMATS)}")
     form = FORMATS[format_name]

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.exporters.registry import FORMATS
 
 
 def register(app: typer.Typer) -> None:
@@ -20,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 def export(
     memory: MemoryArgument,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="json, usd, ply, glb, tum or plan.")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")],
     out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file to write.")],
     json: JsonOption = False,
 ) -> None:
