@@ -26,15 +26,15 @@ import os
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
+
+from list3r.pipeline.workers import OrderedPool
 
 Array = NDArray[np.float64]
 PRESETS = ("calm", "loop", "kidnap", "dynamic", "twins", "sparse", "corridor")
@@ -74,8 +74,8 @@ def main() -> None:
             parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(known)}")
     jobs = [(preset, int(seed), tuple(variants)) for seed in words.seeds.split(",") for preset in presets]
     rows: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(words.workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
-        for done in pool.map(run_video, jobs):
+    with OrderedPool(run_video, words.workers) as pool:
+        for done in pool.map(jobs):
             rows += done
             ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
             print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
@@ -89,12 +89,6 @@ def main() -> None:
     write_json(words.json, {"summary": summary, "revisits": revisits, "runs": rows})
     if words.plot is not None:
         plot(words.plot, rows, presets, variants)
-
-
-def _one_thread() -> None:
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
 
 
 def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:

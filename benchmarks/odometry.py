@@ -13,9 +13,8 @@ import itertools
 import json
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -33,6 +32,7 @@ from list3r.frames.source import open_source
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 from list3r.memory.store.tables.local_instances import LocalNode
+from list3r.pipeline.workers import OrderedPool
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
@@ -194,8 +194,8 @@ def run(path: str, options: SourceOptions, workers: int, beside_open3d: bool) ->
     count = source.info.frame_count
     spans = plan_chunks(count, ChunkSettings())
     begin = time.perf_counter()
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        chunks = list(pool.map(reconstruct, [path] * len(spans), [options] * len(spans), spans))
+    with OrderedPool(partial(reconstruct, path, options), workers) as pool:
+        chunks = list(pool.map(spans))
     wall, begin = time.perf_counter() - begin, time.process_time()
     adjacent, loops = associate(chunks)
     associate_s = time.process_time() - begin

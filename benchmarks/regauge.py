@@ -43,9 +43,8 @@ def main() -> None:
     source = open_source(words.source, options)
     count = min(source.info.frame_count, words.frames or source.info.frame_count)
     tasks = [ChunkTask(str(words.source), options, span, settings) for span in plan_chunks(count, settings.chunks)]
-    pool = OrderedPool(process_chunk, default_workers())
-    results = list(pool.map(tasks))
-    pool.stop()
+    with OrderedPool(process_chunk, default_workers()) as pool:
+        results = list(pool.map(tasks))
     frames = [f for f in source.read(0, count) if isinstance(f, Frame) and f.T_source_cam is not None]
     truth = Trajectory(np.array([f.time_s for f in frames]), np.stack([np.asarray(f.T_source_cam) for f in frames]))
     with threadpool_limits(1):

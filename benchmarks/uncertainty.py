@@ -13,8 +13,6 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,8 @@ from association import PRESETS, run_variant
 from machine import machine, write_json
 from numpy.typing import NDArray
 from scipy.stats import chi2
+
+from list3r.pipeline.workers import OrderedPool
 
 Array = NDArray[np.float64]
 
@@ -37,8 +37,8 @@ def main() -> None:
     words = parser.parse_args()
     jobs = [(p, int(s)) for s in words.seeds.split(",") for p in words.presets.split(",")]
     videos: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(words.workers, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
-        for row in pool.map(run_video, jobs):
+    with OrderedPool(run_video, words.workers) as pool:
+        for row in pool.map(jobs):
             videos.append(row)
             figures = ("inside_share", "median_error_m", "median_stated_m", "ate_sim3_m")
             print(
@@ -51,12 +51,6 @@ def main() -> None:
         print(f"{name:9} " + "  ".join(f"{k} {v}" for k, v in entry.items()))
     print(machine())
     write_json(words.json, {"summary": summary, "videos": videos})
-
-
-def _one_thread() -> None:
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
 
 
 def run_video(job: tuple[str, int]) -> dict[str, Any]:

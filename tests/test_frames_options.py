@@ -88,9 +88,6 @@ def test_values_without_sense_are_refused(bad: dict) -> None:
 
 def test_options_survive_the_way_to_another_process() -> None:
     options = SourceOptions(intrinsics=(5, 5, 2, 2), T_color_depth=np.eye(4), distortion=(0.1,))
-    pool: OrderedPool[SourceOptions, str] = OrderedPool(repr, 1)
-    try:
+    with OrderedPool[SourceOptions, str](repr, 1) as pool:
         assert list(pool.map([options])) == [repr(options)]
-    finally:
-        pool.stop()
     assert hash(options) == hash(copy.deepcopy(options))

@@ -184,13 +184,10 @@ def test_windows_of_two_places_are_made_by_the_chunks_own_network(
     joint = RgbdJointReconstructor(Sessions(pictures), {1: SourceOptions()}, joint_model(task))
     made = joint(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
     assert made is not None and made.scale_kind == "relative"
-    pool = OrderedPool(process_parts, 1)
-    try:
+    with OrderedPool(process_parts, 1) as pool:
         there = joint_windows(Sessions(pictures), 1, task, pool)(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
         with pytest.raises(SourceError):
             joint_windows(Sessions(tmp_path / "gone"), 1, task, pool)(1, [0, 1], 1, [8, 9])
-    finally:
-        pool.stop()
     assert there is not None
     for one, other in ((made.u, there.u), (made.v, there.v)):
         np.testing.assert_array_equal(one.camera_frames, other.camera_frames)

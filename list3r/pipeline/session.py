@@ -124,23 +124,20 @@ def add_chunks(
     if progress is not None:
         progress(len(store.frames(session)), count)
     known = {c.index for c in store.chunks(session)}
-    pool = OrderedPool(process_parts, min(job.workers or usual_workers(job.settings), len(plan.tasks)))
-    joint = joint_windows(store, session, first, pool)
-    try:
-        with threadpool_limits(1):
-            for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):
-                found = [row for part in results for row in part.bad_frames]
-                bad.update(index for index, _ in found)
-                check_bad_share(len(bad), count, found[0][1] if found else "")
-                for part in (p for p in results if p.index not in known):
-                    add_chunk(store, session, part, joint, library=library, debug_dir=debug_dir)
-                    _note_lost(store, session, part)
-                    if added is not None:
-                        added(part)
-                if progress is not None:
-                    progress(task.span.stop, count)
-    finally:
-        pool.stop()
+    workers = min(job.workers or usual_workers(job.settings), len(plan.tasks))
+    with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
+        joint = joint_windows(store, session, first, pool)
+        for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):
+            found = [row for part in results for row in part.bad_frames]
+            bad.update(index for index, _ in found)
+            check_bad_share(len(bad), count, found[0][1] if found else "")
+            for part in (p for p in results if p.index not in known):
+                add_chunk(store, session, part, joint, library=library, debug_dir=debug_dir)
+                _note_lost(store, session, part)
+                if added is not None:
+                    added(part)
+            if progress is not None:
+                progress(task.span.stop, count)
 
 
 MOST_DEPTH_EVERY = 8

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera
 from list3r.memory.errors import ExportError, OptionError
+from list3r.pipeline.workers import OrderedPool
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path
@@ -96,8 +96,7 @@ def write_walk(
 
     Writes `rgb/`, `depth/` (16 bit, 5000 per metre), `rgb.txt`, `depth.txt`, `groundtruth.txt` (T_world_cam),
     `calibration.txt` (fx fy cx cy) and `truth.json`. `progress` is called with the number of frames just written.
-    More than one worker starts processes, which asks of a script that it guards its main part. Raises `OptionError`
-    for a folder that holds a walk, `ExportError` for one that cannot be written.
+    Raises `OptionError` for a folder that holds a walk, `ExportError` for one that cannot be written.
     """
     settings = settings or WalkSettings()
     root = Path(folder)
@@ -115,16 +114,12 @@ def _write(root: Path, settings: WalkSettings, workers: int, progress: Callable[
     time_s, poses = settings.poses()
     spans = [(k, min(k + _BATCH, len(time_s))) for k in range(0, len(time_s), _BATCH)]
     seen: dict[int, dict[str, int]] = {}
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (settings, root)) if workers > 1 else None
-    try:
-        written = pool.map(_write_in_process, spans) if pool else map(_Writer(settings, root).write_span, spans)
-        for areas in written:
+    pool = OrderedPool(partial(_write_in_process, settings, root), workers) if workers > 1 else None
+    with pool or nullcontext():
+        for areas in pool.map(spans) if pool else map(_Writer(settings, root).write_span, spans):
             _count(seen, areas)
             if progress is not None:
                 progress(len(areas))
-    finally:
-        if pool:
-            pool.shutdown(cancel_futures=True)
     write_tum(root / "groundtruth.txt", Trajectory(time_s, poses))
     (root / "truth.json").write_text(json.dumps(settings.truth(seen), indent=1) + "\n", encoding="utf-8")
     _write_lists(root, time_s, settings.camera())
@@ -163,19 +158,13 @@ class _Writer:
         return {int(k): int(area[k]) for k in np.flatnonzero(area) if k > 0}
 
 
-_writer: _Writer | None = None
+@lru_cache(maxsize=1)
+def _writer(settings: WalkSettings, root: Path) -> _Writer:
+    return _Writer(settings, root)
 
 
-def _start(settings: WalkSettings, root: Path) -> None:
-    global _writer
-    cv2.setNumThreads(1)
-    threadpool_limits(1)
-    _writer = _Writer(settings, root)
-
-
-def _write_in_process(span: tuple[int, int]) -> list[dict[int, int]]:
-    assert _writer is not None
-    return _writer.write_span(span)
+def _write_in_process(settings: WalkSettings, root: Path, span: tuple[int, int]) -> list[dict[int, int]]:
+    return _writer(settings, root).write_span(span)
 
 
 def frame_name(position: int) -> str:
