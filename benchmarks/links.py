@@ -1,4 +1,4 @@
-"""What ties frames of colour video where nothing can be followed: SIFT, ALIKED and XFeat by the same code.
+"""What ties frames of colour video where nothing can be followed: SIFT and ALIKED by the same code.
 
     python benchmarks/links.py --source ../shared/data/redkitchen --intrinsics 525,525,320,240 --every 20 \
         --weights ../shared/weights --json benchmarks/results/links.json
@@ -23,12 +23,11 @@ from list3r.frames.base import Frame, guessed_camera
 from list3r.frames.options import parse_distortion, parse_intrinsics
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
-from list3r.reconstruction.features.detectors import make_detector
-from list3r.reconstruction.features.learned import LearnedDetector
+from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.sfm.fill import PosedSegment
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 
-FILES = {"aliked": "aliked/aliked-t16.pth", "xfeat": "xfeat/xfeat_640x640.onnx"}
+FILES = {"aliked": "aliked/aliked-t16.pth"}
 LEAST = 8
 """Frames of a part that counts."""
 
@@ -40,8 +39,8 @@ def main() -> None:
     parser.add_argument("--distortion")
     parser.add_argument("--every", default="20", help="steps, by commas")
     parser.add_argument("--starts", default="0", help="first frames, by commas")
-    parser.add_argument("--kinds", default="sift,aliked,xfeat")
-    parser.add_argument("--weights", type=Path, help="folder with aliked/ and xfeat/")
+    parser.add_argument("--kinds", default="sift,aliked")
+    parser.add_argument("--weights", type=Path, help="folder with aliked/")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
     cv2.setNumThreads(1)

@@ -55,10 +55,10 @@ def main() -> None:
 
 def run_video(job: tuple[str, int]) -> dict[str, Any]:
     """One simulated video."""
+    from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
     from benchmarks.feedforward_sim.feedforward import FeedForwardModel
     from benchmarks.simulation.presets import make_video
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-    from list3r.frames.chunking.cuts import cuts_by_descriptor
 
     preset, seed = job
     video = make_video(preset, seed)

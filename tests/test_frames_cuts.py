@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.frames.chunking.cuts import cuts_by_descriptor, find_cuts
+from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.source import open_source
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -10,13 +10,12 @@ import pytest
 
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
-from list3r.reconstruction.features.detectors import make_detector
-from list3r.reconstruction.features.learned import WIDTHS, as_bytes, match_unit
-from list3r.reconstruction.features.local import match
-from list3r.reconstruction.keyframe_record import KeyframeSettings, make_keyframes
+from list3r.reconstruction.features.learned import LEARNED_WIDTH, as_bytes, make_detector
+from list3r.reconstruction.features.local import match, nearest_pairs
+from list3r.reconstruction.keyframe_record import make_keyframes
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
-FILES = {"aliked": "aliked/aliked-t16.pth", "xfeat": "xfeat/xfeat_640x640.onnx"}
+FILE = "aliked/aliked-t16.pth"
 
 
 @pytest.fixture(scope="module")
@@ -34,21 +33,18 @@ def picture(shared_data: Path) -> np.ndarray:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("kind", list(FILES))
-def test_features_follow_a_known_warp(kind: str, weights: Path, picture: np.ndarray) -> None:
-    if kind == "xfeat":
-        pytest.importorskip("onnxruntime")
-    detector = make_detector(kind, weights / FILES[kind])
+def test_features_follow_a_known_warp(weights: Path, picture: np.ndarray) -> None:
+    detector = make_detector("aliked", weights / FILE)
     turn = cv2.getRotationMatrix2D((320, 240), 6, 0.9)
     warped = cv2.warpAffine(picture, turn, (640, 480), borderMode=cv2.BORDER_REFLECT)
     a, b = detector(picture, 1000), detector(warped, 1000)
     np.testing.assert_allclose(np.linalg.norm(a.descriptors, axis=1), 1.0, rtol=1e-4)
     assert (np.diff(a.score) <= 1e-6).all()
-    rows = match_unit(a.descriptors, b.descriptors)
+    rows = nearest_pairs(a.descriptors, b.descriptors, 0.95)
     truth = a.xy[rows[:, 0]] @ turn[:, :2].T + turn[:, 2]
     right = np.linalg.norm(truth - b.xy[rows[:, 1]], axis=1) < 3.0
     assert right.sum() > 120 and right.mean() > 0.4
-    as_stored = match(as_bytes(a.descriptors, kind), as_bytes(b.descriptors, kind), 0.85)
+    as_stored = match(as_bytes(a.descriptors), as_bytes(b.descriptors), 0.85)
     truth = a.xy[as_stored[:, 0]] @ turn[:, :2].T + turn[:, 2]
     assert (np.linalg.norm(truth - b.xy[as_stored[:, 1]], axis=1) < 3.0).sum() > 0.8 * right.sum()
     again = detector(picture, 1000)
@@ -56,15 +52,12 @@ def test_features_follow_a_known_warp(kind: str, weights: Path, picture: np.ndar
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("kind", list(FILES))
-def test_pictures_without_anything_have_no_features(kind: str, weights: Path) -> None:
-    if kind == "xfeat":
-        pytest.importorskip("onnxruntime")
-    detector = make_detector(kind, weights / FILES[kind])
+def test_pictures_without_anything_have_no_features(weights: Path) -> None:
+    detector = make_detector("aliked", weights / FILE)
     for size in ((480, 640), (97, 131)):
         found = detector(np.zeros((*size, 3), np.uint8), 200)
         assert found.xy.shape == (len(found.score), 2)
-        assert as_bytes(found.descriptors, kind).shape == (len(found.score), WIDTHS[kind])
+        assert as_bytes(found.descriptors).shape == (len(found.score), LEARNED_WIDTH)
 
 
 @pytest.mark.data
@@ -72,9 +65,9 @@ def test_keyframes_keep_them(weights: Path, shared_data: Path) -> None:
     source = open_source(shared_data / "redkitchen")
     frames = list(source.read(0, 3))
     reconstruction = RgbdReconstructor()(frames, source.info.camera)
-    settings = KeyframeSettings(learned=make_detector("aliked", weights / FILES["aliked"]))
-    (first, *_) = make_keyframes(frames, reconstruction, False, settings)
-    assert first.keypoint_descriptors.shape == (len(first.keypoints_xy), WIDTHS["aliked"])
+    detector = make_detector("aliked", weights / FILE)
+    (first, *_) = make_keyframes(frames, reconstruction, False, detector=detector)
+    assert first.keypoint_descriptors.shape == (len(first.keypoints_xy), LEARNED_WIDTH)
     plain = make_keyframes(frames, reconstruction, False)[0]
     np.testing.assert_array_equal(first.descriptor, plain.descriptor)
     assert len(match(first.keypoint_descriptors, plain.keypoint_descriptors, 0.85)) == 0
@@ -85,7 +78,7 @@ def test_bytes_keep_the_order_of_likeness() -> None:
     base = rng.normal(size=(60, 128))
     near = base + 0.5 * rng.normal(size=base.shape)
     a, b = ((x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32) for x in (base, near))
-    rows = match(as_bytes(a, "aliked"), as_bytes(b, "aliked"), 0.85)
+    rows = match(as_bytes(a), as_bytes(b), 0.85)
     np.testing.assert_array_equal(rows[:, 0], rows[:, 1])
     assert len(rows) == 60
 
@@ -98,9 +91,6 @@ def test_wrong_weights_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "junk.pth").write_bytes(b"junk" * 100)
     with pytest.raises(OptionError, match="junk"):
         make_detector("aliked", tmp_path / "junk.pth")
-    pytest.importorskip("onnxruntime")
-    with pytest.raises(OptionError, match="junk"):
-        make_detector("xfeat", tmp_path / "junk.pth")
 
 
 def test_wrong_words_for_local_features_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,7 @@ from list3r.frames.base import Camera, Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import umeyama
-from list3r.reconstruction.features.detectors import make_detector
-from list3r.reconstruction.features.learned import LearnedDetector
+from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.consistency import contradicted, epipolar_errors
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
@@ -149,8 +148,6 @@ def test_keyframes_known_by_features_alone_keep_their_poses():
     assert min(len(xy) for xy, _ in segment.seen.values()) >= 20
 
 
-def test_xfeat_finds_keyframes_again_but_ties_no_frames():
-    model = make_reconstructor("sfm", ModelOptions(device="cpu", local_features="xfeat", feature_weights="nowhere"))
-    assert isinstance(model, SfmReconstructor) and model.detector is None
+def test_weights_of_local_features_that_are_not_there_are_named():
     with pytest.raises(OptionError, match="nowhere"):
         make_reconstructor("sfm", ModelOptions(device="cpu", local_features="aliked", feature_weights="nowhere"))

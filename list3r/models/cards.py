@@ -250,9 +250,6 @@ CARDS: tuple[ModelCard, ...] = (
     ),
     ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of things"),
     ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", about="learned local features"),
-    ModelCard(
-        "xfeat", "local features", APACHE, (), ("onnxruntime",), "pip install onnxruntime", about="small and fast"
-    ),
 )
 """Every model that has an adapter here. Weights that a card does not name are the user's own (`--weights`)."""
 

@@ -29,8 +29,8 @@ from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibr
 from list3r.models.cache import locate
 from list3r.models.device import memory_said
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor
-from list3r.reconstruction.features.detectors import make_detector
-from list3r.reconstruction.keyframe_record import KeyframeSettings, frame_samples, make_keyframes
+from list3r.reconstruction.features.learned import LearnedDetector, make_detector
+from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 
 
@@ -55,7 +55,7 @@ class BuildSettings:
     instance_weights: tuple[tuple[str, str], ...] = ()
     """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
     local_features: str = "sift"
-    """What finds a keyframe again: sift, aliked or xfeat; aliked also ties frames of `sfm` between which nothing can be
+    """What finds a keyframe again: sift or aliked; aliked also ties frames of `sfm` between which nothing can be
     followed."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
@@ -245,8 +245,8 @@ def _described(
     with memory_said("what finds and follows things"):
         library = build_library(frames, reconstruction, task.settings.instances, discoverer or named, tracker)
     clock.mark("instances")
-    keep, how = task.settings.keep_pictures, _keyframe_settings(task.settings)
-    keyframes = make_keyframes(frames, reconstruction, keep, how)
+    detector = _detector(task.settings)
+    keyframes = make_keyframes(frames, reconstruction, task.settings.keep_pictures, detector=detector)
     samples = frame_samples(reconstruction, library)
     if reconstruction.depth_noise is None:  # stereo has no depth where things move; what it sees through is error
         library = flag_moving(samples, library, reconstruction.camera)
@@ -350,14 +350,12 @@ def _instance_models(settings: BuildSettings) -> tuple[Discoverer, Tracker]:
 
 
 @lru_cache(maxsize=2)
-def _keyframe_settings(settings: BuildSettings) -> KeyframeSettings:
-    """How keyframes are kept, with the network of the local features loaded once in a process."""
+def _detector(settings: BuildSettings) -> LearnedDetector | None:
+    """The network of the local features, loaded once in a process; None for SIFT."""
     if settings.local_features == "sift":
-        return KeyframeSettings()
+        return None
     device = "cpu" if settings.device == "auto" else settings.device
-    return KeyframeSettings(
-        learned=make_detector(settings.local_features, Path(settings.feature_weights or ""), device)
-    )
+    return make_detector(settings.local_features, Path(settings.feature_weights or ""), device)
 
 
 @lru_cache(maxsize=2)

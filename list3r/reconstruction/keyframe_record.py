@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.features.descriptor import FrameDescriptor
 from list3r.reconstruction.features.learned import LearnedDetector, as_bytes
 from list3r.reconstruction.features.local import Features, FeatureSettings, detect, points_at
-from list3r.reconstruction.features.vlad import VladDescriptor
+from list3r.reconstruction.features.vlad import describe_frame
 from list3r.reconstruction.rgbd.view import SensorNoise, shrink_camera, shrink_depth
 
 
@@ -27,11 +26,8 @@ class KeyframeSettings:
     """Width of the small depth image, px."""
     jpeg_quality: int = 85
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    descriptor: FrameDescriptor = field(default_factory=VladDescriptor)
-    learned: LearnedDetector | None = None
-    """What finds and describes the features that are kept, instead of SIFT."""
     learned_count: int = 800
-    """Most of these on a frame."""
+    """Most learned features on a frame."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
@@ -61,14 +57,15 @@ def make_keyframes(
     reconstruction: Reconstruction,
     keep_jpeg: bool,
     settings: KeyframeSettings | None = None,
+    detector: LearnedDetector | None = None,
 ) -> tuple[Keyframe, ...]:
-    """The keyframes of a chunk, in order of time."""
+    """Return the keyframes of a chunk in order of time; a `detector` takes the place of SIFT."""
     chosen = settings or KeyframeSettings()
-    return tuple(
-        _make_keyframe(frames[position], reconstruction, int(position), keep_jpeg, chosen)
-        for position in reconstruction.keyframes
-        if reconstruction.posed[position]
-    )
+    kept = [int(p) for p in reconstruction.keyframes if reconstruction.posed[p]]
+    made = [_make_keyframe(frames[p], reconstruction, p, chosen, detector) for p in kept]
+    if keep_jpeg:
+        made = [replace(k, jpeg=_jpeg(frames[p].color, chosen.jpeg_quality)) for k, p in zip(made, kept, strict=True)]
+    return tuple(made)
 
 
 def frame_samples(
@@ -152,26 +149,29 @@ def _pixel_grid(
 
 
 def _make_keyframe(
-    frame: Frame, reconstruction: Reconstruction, position: int, keep_jpeg: bool, settings: KeyframeSettings
+    frame: Frame,
+    reconstruction: Reconstruction,
+    position: int,
+    settings: KeyframeSettings,
+    detector: LearnedDetector | None,
 ) -> Keyframe:
     camera, depth = reconstruction.camera, reconstruction.depth[position]
     features = detect(frame.color, depth, camera, settings.features)
     small = shrink_camera(camera, settings.depth_width)
     kept = features
-    if settings.learned is not None:
-        found = settings.learned(frame.color, settings.learned_count)
-        described = as_bytes(found.descriptors, settings.learned.kind)
-        kept = Features(found.xy, described, points_at(found.xy, depth, camera))
+    if detector is not None:
+        found = detector(frame.color, settings.learned_count)
+        kept = Features(found.xy, as_bytes(found.descriptors), points_at(found.xy, depth, camera))
     return Keyframe(
         frame_index=frame.index,
         T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
-        descriptor=settings.descriptor(frame.color, features.descriptors),
+        descriptor=describe_frame(features.descriptors),
         keypoints_xy=kept.xy,
         keypoint_descriptors=kept.descriptors,
         points_cam=kept.points_cam,
         depth_small=shrink_depth(depth, small, settings.noise),
         camera_small=(small.fx, small.fy, small.cx, small.cy),
-        jpeg=_jpeg(frame.color, settings.jpeg_quality) if keep_jpeg else b"",
+        jpeg=b"",
     )
 
 

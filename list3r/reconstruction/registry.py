@@ -24,7 +24,7 @@ class ModelOptions:
     weights: str | None = None
     """A folder, a file or `repository@revision` of weights instead of the model's own; None for its own."""
     local_features: str = "sift"
-    """What `sfm` ties pictures by where nothing can be followed: aliked; with any other name it takes SIFT."""
+    """Local features by which `sfm` ties pictures between which nothing can be followed: sift or aliked."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
 

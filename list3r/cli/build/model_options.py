@@ -62,7 +62,7 @@ LocalFeatures = Annotated[
     typer.Option(
         "--local-features",
         metavar="KIND[=FILE]",
-        help="What finds a keyframe again: sift, or aliked=FILE or xfeat=FILE with their weights; aliked also ties "
+        help="What finds a keyframe again: sift, or aliked=FILE with its weights, which also ties "
         "frames of colour alone between which nothing can be followed.",
     ),
 ]
@@ -218,7 +218,7 @@ def _check_used(asked: Mapping[str, str], selection: ModelSelection) -> None:
 def _local_features(words: str) -> tuple[str, str | None]:
     """Kind and file of `--local-features`. Raises `OptionError` for what is not known or cannot be loaded."""
     from list3r.memory.errors import OptionError
-    from list3r.reconstruction.features.detectors import KINDS, make_detector
+    from list3r.reconstruction.features.learned import KINDS, make_detector
 
     kind, _, file = words.partition("=")
     if kind == "sift" and not file:

@@ -32,7 +32,6 @@ _PACKAGES = (
     ("huggingface_hub", "fetching weights"),
     ("safetensors", "reading weights"),
     ("ncnn", "labels by a box detector"),
-    ("onnxruntime", "learned local features (xfeat)"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
 _OPTIONAL = {
@@ -42,7 +41,6 @@ _OPTIONAL = {
     "huggingface_hub",
     "safetensors",
     "ncnn",
-    "onnxruntime",
     "open3d-cpu|open3d",
 }
 _LIBRARIES = (

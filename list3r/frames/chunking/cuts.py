@@ -1,8 +1,8 @@
 """Shot cuts: where a video jumps to another place, so that no chunk spans a jump.
 
 A false cut tears a video apart that one camera walk holds together; a missed one only costs the frames behind it in one
-chunk. So a frame is suspected cheaply, by a thumbnail or a descriptor that is far less like the one before than frames
-around are to each other, and for pictures believed only when local features on either side know nothing of each other.
+chunk. So a frame is suspected cheaply, by a thumbnail that is far less like the one before than frames
+around are to each other, and believed only when local features on either side know nothing of each other.
 One spoilt frame (black, flash, blur) is looked past.
 """
 
@@ -37,8 +37,6 @@ class CutSettings:
     thumbnail_likeness: float = 0.9
     """Correlation, best over small shifts, from which thumbnails are alike whatever is usual: of consecutive frames of
     hand-held video at 3 to 30 a second 99 in 100 are above, of frames of different places 1 in 100."""
-    descriptor_likeness: float = 0.75
-    """Cosine from which frame descriptors are alike whatever is usual."""
     features: int = 500
     """Local features on a frame where a suspect is looked at."""
     ratio: float = 0.85
@@ -95,7 +93,7 @@ def find_cuts(
         return _thumbnail_likeness(one, two) >= chosen.thumbnail_likeness or looks.same_place(a, b)
 
     def judge(k: int) -> None:
-        if k >= 0 and _suspected(likeness, k, chosen.thumbnail_likeness, chosen) and _jumps(k, count, alike, chosen):
+        if k >= 0 and suspected(likeness, k, chosen.thumbnail_likeness, chosen) and jumps(k, count, alike, chosen):
             cuts.append(k)
 
     reach = max(chosen.look_past, chosen.least_shot) + 1
@@ -113,27 +111,13 @@ def find_cuts(
             progress(k + 1, count)
     for k in range(count - delay, count):
         judge(k)
-    return _spaced(cuts, alike, chosen)
-
-
-def cuts_by_descriptor(descriptors: Floats, settings: CutSettings | None = None) -> tuple[int, ...]:
-    """Positions before which the video jumps, ascending, by unit-length descriptors of all frames. Shape (F, D)."""
-    chosen = settings or CutSettings()
-    if len(descriptors) < 2:
-        return ()
-    likeness = np.r_[1.0, np.einsum("fd,fd->f", descriptors[1:], descriptors[:-1])]
-
-    def alike(a: int, b: int) -> bool:
-        return bool(descriptors[a] @ descriptors[b] >= chosen.descriptor_likeness)
-
-    suspects = [k for k in range(len(likeness)) if _suspected(likeness, k, chosen.descriptor_likeness, chosen)]
-    return _spaced([k for k in suspects if _jumps(k, len(descriptors), alike, chosen)], alike, chosen)
+    return spaced(cuts, alike, chosen)
 
 
 Alike = Callable[[int, int], bool]
 
 
-def _suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: CutSettings) -> bool:
+def suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: CutSettings) -> bool:
     """Whether a frame is far less like the one before than is usual around it; 1 is alike, of F frames the first is."""
     if likeness[k] >= enough:
         return False
@@ -141,14 +125,14 @@ def _suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: C
     return bool(1.0 - likeness[k] > settings.factor * float(np.median(around)))
 
 
-def _jumps(cut: int, count: int, alike: Alike, settings: CutSettings) -> bool:
+def jumps(cut: int, count: int, alike: Alike, settings: CutSettings) -> bool:
     """True when nothing just before the cut is like anything just after it, looking past spoilt frames on one side."""
     after = ((cut - 1, cut + k) for k in range(settings.look_past + 1) if cut + k < count)
     before = ((cut - k, cut) for k in range(2, settings.look_past + 2) if cut - k >= 0)
     return not any(alike(a, b) for a, b in (*after, *before))
 
 
-def _spaced(cuts: Sequence[int], alike: Alike, settings: CutSettings) -> tuple[int, ...]:
+def spaced(cuts: Sequence[int], alike: Alike, settings: CutSettings) -> tuple[int, ...]:
     """Cuts with no shot between them that is too short to be one: the frames of a flash belong to neither side."""
     out: list[int] = []
     for cut in cuts:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from list3r.memory.errors import OptionError
-from list3r.reconstruction.features.learned import WIDTHS, LearnedFeatures
+from list3r.reconstruction.features.learned import LEARNED_WIDTH, LearnedFeatures
 
 DIVISOR = 32
 """Sides of the network's input are multiples of this."""
@@ -28,8 +28,6 @@ TEMPERATURE = 0.1
 
 class Aliked:
     """Detects and describes; descriptors are unit vectors."""
-
-    kind = "aliked"
 
     def __init__(self, weights: Path, device: str = "cpu") -> None:
         """`weights` is a file of published weights. Raises `OptionError` when it is not."""
@@ -184,8 +182,8 @@ def _network_of(state: dict[str, Tensor], weights: Path) -> _Network:
         network.load_state_dict(state)
     except (KeyError, RuntimeError, ValueError, AttributeError, TypeError):
         raise OptionError(f"{weights} holds no weights of ALIKED; give a file such as aliked-n16.pth") from None
-    if 2 * width > WIDTHS["aliked"]:
-        raise OptionError(f"{weights} has descriptors of {width} numbers; at most {WIDTHS['aliked'] // 2} are kept")
+    if 2 * width > LEARNED_WIDTH:
+        raise OptionError(f"{weights} has descriptors of {width} numbers; at most {LEARNED_WIDTH // 2} are kept")
     return network
 
 

@@ -40,27 +40,21 @@ class Vocabulary:
             return Vocabulary(*(data[name].astype(np.float32) for name in ("mean", "axes", "words")))
 
 
-@dataclass(frozen=True)
-class VladDescriptor:
-    """A `FrameDescriptor` by VLAD: residuals of SIFT descriptors to their words."""
+def describe_frame(local_descriptors: NDArray[np.uint8]) -> Floats:
+    """Return the unit descriptor of a frame's SIFT descriptors (N, 128), zeros without any: residuals to their words.
 
-    @property
-    def length(self) -> int:
-        """Numbers in a descriptor."""
-        return int(Vocabulary.built_in().words.size)
-
-    def __call__(self, color: NDArray[np.uint8], local_descriptors: NDArray[np.uint8]) -> Floats:
-        """Unit-length descriptor of a frame's SIFT descriptors (N, 128); zeros without any. Shape (length,)."""
-        v = Vocabulary.built_in()
-        if not len(local_descriptors):
-            return np.zeros(v.words.size, np.float32)
-        x = (root_sift(local_descriptors) - v.mean) @ v.axes
-        word = np.argmin((v.words**2).sum(axis=1) - 2.0 * x @ v.words.T, axis=1)
-        sums = np.zeros(v.words.shape, np.float64)
-        np.add.at(sums, word, x - v.words[word])
-        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-        rooted = np.sign(sums) * np.sqrt(np.abs(sums))
-        return np.asarray(rooted.ravel() / max(float(np.linalg.norm(rooted)), 1e-9), np.float32)
+    Shape (words * d,).
+    """
+    v = Vocabulary.built_in()
+    if not len(local_descriptors):
+        return np.zeros(v.words.size, np.float32)
+    x = (root_sift(local_descriptors) - v.mean) @ v.axes
+    word = np.argmin((v.words**2).sum(axis=1) - 2.0 * x @ v.words.T, axis=1)
+    sums = np.zeros(v.words.shape, np.float64)
+    np.add.at(sums, word, x - v.words[word])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    rooted = np.sign(sums) * np.sqrt(np.abs(sums))
+    return np.asarray(rooted.ravel() / max(float(np.linalg.norm(rooted)), 1e-9), np.float32)
 
 
 def root_sift(descriptors: NDArray[np.uint8]) -> Floats:

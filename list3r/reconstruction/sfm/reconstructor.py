@@ -24,8 +24,7 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
-from list3r.reconstruction.features.detectors import make_detector
-from list3r.reconstruction.features.learned import LearnedDetector
+from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.mvs.stereo import MvsSettings, dense_depth, stereo_noise
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.odometry import OdometrySettings
@@ -48,7 +47,7 @@ def make(options: ModelOptions) -> SfmReconstructor:
     if device == "auto":
         device = "cpu" if find_gpu() is None else "cuda"
     detector = None
-    if options.local_features == "aliked":
+    if options.local_features != "sift":
         where = "cpu" if options.device == "auto" else options.device
         detector = make_detector(options.local_features, Path(options.feature_weights or ""), where)
     return SfmReconstructor(poses=options.poses, device=device, camera_known=options.camera_known, detector=detector)
