@@ -1,6 +1,6 @@
-"""Learn the vocabulary of frame descriptors (`list3r/reconstruction/vocabulary.npz`) on simulated rooms.
+"""Learn the vocabulary of frame descriptors (`list3r/reconstruction/features/vocabulary.npz`) on simulated rooms.
 
-python benchmarks/vocabulary.py --out list3r/reconstruction/vocabulary.npz
+python benchmarks/vocabulary.py --out list3r/reconstruction/features/vocabulary.npz
 """
 
 from __future__ import annotations

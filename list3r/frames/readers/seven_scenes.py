@@ -1,10 +1,7 @@
 """The 7-Scenes layout: `frame-NNNNNN.color.*`, `.depth.png`, `.pose.txt`.
 
 The Kinect of 7-Scenes delivers colour and depth unregistered, and its poses belong to the depth camera. The 585 px of
-its `camera-intrinsics.txt` are nominal. Measured (`calibrate`): depth edges meet colour edges when the focal lengths
-are as 524 to 579 and the colour camera stands 25 mm to the side, the Kinect's real baseline. Of all pairs in that
-ratio 524 px for colour, with a slight barrel distortion, agrees best with a moving camera (photometric registration,
-feature matches with depth).
+its `camera-intrinsics.txt` are nominal; the cameras that are taken were measured (decision 0072).
 """
 
 from __future__ import annotations

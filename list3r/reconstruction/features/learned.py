@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from list3r.memory.errors import OptionError
 
 KINDS = ("aliked",)
-"""Networks by name; page 0060 of docs/decisions says why there is no other."""
+"""Networks by name; decision 0060 says why there is no other."""
 LEARNED_WIDTH = 256
 """Bytes of a stored descriptor, unlike SIFT's 128, so that the width names the kind."""
 

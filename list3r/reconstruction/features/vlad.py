@@ -2,11 +2,8 @@
 into a compact image representation", 2010, with the normalisation within each word of Arandjelovic, Zisserman, "All
 about VLAD", 2013).
 
-The vocabulary lies beside this file. It was learned by `benchmarks/vocabulary.py` on SIFT descriptors of simulated
-rooms, so that a chunk's descriptors depend on that chunk alone, and frames of different videos can be compared.
-Measured on 200 frames of redkitchen, pairs more than 100 frames apart, revisits share 30 % of their surface: recall at
-precision 0.9 is 0.69 and at 0.99 0.34; of a vocabulary learned on the first 12 or 30 frames of that video itself 0.67
-and 0.72 at precision 0.9; of hashed words with a layout of gradients (`descriptor`) 0.34, and 0.13 at 0.99.
+The vocabulary lies beside this file and was learned on simulated rooms, so that a chunk's descriptors depend on that
+chunk alone, and frames of different videos can be compared (decision 0061).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Find what moves of its own: a surface that disagrees with the motion that the rest of the picture determines.
 
-A near surface weighs heavily (1 / sigma^2 falls with the fourth power of depth), so a mover over a fifth of the picture
-drags the camera along, and no robust kernel over single pixels can tell it from the background: both agree half. What
-can is a vote by pixels between two explanations, with and without a whole surface.
+Two explanations, with and without a whole surface, are compared by a vote of pixels. A robust kernel over single pixels
+cannot tell a large near mover from the background: both agree half (decision 0063).
 """
 
 from __future__ import annotations

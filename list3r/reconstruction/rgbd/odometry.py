@@ -3,23 +3,8 @@
 A frame is accepted only when enough of the model is seen, agrees in depth and brightness, the pairs determine every
 motion, and the motion is possible. A frame that fails, that has no known motion before it, or that agrees much less
 than its forerunners is sought by local features and by starts all round the last pose; where that fails too a new
-segment begins. Segments are put together afterwards by verified geometry only.
-
-What was measured on 1,000 frames of 7-Scenes redkitchen, ATE RMSE over the whole run without loops: depth alone with
-equal weights 0.068 m, with weights 1/sigma^2 of the sensor 0.048 m; with brightness added at weight 1, 2, 4
-0.031, 0.026, 0.028 m. A model that remembers 500 views instead of 50 changes nothing. In chunks of 100 with loop edges
-0.027, 0.029, 0.029 m at the same three weights, so the weight is not tuned to the sequence. On the 58 frames of TUM
-fr3_cabinet, 0.67 s apart: features alone pose 38 and those wrongly (0.36 m); the sweep of starts poses all (0.051 m).
-
-What moves before the camera is found by `movers` and left out. Simulated walks of 130 frames, two seeds, with a board
-1.2 m away over a fifth of the picture that swings at 0.1 to 1.0 m/s: before, 24 to 55 frames posed, errors up to
-0.17 m; now all, RMSE 0.0016 to 0.0042 m, over 40 % of the picture 0.0020 and 0.0068 m. Two criteria were tried. A
-surface left out where the others' cost falls by a tenth without it: right for these boards, but in 280 frames of the
-kitchen two static ones went too. A gain over all pixels together: no wrong verdict there, but a board over 40 % is
-followed (0.13 and 0.18 m); so either that or a gain of 40 % for the rest. Redkitchen in chunks: 0.0288 m with loops
-and 0.0316 without (0.0289, 0.0322 before). A mover over more than half of the picture is still taken for the scene,
-and wrongly: 53 of 130 frames at 0.12 m before, 97 at 0.16 m now. To refuse poses that explain one large surface alone
-changed nothing there.
+segment begins. Segments are joined afterwards by verified geometry only (decision 0062). What moves before the camera
+is left out (decision 0063).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""The lens of an RGB source, estimated once before its chunks: focal length and radial distortion.
+"""Estimate the lens of an RGB source once before its chunks: focal length and radial distortion.
 
-One chunk alone says little of the focal length (on redkitchen 472 to 536 px of 524), so some windows spread over the
-video are mapped each by itself with a free camera, and then adjusted together with one camera for all. A window's
-parallax decides how much it says. All chunks are then made with the camera that was found.
+Windows spread over the video are mapped each by itself with a free camera, and then adjusted together with one camera
+for all. A window's parallax decides how much it says. All chunks use the camera that was found (decision 0069).
 """
 
 from __future__ import annotations

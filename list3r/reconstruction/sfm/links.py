@@ -1,25 +1,8 @@
 """What keyframes of a chunk see in common: tracked corners, and local features where tracks do not reach.
 
 Corners tie keyframes of one run of tracks. Where all tracks ended at once, keyframes of all runs that look alike are
-matched by local features; these join the corners as further points of the same views.
-
-Frames in the largest part and ATE after Sim(3), at first with SIFT of the two keyframes on either side of a break only:
-redkitchen every 15th, 20th and 30th frame 28 of 67, 13 of 50 and 7 of 33; now 67 (0.048 m), 50 (0.048 m) and 33
-(0.050 m) by SIFT, and the same by ALIKED. Every 20th frame of 400 to 720, where no place is seen again: SIFT 5 of 16,
-ALIKED 16 (0.026 m). The bare cabinet, 58 frames 0.6 s apart: SIFT 6, ALIKED 21 (0.015 m). Simulated walks with fast
-turns: SIFT 28 of 53, ALIKED 26 to 28. XFeat is not used here: 24 of the 33, and a map of the cabinet 1.27 m off.
-Before matched pairs had to fit an essential matrix with a third of their matches (`MappingSettings.matched_share`)
-ALIKED bent one of those walks by 0.94 m.
-
-A chunk through which the camera moves little is bent by corners alone: they follow what lies at the edge of two depths,
-and the far comes out too near. So frames before and behind the chunk are mapped with it, and all keyframes are matched
-by features as well. Dense depth of fourteen chunks of redkitchen against the sensor, worst three medians (near by far):
-0.059 (1.22), 0.047 (1.09), 0.043 (1.21); so 0.019 (1.01), 0.025 (1.04), 0.015 (1.05), with features alone, and the
-first 0.026 with corners as well, which is what is done. Sparse points of the worst three, median error: corners 0.087,
-0.083, 0.049; with features as well 0.047, 0.053, 0.045; with eight frames on either side besides 0.036, 0.049, 0.038;
-features and frames without corners 0.018, 0.028, 0.034, but on simulated walks, whose pictures are sharp, corners and
-features together have an ATE of 2 to 6 mm where features alone have 2 to 9, and corners alone 2 to 10. Twice the frames
-on either side, and four times as far, change nothing more.
+matched by local features. Frames before and behind the chunk are mapped with it, and all keyframes are matched by
+features as well, because corners alone bend a chunk with little motion (decision 0065).
 """
 
 from __future__ import annotations

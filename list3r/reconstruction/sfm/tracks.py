@@ -1,13 +1,10 @@
-"""Corners followed through a chunk: pyramidal Lucas-Kanade from frame to frame, each position then refined against the
-frame where the corner was first seen, so that a track does not creep.
+"""Follow corners through a chunk: pyramidal Lucas-Kanade from frame to frame, each position then refined against the frame
+where the corner was first seen, so that a track does not creep.
 
-On the way frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where
-nearly all corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in
-those too (a jerk) all tracks end and a new run of tracks begins.
-
-Pictures are first brought to one brightness where the camera changed it (`as_bright`). With an exposure that swings
-2.8-fold in half a second a corner of redkitchen then lives 21 frames, as with a constant one, and 7 to 10 without;
-brightness told by the ranks of grey values, or contrast by their spread, cost a quarter where nothing had changed.
+Frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where nearly all
+corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in those too
+(a jerk) all tracks end and a new run of tracks begins. Pictures are first brought to one brightness where the camera
+changed it (decision 0070).
 """
 
 from __future__ import annotations
