@@ -1,8 +1,8 @@
 """Dense depth of a chunk of RGB frames whose poses are known: plane sweep, consistency, fusion.
 
-Keyframes are swept (`sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width. What other
-keyframes confirm is kept and fused (`fusion`), flat holes are filled and said to be unsure (`fill`), and every frame
-gets the depth of the keyframes around it. Depth without parallax or texture stays unknown (decision 0068).
+Keyframes are swept (`sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width. What
+other keyframes confirm is kept and fused (`fusion`), flat holes are filled and said to be unsure (`fill`), and every
+frame gets the depth of the keyframes around it. Depth without parallax or texture stays unknown (decision 0068).
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Follow corners through a chunk: pyramidal Lucas-Kanade from frame to frame, each position then refined against the frame
-where the corner was first seen, so that a track does not creep.
+"""Follow corners through a chunk: pyramidal Lucas-Kanade from frame to frame.
+
+Each position is then refined against the frame where the corner was first seen, so that a track does not creep.
 
 Frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where nearly all
 corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in those too
