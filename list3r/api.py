@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.exporters.registry import export as export_memory
 from list3r.exporters.tables import Table, Value, records_of
 from list3r.memory.errors import OptionError
+from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance.as_of import store_at
 from list3r.memory.maintenance.editing import MemoryEdits
 from list3r.memory.maintenance.history import world_at
-from list3r.memory.records import Instance, Support
+from list3r.memory.records import FrameRow, Instance, Session, Support
 from list3r.memory.store.store import Store
 from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, find
@@ -27,6 +28,7 @@ from list3r.queries.free_words import WordEncoder
 from list3r.queries.match import FilterOptions, Match, Matches
 from list3r.queries.nearest import nearest
 from list3r.queries.path import path
+from list3r.queries.pictures import InstancePicture, KeyframePicture, instance_picture, keyframe_pictures, keyframe_rgb
 from list3r.queries.relations import Place, Relations, relations
 from list3r.queries.seen import Sightings, seen, visible
 from list3r.queries.similar import similar
@@ -36,6 +38,7 @@ from list3r.queries.within import within
 if TYPE_CHECKING:
     import networkx
 
+    from list3r.exporters.prompt.scene_text import ScenePrompt
     from list3r.frames.options import SourceOptions
     from list3r.pipeline.chunk import BuildSettings
 
@@ -371,6 +374,46 @@ class SceneMemory(MemoryEdits):
         return records_of(self.store, table)
 
     @_alone
+    def sessions(self) -> list[Session]:
+        """The videos that the memory was made from, in order."""
+        return self.store.sessions()
+
+    @_alone
+    def camera_poses(self, session: int | None = None) -> list[tuple[FrameRow, Sim3]]:
+        """Every posed frame in order, of one session or of all, with its `S_world_cam`."""
+        return self.store.camera_poses(session)
+
+    @_alone
+    def pictures(self, instance_ids: Sequence[int] | None = None) -> list[KeyframePicture]:
+        """The keyframes whose picture is stored, with what shows in each; only those of some instances where asked."""
+        return keyframe_pictures(self.store, instance_ids)
+
+    @_alone
+    def picture(self, instance_id: int) -> InstancePicture:
+        """The stored picture that shows an instance best, with its mask. Raises `UnknownIdError` and `OptionError`.
+
+        >>> Image.fromarray(memory.picture(12).crop()).save("mug.png")
+        """
+        return instance_picture(self.store, instance_id)
+
+    @_alone
+    def pixels(self, picture: KeyframePicture) -> NDArray[np.uint8]:
+        """The pixels of one of `pictures()`, RGB. Shape (H, W, 3)."""
+        return keyframe_rgb(self.store, picture)
+
+    def prompt(self, tokens: int = 2000, question: str | None = None) -> ScenePrompt:
+        """The memory as text for a language model, of at most so many tokens; `str` of it is the text.
+
+        With a `question` the things that its words name come first, then what is nearest to them. Tokens are counted
+        by `list3r.exporters.prompt.tokens.count_tokens`. Raises `OptionError` where they do not even hold the head.
+
+        >>> print(memory.prompt(1000, "what is on the table?"))
+        """
+        from list3r.exporters.prompt.scene_text import scene_prompt
+
+        return scene_prompt(self, tokens, question)
+
+    @_alone
     def relation_graph(self) -> networkx.MultiDiGraph:
         """Instances and relations as a graph."""
         from list3r.memory.search.graphs import relation_graph
@@ -385,11 +428,18 @@ class SceneMemory(MemoryEdits):
         return merge_graph(self.store)
 
     @_alone
-    def export(self, format: str, path: str | Path) -> tuple[Path, ...]:
-        """Write the memory in a format: json, usd, ply, glb, tum, plan. Raises `OptionError` and `ExportError`.
+    def export(
+        self, format: str, path: str | Path, *, tokens: int = 2000, question: str | None = None
+    ) -> tuple[Path, ...]:
+        """Write the memory in a format: json, usd, ply, glb, tum, plan, prompt. Raises `OptionError` and `ExportError`.
 
-        Returns the files written: `path`, and more beside it where parts of the memory could not be joined.
+        Returns the files written: `path`, and more beside it where parts of the memory could not be joined. `prompt`
+        is a folder of text, maps and pictures for a language model; `tokens` and `question` are those of `prompt()`.
         """
+        if format == "prompt":
+            from list3r.exporters.prompt.pack import write_prompt
+
+            return write_prompt(self, path, tokens, question)
         with self.store.snapshot():
             return export_memory(self.store, format, path)
 

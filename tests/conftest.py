@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import (
@@ -61,7 +63,9 @@ def local_instance(local_id: int, points: np.ndarray, rgb: tuple[int, int, int],
     return LocalInstance(local_id, track, feature / np.linalg.norm(feature), support, stability=0.9)
 
 
-def chunk_result(index: int, first: int, count: int, instances: tuple[LocalInstance, ...]) -> ChunkResult:
+def chunk_result(
+    index: int, first: int, count: int, instances: tuple[LocalInstance, ...], jpeg: bytes = b""
+) -> ChunkResult:
     """A chunk whose camera stands at the origin looking along +x of a z-up world, moving 1 cm a frame along y."""
     T_chunk_cam = np.tile(np.eye(4), (count, 1, 1))
     T_chunk_cam[:, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
@@ -76,6 +80,7 @@ def chunk_result(index: int, first: int, count: int, instances: tuple[LocalInsta
         points_cam=np.ones((4, 3), np.float32),
         depth_small=np.ones((6, 8), np.float32),
         camera_small=(8.0, 8.0, 4.0, 3.0),
+        jpeg=jpeg,
     )
     samples = FrameSamples(
         frame=np.repeat(frames, 2),
@@ -155,15 +160,24 @@ def make_memory(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-def write_small_room(store: Store) -> None:
-    """Fill an empty store with `SMALL_ROOM`, seen in one chunk of twenty frames."""
+def small_picture() -> bytes:
+    """A JPEG of 64 x 48 px, grey with a brighter left half."""
+    image = np.full((48, 64, 3), 90, np.uint8)
+    image[:, :32] = 200
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, format="JPEG")
+    return out.getvalue()
+
+
+def write_small_room(store: Store, jpeg: bytes = b"") -> None:
+    """Fill an empty store with `SMALL_ROOM`, seen in one chunk of twenty frames; the first may have a picture."""
     frames = np.arange(20)
     local = tuple(
         local_instance(k, box_points(center, size, 400, k), rgb, frames)
         for k, (_, center, size, rgb, _) in enumerate(SMALL_ROOM)
     )
     session = store.add_session("walk", "abc", {"length": 100}, 20)
-    chunk = store.add_chunk(session, chunk_result(0, 0, 20, local))
+    chunk = store.add_chunk(session, chunk_result(0, 0, 20, local, jpeg))
     store.place_chunks({chunk: Sim3.identity()}, {chunk: chunk})
     for key, value in (
         ("scale_kind", "metric"),

@@ -14,6 +14,7 @@ from types import FrameType
 import typer
 
 from list3r.cli.ask import memory as memory_commands
+from list3r.cli.ask import picture as picture_commands
 from list3r.cli.ask import query as query_commands
 from list3r.cli.build import commands as build_commands
 from list3r.cli.build import update as update_commands
@@ -39,6 +40,7 @@ for module in (
     build_commands,
     memory_commands,
     query_commands,
+    picture_commands,
     edit_commands,
     embed_commands,
     file_commands,

@@ -42,6 +42,10 @@ FORMATS: dict[str, Format] = {
 }
 
 
+FOLDERS = ("prompt",)
+"""Formats that are a folder, written through the face for Python."""
+
+
 def export(store: Store, format_name: str, path: str | Path) -> tuple[Path, ...]:
     """Write a memory to `path` in a format. Returns the files written, `path` first.
 
@@ -61,7 +65,7 @@ def export(store: Store, format_name: str, path: str | Path) -> tuple[Path, ...]
 def find_writer(format_name: str) -> Writer:
     """Return the function that writes a format. Raises `OptionError` that names the known formats."""
     if format_name not in FORMATS:
-        raise OptionError(f"unknown format {format_name!r}; there are {', '.join(FORMATS)}")
+        raise OptionError(f"unknown format {format_name!r}; there are {', '.join((*FORMATS, *FOLDERS))}")
     form = FORMATS[format_name]
     module = importlib.import_module(f"list3r.exporters.{form.module}")
     return cast(Writer, getattr(module, form.function))

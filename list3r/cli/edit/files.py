@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
-from list3r.exporters.registry import FORMATS
+from list3r.exporters.registry import FOLDERS, FORMATS
 
 
 def register(app: typer.Typer) -> None:
@@ -21,19 +21,23 @@ def register(app: typer.Typer) -> None:
 
 def export(
     memory: MemoryArgument,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")],
-    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file to write.")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join((*FORMATS, *FOLDERS))}.")],
+    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file to write; of prompt, the folder.")],
+    tokens: Annotated[int, typer.Option("--tokens", help="prompt: tokens of the text at most.")] = 2000,
+    question: Annotated[str | None, typer.Option("--question", help="prompt: what to put first.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a memory in another format: scene JSON, USD, coloured points, boxes, trajectory, plan picture.
+    """Write a memory in another format: scene JSON, USD, coloured points, boxes, trajectory, plan picture, or a pack
+    for a language model: text within a budget of tokens, maps, marked views and crops.
 
     Example: list3r export house.l3r --to usd --out house.usda
     """
     with open_memory(memory) as scene:
-        written = scene.export(to, out)
+        written = scene.export(to, out, tokens=tokens, question=question)
     sizes = {str(path): path.stat().st_size for path in written}
     if json:
-        print_json({"format": to, "path": str(out), "bytes": sizes[str(out)], "files": sizes})
+        size = sizes.get(str(out), sum(sizes.values()))
+        print_json({"format": to, "path": str(out), "bytes": size, "files": sizes})
     else:
         print("\n".join(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
 

@@ -1,0 +1,48 @@
+"""A text of lines that never takes more tokens than it may."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from list3r.exporters.prompt.tokens import count_tokens
+
+
+class Budget:
+    """Lines that are added as long as there is room."""
+
+    def __init__(self, tokens: int) -> None:
+        self.tokens = tokens
+        self.used = 0
+        self.lines: list[str] = []
+
+    @property
+    def left(self) -> int:
+        """Tokens that are left."""
+        return self.tokens - self.used
+
+    def add(self, line: str, *, keep: int = 0) -> bool:
+        """Add a line where that leaves `keep` tokens; whether it was added."""
+        cost = count_tokens(line + "\n")
+        if self.used + cost + keep > self.tokens:
+            return False
+        self.lines.append(line)
+        self.used += cost
+        return True
+
+    def add_list(self, head: str, items: Iterable[str], *, share: float = 1.0) -> int:
+        """Add one line of a head and as many of the items as a share of what is left has room for; how many."""
+        separator, room = "; ", self.used + share * self.left
+        items, kept, cost = list(items), 0, count_tokens(head + "\n")
+        step = count_tokens(separator)
+        for item in items:
+            cost += count_tokens(" " + item) + step
+            if self.used + cost > room:
+                break
+            kept += 1
+        if kept:
+            self.add(head + " " + separator.join(items[:kept]))
+        return kept
+
+    def text(self) -> str:
+        """The text."""
+        return "".join(line + "\n" for line in self.lines)

@@ -1,0 +1,146 @@
+"""The pack for a vision language model: text, maps, marked views and crops in one folder."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from list3r.exporters.prompt.cognitive_map import cognitive_maps
+from list3r.exporters.prompt.coverage import cover
+from list3r.exporters.prompt.marks import draw_marks
+from list3r.exporters.prompt.scene_text import scene_prompt
+from list3r.memory.errors import ExportError, OptionError
+from list3r.queries.pictures import KeyframePicture
+
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+
+_OURS = "list3r-prompt.json"
+"""Names the files of a pack; a folder that holds it may be replaced."""
+
+
+@dataclass(frozen=True)
+class PackSettings:
+    """What a pack shows."""
+
+    least_visible: float = 0.3
+    """Share of an instance that must show for a view to count for it."""
+    least_side_px: float = 12.0
+    """Side of a square of the area of its mask, likewise."""
+
+
+def write_prompt(
+    memory: SceneMemory,
+    folder: str | Path,
+    tokens: int = 2000,
+    question: str | None = None,
+    settings: PackSettings | None = None,
+) -> tuple[Path, ...]:
+    """Write scene.md, cognitive_map.json, map.png, views/ and crops/ to a folder; return the files.
+
+    The views are the fewest stored keyframes that together show every listed instance. An earlier pack is replaced,
+    another folder is not, and an interruption leaves what was there. Raises `OptionError` and `ExportError`.
+    """
+    folder, settings = Path(folder), settings or PackSettings()
+    prompt = scene_prompt(memory, tokens, question)
+    instances = [i for i in memory.instances(structure=None) if i.state != "removed"]
+    things = {i.id for i in instances if i.structure is None}
+    listed = [n for n in prompt.listed if n in things]
+    with _replacing_folder(folder) as temporary:
+        (temporary / "scene.md").write_text(prompt.text, encoding="utf-8")
+        maps = cognitive_maps(instances, memory.units)
+        (temporary / "cognitive_map.json").write_text(json.dumps(maps, indent=1) + "\n", encoding="utf-8")
+        memory.export("plan", temporary / "map.png")
+        views = _write_views(memory, temporary / "views", listed, settings)
+        crops = _write_crops(memory, temporary / "crops", listed)
+        told = {
+            "format": "list3r-prompt",
+            "version": 1,
+            "memory": memory.path.name,
+            "question": question,
+            "tokens": prompt.tokens,
+            "listed": list(prompt.listed),
+            "views": views,
+            "without_picture": sorted(set(listed) - crops),
+        }
+        (temporary / _OURS).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    return tuple(sorted(p for p in folder.rglob("*") if p.is_file()))
+
+
+def chosen_views(
+    pictures: Sequence[KeyframePicture], listed: Sequence[int], settings: PackSettings | None = None
+) -> list[KeyframePicture]:
+    """Return the fewest pictures in which every listed instance shows that is readable in any of them.
+
+    An instance that is nowhere readable counts in the picture that shows it best.
+    """
+    s, wanted = settings or PackSettings(), set(listed)
+    shows: dict[int, set[int]] = {n: set() for n in range(len(pictures))}
+    best: dict[int, tuple[float, int]] = {}
+    for n, picture in enumerate(pictures):
+        for sight in picture.sights:
+            if sight.instance_id in wanted:
+                best[sight.instance_id] = max(best.get(sight.instance_id, (-1.0, 0)), (sight.worth(), -n))
+                if sight.visible_fraction >= s.least_visible and sight.area_px >= s.least_side_px**2:
+                    shows[n].add(sight.instance_id)
+    readable = set[int]().union(*shows.values())
+    for instance_id, (_, n) in best.items():
+        if instance_id not in readable:
+            shows[-n].add(instance_id)
+    return [pictures[n] for n in cover(shows)]
+
+
+def _write_views(
+    memory: SceneMemory, folder: Path, listed: Sequence[int], settings: PackSettings
+) -> list[dict[str, object]]:
+    folder.mkdir()
+    out: list[dict[str, object]] = []
+    for picture in chosen_views(memory.pictures(listed), listed, settings):
+        sights = [s for s in picture.sights if s.instance_id in set(listed)]
+        name = f"session{picture.session_id}_frame{picture.frame_index:06d}.jpg"
+        draw_marks(memory.pixels(picture), sights).save(folder / name, quality=90)
+        out.append({"file": f"views/{name}", "instances": [s.instance_id for s in sights]})
+    return out
+
+
+def _write_crops(memory: SceneMemory, folder: Path, listed: Sequence[int]) -> set[int]:
+    """Write the best picture of each instance; the ids of those that have one."""
+    folder.mkdir()
+    written = set()
+    for instance_id in listed:
+        with contextlib.suppress(OptionError):
+            crop = memory.picture(instance_id).crop()
+            Image.fromarray(np.ascontiguousarray(crop)).save(folder / f"{instance_id}.jpg", quality=90)
+            written.add(instance_id)
+    return written
+
+
+@contextlib.contextmanager
+def _replacing_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder` that takes its place when the block ends well."""
+    if not folder.parent.is_dir():
+        raise ExportError(f"the folder {folder.parent} does not exist; create it first")
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder} is a file; name a folder for the pack")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / _OURS).is_file():
+        raise ExportError(f"{folder} holds other files; name a new folder for the pack")
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        yield temporary
+        shutil.rmtree(folder, ignore_errors=True)
+        temporary.replace(folder)
+    except OSError as error:
+        raise ExportError(f"{folder} cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

@@ -1,0 +1,241 @@
+"""A memory as text for a language model: a table of things, counts and relations within a budget of tokens."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from list3r.exporters.prompt.budget import Budget
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance, Relation
+
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+
+SUPPORTING = ("on", "in", "attached_to")
+"""Predicates that stand in a thing's own row: what holds it."""
+_TOLD = ("next_to", "above", "under")
+"""Further predicates; the others are their inverses, or follow from the gaps."""
+
+
+@dataclass(frozen=True)
+class PromptSettings:
+    """What goes into the text."""
+
+    unsure_below: float = 0.5
+    """Instances less sure than this are marked."""
+    turned_from_deg: float = 8.0
+    """Boxes turned by less than this against the axes count as along them."""
+    share_of_rows: float = 0.85
+    """Rows take at most this share of the tokens where not all things fit; the rest is for counts."""
+    share_of_counts: float = 0.5
+    """Counts take at most this share of what the rows have left."""
+    neighbours: int = 2
+    """Nearest things that are told of each thing."""
+
+
+@dataclass(frozen=True)
+class ScenePrompt:
+    """A memory as text."""
+
+    text: str
+    """Markdown, the content of `scene.md`."""
+    tokens: int
+    """Tokens of the text by `count_tokens`."""
+    listed: tuple[int, ...]
+    """Ids of the instances that have a row, in order."""
+    instances: int
+    """How many instances the memory holds, structure too."""
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def scene_prompt(
+    memory: SceneMemory, tokens: int = 2000, question: str | None = None, settings: PromptSettings | None = None
+) -> ScenePrompt:
+    """Return the text of a memory in at most so many tokens, see `SceneMemory.prompt`."""
+    settings = settings or PromptSettings()
+    things = [i for i in memory.instances(structure=None) if i.state != "removed"]
+    ranked = ranked_instances(memory, things, question)
+    budget = Budget(tokens)
+    writer = _Writer(memory, things, settings)
+    for line in writer.head():
+        if not budget.add(line):
+            needed = sum(_cost(x) for x in writer.head())
+            raise OptionError(f"{tokens} tokens are too few: the frame of the scene alone takes {needed}")
+    listed = writer.rows(budget, ranked)
+    if len(listed) < len(things):
+        writer.counts(budget, [name_of(i) for i in listed] if question else [])
+    writer.changes(budget)
+    writer.gaps(budget, listed)
+    writer.relations(budget, listed)
+    return ScenePrompt(budget.text(), budget.used, tuple(i.id for i in listed), len(things))
+
+
+def _cost(line: str) -> int:
+    budget = Budget(10**9)
+    budget.add(line)
+    return budget.used
+
+
+def ranked_instances(memory: SceneMemory, things: Sequence[Instance], question: str | None) -> list[Instance]:
+    """Return the instances in the order in which they matter: by the words of a question and ids such as #12 in it,
+    then by nearness to what it names; without a question the surest and most seen things first, structure last.
+    """
+    usual = sorted(things, key=lambda i: (i.structure is not None, -i.confidence * np.log1p(i.observations), i.id))
+    if not question:
+        return usual
+    named = {m.instance.id: m.score for m in memory.nearest(question, k=200)}
+    named |= {i.id: 2.0 for i in things if re.search(rf"#{i.id}\b", question)}
+    if not named:
+        return usual
+    anchors = np.array([i.center for i in things if i.id in named])
+    order = {i.id: n for n, i in enumerate(usual)}
+
+    def rank(i: Instance) -> tuple[float, float, int]:
+        away = float(np.linalg.norm(anchors - i.center, axis=1).min())
+        return -named.get(i.id, 0.0), away, order[i.id]
+
+    return sorted(things, key=rank)
+
+
+def name_of(instance: Instance) -> str:
+    """Return what an instance is called: its label, its kind of structure, or its description up to the comma."""
+    return instance.label or instance.structure or instance.description.split(",")[0].strip() or "thing"
+
+
+def length_unit(things: Iterable[Instance], units: str) -> tuple[float, int]:
+    """Return how many of the text's units a length of 1 is, and the decimals: whole centimetres where metric, the
+    memory's own unit to about a thousandth of the extent where that has no scale.
+    """
+    centers = np.array([i.center for i in things if np.isfinite(i.center).all()]).reshape(-1, 3)
+    if units == "m":
+        return 100.0, 0
+    extent = float(np.ptp(centers, axis=0).max()) if len(centers) else 0.0
+    return 1.0, int(np.clip(np.ceil(3 - np.log10(extent or 1.0)), 0, 9))
+
+
+class _Writer:
+    """Lines about one memory."""
+
+    def __init__(self, memory: SceneMemory, things: Sequence[Instance], settings: PromptSettings) -> None:
+        self.memory, self.things, self.settings = memory, things, settings
+        self.per_unit, self.decimals = length_unit(things, memory.units)
+        self.names = {i.id: name_of(i) for i in things}
+        self.stored = [r for r in memory.relations() if r.subject in self.names and r.object in self.names]
+        self.holders: dict[int, Relation] = {}
+        for r in self.stored:
+            if r.predicate in SUPPORTING:
+                self.holders.setdefault(r.subject, r)
+        self.parts = len({i.component for i in things})
+
+    def number(self, value: float) -> str:
+        return f"{np.round(value * self.per_unit, self.decimals) + 0.0:.{self.decimals}f}"
+
+    def triple(self, values: Iterable[float], separator: str) -> str:
+        return separator.join(self.number(v) for v in values)
+
+    def head(self) -> list[str]:
+        units, gravity = self.memory.units, self.memory.gravity
+        solid = sum(i.structure is None for i in self.things)
+        scale = "Lengths: cm." if units == "m" else "Lengths: arbitrary units, the scale is unknown."
+        up = "z is up." if gravity != "unknown" else "Which way is up is unknown, so nothing is told of on or above."
+        parts = f" {self.parts} parts that are not placed against each other." if self.parts > 1 else ""
+        lines = [
+            f"# {self.memory.path.name}: {solid} things, {len(self.things) - solid} of structure",
+            f"{scale} {up}{parts}",
+            "Row: id name | centre x,y,z | size along its sides @ degrees turned about z | held by id",
+        ]
+        if any(i.confidence < self.settings.unsure_below for i in self.things):
+            lines.append("? after a name: unsure.")
+        return lines
+
+    def rows(self, budget: Budget, ranked: Sequence[Instance]) -> list[Instance]:
+        """Add a row for each instance as long as there is room; those that have one."""
+        lines = [(i, self.row(i)) for i in ranked]
+        whole = sum(_cost(line) for _, line in lines)
+        keep = 0 if whole <= budget.left else int((1.0 - self.settings.share_of_rows) * budget.tokens)
+        out = []
+        for i, line in lines:
+            if not budget.add(line, keep=keep):
+                break
+            out.append(i)
+        return out
+
+    def row(self, i: Instance) -> str:
+        unsure = "?" if i.confidence < self.settings.unsure_below else ""
+        cells = [f"{i.id} {self.names[i.id]}{unsure}"]
+        if np.isfinite(i.center).all() and np.isfinite(i.box.size).all():
+            cells += [self.triple(i.center, ","), self.triple(i.box.size, "x") + self.turn(i)]
+        held = self.holders.get(i.id)
+        if held is not None:
+            cells.append(f"{held.predicate.replace('_', ' ')} {held.object}")
+        if i.dynamic or i.state not in ("present", "unseen"):
+            cells.append("moving" if i.dynamic else i.state)
+        if self.parts > 1:
+            cells.append(f"part {i.component}")
+        return " | ".join(cells)
+
+    def turn(self, i: Instance) -> str:
+        """How far the box is turned about the vertical; nothing where that is little or which way is up is unknown."""
+        if self.memory.gravity == "unknown":
+            return ""
+        angle = float(np.rad2deg(np.arctan2(i.box.rotation[1, 0], i.box.rotation[0, 0])))
+        angle = (angle + 90.0) % 180.0 - 90.0
+        return f"@{angle:.0f}" if abs(angle) >= self.settings.turned_from_deg else ""
+
+    def counts(self, budget: Budget, first: Sequence[str]) -> None:
+        """Add how many there are of each name, of all instances: some names first, then the most common."""
+        count = Counter(self.names.values())
+        common = sorted(count, key=lambda name: (-count[name], name))
+        names = dict.fromkeys([*first, *common])
+        budget.add_list("In all:", [f"{count[name]} {name}" for name in names], share=self.settings.share_of_counts)
+
+    def changes(self, budget: Budget) -> None:
+        """Add what the last session changed."""
+        found = self.memory.changes()
+        newest = max((c.event.session_id for c in found), default=0)
+        items = []
+        for c in found:
+            if c.event.session_id == newest:
+                far = "" if c.distance_m is None else f" {self.number(c.distance_m)}"
+                items.append(f"{c.instance.id} {name_of(c.instance)} {c.event.kind}{far}")
+        if items:
+            budget.add_list("Changed last:", items)
+
+    def gaps(self, budget: Budget, listed: Sequence[Instance]) -> None:
+        """Add the nearest things of each listed thing with the gap between their surfaces."""
+        items, told, cost = [], set[frozenset[int]](), 0
+        for i in listed:
+            if i.structure is not None or cost > budget.left:
+                continue
+            near = []
+            for m in self.memory.nearest(i.id, k=self.settings.neighbours):
+                pair = frozenset((i.id, m.instance.id))
+                if m.distance_m is not None and pair not in told:
+                    told.add(pair)
+                    near.append(f"{m.instance.id} {self.number(m.distance_m)}")
+            if near:
+                items.append(f"{i.id}: {', '.join(near)}")
+                cost += _cost(items[-1])
+        if items:
+            budget.add_list("Nearest, gap between surfaces:", items)
+
+    def relations(self, budget: Budget, listed: Sequence[Instance]) -> None:
+        """Add further relations between listed things, the surest first."""
+        shown = {i.id for i in listed}
+        for predicate in _TOLD:
+            told, items = set[frozenset[int]](), []
+            for r in self.stored:
+                pair = frozenset((r.subject, r.object))
+                if r.predicate == predicate and {r.subject, r.object} <= shown and pair not in told:
+                    told.add(pair)
+                    items.append(f"{r.subject} {r.object}")
+            if items:
+                budget.add_list(f"{predicate.replace('_', ' ')}:".capitalize(), items)
