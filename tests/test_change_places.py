@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.change.free_space import SeenThrough
+from list3r.memory.change.free_space import FreeSpaceCarving
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.merging.edges import pair_scores
@@ -63,7 +63,7 @@ def test_what_stays_is_seen_through_by_nobody(tmp_path: Path) -> None:
     with Store.open(_two(tmp_path / "a.l3r", dict(ROOM))) as store:
         u, v = (chunk_summaries(store)[c.chunk_id].shapes for c in store.chunks())
         pairs = pair_scores(u, v, Sim3.identity())
-        shares = SeenThrough(store, S).shares(u, v, pairs, Sim3.identity())
+        shares = FreeSpaceCarving(store, S).shares(u, v, pairs, Sim3.identity())
         assert len(shares[0]) == len(shares[1]) == len(pairs.i) > 0
         assert max(shares[0].max(), shares[1].max()) < 0.02
         assert [e.kind for e in store.events(2) if e.kind != "seen_again"] == []

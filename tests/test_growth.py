@@ -200,6 +200,16 @@ def test_chunks_that_a_loop_closure_moves_are_followed(walks: ModuleType, store:
         check(store)
 
 
+def test_overlaps_are_measured_anew_when_most_chunks_move(walks: ModuleType, store: Store) -> None:
+    for index, place in enumerate(ORDERS["there and back"]):
+        add(store, visit(walks, index, place))
+    with store.transaction():
+        for k in range(2, 8):
+            store.place_chunks({k: Sim3.exp(np.array([0.01 * k, 0.0, 0.02, 0, 0, 0.002 * k, 0]))}, {k: 1})
+        assert consolidate(store, settings=GROW).written is None
+    check(store)
+
+
 def test_things_of_chunks_that_trembled_lie_where_the_chunks_lie_when_a_session_ends(
     walks: ModuleType, store: Store
 ) -> None:

@@ -98,13 +98,14 @@ def check(store: Store, chunk_id: int | None) -> None:
 def whole_runs(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many chunks the memory had each time it was derived as a whole."""
     runs: list[int] = []
-    derive = consolidation._derive_whole
+    derive = consolidation._derive
 
-    def watched(store, *arguments):  # type: ignore[no-untyped-def]
-        runs.append(len(store.chunks()))
-        return derive(store, *arguments)
+    def watched(region, dirty, *arguments, **options):  # type: ignore[no-untyped-def]
+        if dirty.whole:
+            runs.append(len(region.rows))
+        return derive(region, dirty, *arguments, **options)
 
-    monkeypatch.setattr(consolidation, "_derive_whole", watched)
+    monkeypatch.setattr(consolidation, "_derive", watched)
     return runs
 
 

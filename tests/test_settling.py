@@ -9,7 +9,7 @@ import pytest
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.settling import settle
+from list3r.memory.library.settled_poses import settle
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.store.store import Store
 from tests.test_consolidation import add, chunk, create
@@ -29,7 +29,8 @@ def place(store: Store, poses: dict[int, Sim3], T_world_graph: Sim3 | None = Non
 
 def settled(store: Store) -> dict[int, Sim3]:
     with store.transaction():
-        return settle(store, chunk_summaries(store)).S_graph_chunk
+        settle(store, chunk_summaries(store))
+        return {k: row.S_graph_chunk for k, row in store.settled().items()}
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from list3r.memory.change.free_space import SeenThrough
+from list3r.memory.change.free_space import FreeSpaceCarving
 from list3r.memory.change.matching import Story
 from list3r.memory.change.places import Places
 from list3r.memory.change.records import Change, Changes, ChangeSettings
@@ -35,7 +35,7 @@ def across_sessions(
     pairs: Mapping[tuple[int, int], PairScores],
     shapes: Mapping[int, ChunkShapes],
     S_graph_chunk: Mapping[int, Sim3],
-    seen: SeenThrough,
+    seen: FreeSpaceCarving,
     settings: ChangeSettings,
 ) -> dict[tuple[int, int], PairScores]:
     """Scores of pairs without those that plainly are two things of two sessions at one place."""

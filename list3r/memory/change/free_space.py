@@ -20,7 +20,7 @@ _KEPT = 64
 """Chunks whose depth pictures are kept at hand."""
 
 
-class SeenThrough:
+class FreeSpaceCarving:
     """Asks the keyframes of one chunk about the instances of another one."""
 
     def __init__(self, store: Store, settings: VisibilitySettings, least_overlap: float = 0.2) -> None:

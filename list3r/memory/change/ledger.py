@@ -29,7 +29,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Tale:
+class ChangeLedger:
     """The story of the sessions that have ended."""
 
     session: int
@@ -39,7 +39,7 @@ class Tale:
     """A local instance of every thing that has an event."""
 
     @staticmethod
-    def of(changes: Changes, places: Sequence[Sequence[Key]], session: int) -> Tale:
+    def of(changes: Changes, places: Sequence[Sequence[Key]], session: int) -> ChangeLedger:
         """What was found, given the groups by overlap that it was found for."""
         home = {key: tuple(g) for g in places for key in g}
         moved = []
@@ -47,7 +47,7 @@ class Tale:
             if group[0] in changes.current:
                 parts = sorted({home[key] for key in group})
                 moved.append(Moved(tuple(parts), parts.index(home[changes.current[group[0]][0]])))
-        return Tale(session, tuple(moved), frozenset(e.first for e in changes.events))
+        return ChangeLedger(session, tuple(moved), frozenset(e.first for e in changes.events))
 
     def shows(self, group: Collection[Key]) -> bool:
         """Whether a group has an event, so that it is shown however little was seen of it."""
@@ -65,7 +65,9 @@ class Tale:
         """All local instances that it speaks of."""
         return {k for m in self.moved for place in m.places for k in place} | self.told
 
-    def joined(self, groups: Sequence[Sequence[Key]], components: Mapping[int, int]) -> tuple[list[list[Key]], Tale]:
+    def joined(
+        self, groups: Sequence[Sequence[Key]], components: Mapping[int, int]
+    ) -> tuple[list[list[Key]], ChangeLedger]:
         """Groups by overlap with those joined that are the places of one thing, and the tale with the places as they
         have become; what it says of things that are not among the groups stands. `components` by chunk id.
         """
@@ -89,7 +91,7 @@ class Tale:
         renewed = [_renewed([groups[n] for n in ns], owner.get(first)) for first, ns in parts.items()]
         out = sorted(sorted(k for n in ns for k in groups[n]) for ns in parts.values())
         moved = sorted([*absent, *(m for m in renewed if m is not None)], key=lambda m: min(m.places))
-        return out, Tale(self.session, tuple(moved), self.told)
+        return out, ChangeLedger(self.session, tuple(moved), self.told)
 
     def state(self, before: str | None, group: Sequence[Key], rows: Mapping[int, ChunkRow]) -> str:
         """The state of a thing: the one that was told, until a later session sees it."""
@@ -109,18 +111,18 @@ def _renewed(groups: Sequence[Sequence[Key]], before: Moved | None) -> Moved | N
     return Moved(tuple(places), places.index(now)) if here and rest else None
 
 
-def read_tale(store: Store, chunks: Sequence[ChunkRow]) -> Tale | None:
+def read_ledger(store: Store, chunks: Sequence[ChunkRow]) -> ChangeLedger | None:
     """What stands of changes; None where several sessions have ended and nothing is written down of them."""
     told = store.get_value(_NAME)
     if told is not None:
         moved = (Moved(tuple(_keys(p) for p in m["places"]), int(m["now"])) for m in told["moved"])
-        return Tale(int(told["session"]), tuple(moved), frozenset(_keys(told["told"])))
+        return ChangeLedger(int(told["session"]), tuple(moved), frozenset(_keys(told["told"])))
     complete = {s.session_id for s in store.sessions() if s.state == "complete"}
     ended = sorted({c.session_id for c in chunks} & complete)
-    return Tale(ended[0] if ended else 0) if len(ended) < 2 else None
+    return ChangeLedger(ended[0] if ended else 0) if len(ended) < 2 else None
 
 
-def write_tale(store: Store, tale: Tale) -> None:
+def write_ledger(store: Store, tale: ChangeLedger) -> None:
     """Keep it; call inside `transaction()`."""
     moved = [{"places": [list(map(list, p)) for p in m.places], "now": m.now} for m in tale.moved]
     store.set_value(_NAME, {"session": tale.session, "moved": moved, "told": sorted(map(list, tale.told))})

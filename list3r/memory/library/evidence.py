@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.overlap.missed import LookSettings, bears_out, frames_beside, misses
-from list3r.memory.overlap.pair_scores import Key, Meetings, Numbering, PairScores
+from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
 from list3r.memory.overlap.voxels import ChunkShapes, Ints
 
 
@@ -80,7 +80,7 @@ def weigh(
     weighed[list(range(len(groups)) if wanted is None else wanted)] = True
     frames = [_frames_of(g, chunks) if weighed[n] else set() for n, g in enumerate(groups)]
     chunk_of = np.array([k for k, _ in numbering.keys], np.int64)
-    meet = Meetings.of(pairs, numbering)
+    meet = PairTable.of(pairs, numbering)
     against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
     beside = frames_beside(chunks, pairs)
     for inner, outer, cover in ((meet.a, meet.b, meet.a_on_b), (meet.b, meet.a, meet.b_on_a)):

@@ -1,30 +1,118 @@
-"""Things of the library: derived from their members, and kept for the next chunk that comes."""
+"""A global instance from its local instances: points, box, feature, confidence, best view."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3
-from list3r.memory.library.derivation import Member, Thing, derive_mover, derive_thing
-from list3r.memory.library.rules import ConsolidationSettings, World
+from list3r.memory.description.colors import Swatch, dominant_colors
+from list3r.memory.description.describe import shape_word
+from list3r.memory.geometry import Array, Sim3
 from list3r.memory.merging.moving import Mover
 from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.overlap.summaries import cameras_of
 from list3r.memory.overlap.voxels import ChunkShapes
-from list3r.memory.records import ChunkRow
+from list3r.memory.records import BestView
+from list3r.memory.relations.bodies import Body, fit_box, without_strays
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 _KEPT = 400
-"""Things that are kept; more are derived again when they are asked for, so that memory does not grow with chunks."""
+"""Instances that are kept; more are derived again when they are asked for, so that memory does not grow with chunks."""
 
 
-class InstanceCache(LruCache[tuple[object, ...], Thing]):
+@dataclass(frozen=True)
+class DeriveSettings:
+    """How much evidence makes a thing certain, and how its extent is measured."""
+
+    half_frames: float = 12.0
+    """Frames after which half of the doubt is gone."""
+    max_points: int = 1000
+    """Surface points kept for boxes and relations."""
+    trim: float = 0.01
+    """Share of points outside the box at either end of each axis."""
+    flat: float = 0.15
+    """Thickness over the second longest extent of what is flat."""
+    confirmed: float = 0.25
+    """Share of the members that must have a surface at a point of a small thing of at least four whole views."""
+    small_m: float = 0.5
+    """Diagonal of a small thing; of a larger one each chunk sees another part."""
+    border_px: float = 3.0
+    """A box that comes this near to the border of what is seen is cut by it."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """One local instance of a thing."""
+
+    shapes: ChunkShapes
+    at: int
+    """Position in the chunk's shapes."""
+    S_world_chunk: Sim3
+    dropped: NDArray[np.bool_]
+    """Points of the chunk's shapes that belong to something else. Shape (R,)."""
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and end of its points in the chunk's shapes, which are ordered by owner."""
+        start, stop = np.searchsorted(self.shapes.owner, [self.at, self.at + 1])
+        return int(start), int(stop)
+
+    def own(self) -> NDArray[np.int64]:
+        """Positions of the points of the chunk's shapes that are its surface. Shape (M,)."""
+        start, stop = self.span
+        return np.asarray(start + np.flatnonzero(~self.dropped[start:stop]))
+
+
+@dataclass(frozen=True)
+class DerivedInstance:
+    """A global instance before it is written."""
+
+    body: Body
+    feature: NDArray[np.float32]
+    """Unit length. Shape (D,)."""
+    frames: tuple[tuple[int, int], ...]
+    """(session id, Frame.index) of every frame in which it is seen, in order."""
+    best_view: BestView | None
+    certainty: float
+    """How sure it is that it exists as one thing, before it is asked who else should have seen it."""
+    anchor: int
+    """Id of the chunk that saw it longest."""
+    shape: str
+    """Its shape in a word, see `memory.describe`."""
+    swatches: tuple[Swatch, ...]
+    """Its colours, the commonest first."""
+    dynamic: bool = False
+    """Whether it was seen moving; its body is then where it was last."""
+    resting: bool = True
+    """Whether it stands still there, so that it has relations."""
+
+
+@dataclass(frozen=True)
+class Members:
+    """The local instances of one instance."""
+
+    group: Sequence[Key]
+    shown_by: Sequence[Key]
+    """Those that show it where it is now."""
+    chunks: Mapping[int, tuple[ChunkShapes, Sim3, NDArray[np.bool_]]]
+    """Shapes, settled pose in the world and dropped points of each chunk."""
+    component: int
+    upright: bool
+    """Whether z is up there."""
+    mover: Mover | None = None
+    """What is known of its motion."""
+
+    def of(self, keys: Sequence[Key]) -> list[Member]:
+        """Return some of them."""
+        found = ((self.chunks[k], n) for k, n in keys)
+        return [Member(c[0], int(np.searchsorted(c[0].local_id, n)), c[1], c[2]) for c, n in found]
+
+
+class InstanceCache(LruCache[tuple[object, ...], DerivedInstance]):
     """Instances as they were derived from their members."""
 
     def __init__(self) -> None:
@@ -32,43 +120,152 @@ class InstanceCache(LruCache[tuple[object, ...], Thing]):
         self.stamps = itertools.count(1)
 
 
-def thing_of(
-    store: Store,
+def derived_instance(store: Store, instance_id: int, members: Members, settings: DeriveSettings) -> DerivedInstance:
+    """Return an instance, derived from its members unless it was just so before."""
+    m, cache = members, store.derived.of(InstanceCache)
+    shown_by = m.of(m.shown_by)
+    poses = tuple(
+        (store.node_checksum(k), m.chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in m.group})
+    )
+    cuts = b"".join(np.packbits(x.dropped[slice(*x.span)]).tobytes() for x in shown_by)
+    key = (instance_id, m.component, m.upright, tuple(m.group), tuple(m.shown_by), poses, cuts, m.mover)
+    kept = cache.get(key)
+    if kept is not None:
+        return kept
+    found = derive_instance(instance_id, shown_by, m.component, upright=m.upright, settings=settings)
+    if m.mover is not None:
+        last = m.of([k for k in m.group if k in m.mover.last])
+        now = derive_instance(instance_id, last, m.component, upright=m.upright, settings=settings)
+        found = replace(found, body=now.body, anchor=now.anchor, shape=now.shape, dynamic=True, resting=m.mover.resting)
+    return cache.put(key, replace(found, body=replace(found.body, stamp=next(cache.stamps))))
+
+
+def derive_instance(
     instance_id: int,
-    group: Sequence[Key],
-    shown_by: Sequence[Key],
-    chunks: Mapping[int, tuple[ChunkShapes, Sim3, NDArray[np.bool_]]],
+    members: Sequence[Member],
     component: int,
-    s: ConsolidationSettings,
-    world: World,
-    mover: Mover | None = None,
-) -> Thing:
-    """A thing, derived from its members unless it was just so before. `chunks` are the shapes, the settled poses in the
-    world and the dropped points of its chunks.
+    *,
+    upright: bool,
+    settings: DeriveSettings,
+) -> DerivedInstance:
+    """All that follows from the members of one thing; `upright` says that z is up."""
+    s = settings
+    own = [m.own() for m in members]
+    points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[k]) for m, k in zip(members, own, strict=True)])
+    rgb = np.concatenate([m.shapes.rgb[k] for m, k in zip(members, own, strict=True)])
+    if len(points) == 0:
+        points, rgb = members[0].S_world_chunk.apply(np.zeros((1, 3))), np.zeros((1, 3), np.uint8)
+    owner = np.repeat(np.arange(len(members)), [len(k) for k in own])
+    step = -(-len(points) // s.max_points)
+    points, rgb, owner = points[::step], rgb[::step], owner[::step]
+    keep = _confirmed(points, owner, members, s)
+    points, rgb = points[keep], rgb[keep]
+    keep = without_strays(points)
+    points, rgb = points[keep], rgb[keep]
+    frames = sorted({(m.shapes.session_id, int(f)) for m in members for f in m.shapes.frames[m.at]})
+    counts = np.array([len(m.shapes.frames[m.at]) for m in members], dtype=np.float64)
+    stability = float(np.average([m.shapes.stability[m.at] for m in members], weights=np.maximum(counts, 1)))
+    feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
+    box = fit_box(points, upright=upright, trim=s.trim)
+    body = Body(
+        id=instance_id,
+        points=points,
+        rgb=rgb,
+        box=box,
+        aabb=_aabb(points, s.trim),
+        normal=_normal(members, points, s),
+        flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
+        component=component,
+    )
+    certainty = _certainty(len(frames), stability, members, s)
+    anchor = members[int(np.argmax(counts))].shapes.chunk_id
+    unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
+    shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
+    colors = dominant_colors(rgb)
+    view = _best_view(members, s)
+    return DerivedInstance(body, unit_feature, tuple(frames), view, certainty, anchor, shape, colors)
+
+
+def _metre(members: Sequence[Member]) -> float:
+    """What a metre is about in the world, as its chunks tell."""
+    return float(np.median([m.shapes.unit * float(m.S_world_chunk.scale) for m in members]))
+
+
+def _aabb(points: Array, trim: float) -> Array:
+    return np.asarray(np.quantile(points, [trim, 1.0 - trim], axis=0))
+
+
+def _confirmed(
+    points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings
+) -> NDArray[np.int64]:
+    """Points that enough of the members agree on: what a single chunk added to a thing that others saw whole is a bit
+    of something else. Members that the image's border cut have no say, and where they are many nothing is dropped.
     """
-    upright = world.upright and component == world.first
-    members = [
-        Member(chunks[k][0], int(np.searchsorted(chunks[k][0].local_id, n)), chunks[k][1], chunks[k][2])
-        for k, n in shown_by
-    ]
-    poses = tuple((store.node_checksum(k), chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in group}))
-    cuts = b"".join(np.packbits(m.dropped[slice(*m.span)]).tobytes() for m in members)
-    key: tuple[object, ...] = (instance_id, component, upright, tuple(group), tuple(shown_by), poses, cuts, mover)
-    kept = store.derived.of(InstanceCache)
-    found = kept.get(key)
-    if found is not None:
-        return found
-    if mover is None:
-        thing = derive_thing(instance_id, members, component, upright=upright, settings=s.derive)
-    else:
-        last = [m for m, k in zip(members, group, strict=True) if k in mover.last]
-        thing = derive_mover(
-            instance_id, members, last, component, resting=mover.resting, upright=upright, settings=s.derive
-        )
-    return kept.put(key, replace(thing, body=replace(thing.body, stamp=next(kept.stamps))))
+    whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
+    need = int(np.ceil(s.confirmed * whole.sum()))
+    size = float(np.median([m.shapes.size[m.at] / m.shapes.unit for m in members]))
+    if whole.sum() < 4 or whole.mean() < 0.7 or need < 2 or size > s.small_m:
+        return np.arange(len(points))
+    grain = 2.0 * members[0].shapes.grain * float(members[0].S_world_chunk.scale)
+    cells = np.floor((points - points.min(axis=0)) / grain).astype(np.int64) + 1
+    shape = cells.max(axis=0) + 2
+    flat = np.ravel_multi_index(tuple(cells.T), tuple(shape))
+    reach = np.array([np.ravel_multi_index((i + 1, j + 1, k + 1), tuple(shape)) for i, j, k in _NEAR]) - int(
+        np.ravel_multi_index((1, 1, 1), tuple(shape))
+    )
+    seen = np.unique((flat[:, None] + reach) * len(members) + owner[:, None])
+    held, count = np.unique(seen[whole[seen % len(members)]] // len(members), return_counts=True)
+    at = np.minimum(np.searchsorted(held, flat), len(held) - 1)
+    keep = np.flatnonzero((held[at] == flat) & (count[at] >= need))
+    return keep if len(keep) >= 0.3 * len(points) else np.arange(len(points))
 
 
-def eye_level(store: Store, chunks: Sequence[ChunkRow]) -> float:
-    """Height that 90 % of the cameras of some chunks lie below; without cameras everything is below."""
-    heights = cameras_of(store, chunks).translation[:, 2]
-    return float(np.quantile(heights, 0.9)) if len(heights) else np.inf
+_NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
+
+
+def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:
+    """Normal of a thing that is flat in most of its views and as a whole, towards the cameras that saw it."""
+    flat = [m for m in members if not np.isnan(m.shapes.plane[m.at]).any()]
+    if 2 * len(flat) < len(members) or len(points) < 3:
+        return None
+    center = np.median(points, axis=0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2]
+    extent = np.ptp(np.quantile((points - center) @ axes.T, [0.1, 0.9], axis=0), axis=0)
+    if extent[2] > s.flat * extent[1]:
+        return None
+    toward = np.sum([m.S_world_chunk.rotation @ m.shapes.plane[m.at, :3] for m in flat], axis=0)
+    return np.asarray(axes[2] if axes[2] @ toward >= 0 else -axes[2])
+
+
+def with_agreement(found: DerivedInstance, agreement: float) -> DerivedInstance:
+    """The thing with its confidence; `agreement` is the share of the chunks that saw its place and found it."""
+    return replace(found, body=replace(found.body, confidence=round(found.certainty * agreement, 4)))
+
+
+def _certainty(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:
+    """Grows with frames and with chunks that found the thing on their own; stability caps it."""
+    chunks = len({m.shapes.chunk_id for m in members})
+    seen = frames / (frames + s.half_frames)
+    agreed = 1.0 - 0.5**chunks
+    return float(np.clip(stability, 0.0, 1.0)) * (0.6 * seen + 0.4 * agreed)
+
+
+def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:
+    """The frame with the largest mask, weighted down where the border cuts it or something hides it."""
+    best: tuple[float, int, int] | None = None
+    box: Array = np.zeros(4)
+    for m in members:
+        b = m.shapes.boxes_xyxy[m.at].astype(np.float64)
+        if len(b) == 0:
+            continue
+        seen = m.shapes.seen
+        cut = (b[:, :2] <= seen[:2] + s.border_px).any(axis=1) | (b[:, 2:] >= seen[2:] - s.border_px).any(axis=1)
+        score = m.shapes.areas_px[m.at] * np.where(cut, 0.25, 1.0) * (0.2 + 0.8 * m.shapes.visible_fraction[m.at])
+        n = int(np.argmax(score))
+        rank = (-float(score[n]), m.shapes.session_id, int(m.shapes.frames[m.at][n]))
+        if best is None or rank < best:
+            best, box = rank, b[n]
+    if best is None:
+        return None
+    x0, y0, x1, y1 = (float(x) for x in box)
+    return BestView(best[1], best[2], (x0, y0, x1, y1))

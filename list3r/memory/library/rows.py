@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import color_words, main_color
 from list3r.memory.description.describe import describe
 from list3r.memory.geometry import Sim3
-from list3r.memory.library.derivation import Thing
 from list3r.memory.library.identities import Identities
+from list3r.memory.library.instances import DerivedInstance
 from list3r.memory.library.rules import World
 from list3r.memory.overlap.pair_scores import Key, PairScores
 from list3r.memory.records import Instance, MergeDecision
@@ -40,15 +40,15 @@ def unpack_scores(blob: bytes) -> PairScores:
 
 
 def record_of(
-    thing: Thing, label: str | None, times: Mapping[tuple[int, int], float], world: World, *, metric: bool
+    found: DerivedInstance, label: str | None, times: Mapping[tuple[int, int], float], world: World, *, metric: bool
 ) -> Instance:
-    """The record of a thing, where its chunks are settled."""
-    body: Body = thing.body
-    seen = [times[f] for f in thing.frames if f in times] or [0.0]
-    name, rgb = main_color(thing.swatches, world.light)
-    color = color_words(thing.swatches, world.light)
-    words = describe(thing.shape, color, body.box.size, world.unit, metric=metric, structure=body.structure)
-    words = words if thing.resting else f"moving {words}"
+    """Return the record of an instance, where its chunks are settled."""
+    body: Body = found.body
+    seen = [times[f] for f in found.frames if f in times] or [0.0]
+    name, rgb = main_color(found.swatches, world.light)
+    color = color_words(found.swatches, world.light)
+    words = describe(found.shape, color, body.box.size, world.unit, metric=metric, structure=body.structure)
+    words = words if found.resting else f"moving {words}"
     return Instance(
         id=body.id,
         label=label,
@@ -57,7 +57,7 @@ def record_of(
         aabb=body.aabb,
         box=body.box,
         confidence=body.confidence,
-        observations=len(thing.frames),
+        observations=len(found.frames),
         first_seen_s=min(seen),
         last_seen_s=max(seen),
         state="present",
@@ -65,8 +65,8 @@ def record_of(
         color_rgb=rgb,
         color_name=name,
         component=body.component,
-        best_view=thing.best_view,
-        dynamic=thing.dynamic,
+        best_view=found.best_view,
+        dynamic=found.dynamic,
     )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from list3r.memory.change.detection import ChangeSettings
 from list3r.memory.constraints import Key
 from list3r.memory.description.colors import Reference
-from list3r.memory.library.derivation import DeriveSettings
 from list3r.memory.library.evidence import EvidenceSettings
-from list3r.memory.library.settling import SettlingSettings
+from list3r.memory.library.instances import DeriveSettings
+from list3r.memory.library.settled_poses import SettlingSettings
 from list3r.memory.merging.moving import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
 from list3r.memory.overlap.planes import place_planes
@@ -146,7 +146,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         posed=store.posed_count(_POSED),
         space=spaces.pop() if len(spaces) == 1 else "",
         stamp=_stamp(store, s),
-        edits=max((e.entry for e in store.edits()), default=0),
+        edits=last_edit(store),
     )
 
 
@@ -180,8 +180,13 @@ def _stamp(store: Store, s: ConsolidationSettings) -> int:
     return zlib.crc32(repr((s, store.get_value("T_world_graph"), store.get_value("scale_kind"))).encode())
 
 
-def spoken_of(store: Store, since: int) -> frozenset[Key]:
-    """The local instances that edits after an entry speak of; an undo speaks of what it takes back."""
+def last_edit(store: Store) -> int:
+    """Return the entry of the last edit, 0 where there is none."""
+    return max((e.entry for e in store.edits()), default=0)
+
+
+def edited_since(store: Store, since: int) -> frozenset[Key]:
+    """Return the local instances that edits after an entry name; an undo names those of what it takes back."""
     edits = {e.entry: e for e in store.edits()}
     left = [e for n, e in edits.items() if n > since]
     out: set[Key] = set()

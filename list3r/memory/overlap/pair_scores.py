@@ -117,7 +117,7 @@ class Numbering:
 
 
 @dataclass(frozen=True)
-class Meetings:
+class PairTable:
     """M pairs of local instances that meet, of many pairs of chunks, by their numbers."""
 
     a: Ints
@@ -130,13 +130,13 @@ class Meetings:
     """Shape (M,)."""
 
     @staticmethod
-    def of(pairs: Mapping[tuple[int, int], PairScores], numbering: Numbering) -> Meetings:
+    def of(pairs: Mapping[tuple[int, int], PairScores], numbering: Numbering) -> PairTable:
         """Those of pairs of chunks (u <= v) that are in the numbering."""
         known = [(u, v, p) for (u, v), p in pairs.items() if u in numbering.start and v in numbering.start]
         sizes = [len(p.i) for _, _, p in known]
         start_u = np.repeat(np.array([numbering.start[u] for u, _, _ in known], np.int64), sizes)
         start_v = np.repeat(np.array([numbering.start[v] for _, v, _ in known], np.int64), sizes)
-        return Meetings(
+        return PairTable(
             start_u + joined([p.i for _, _, p in known], np.int64),
             start_v + joined([p.j for _, _, p in known], np.int64),
             joined([p.i_on_j for _, _, p in known], np.float64),

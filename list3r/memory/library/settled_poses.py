@@ -1,10 +1,10 @@
-"""Where chunks lie for the purpose of consolidation: each graph trembles a little with every chunk that comes, and what
-is derived from a chunk need not be derived again for a millimetre.
+"""Settled poses: where chunks lie for the purpose of consolidation, with hysteresis. Every chunk that comes moves all
+others by a little, and what is derived from a chunk need not be derived again for a millimetre.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,54 +30,41 @@ class SettlingSettings:
     scale: float = 0.002
 
 
-@dataclass(frozen=True)
-class Settled:
-    """The chunks as consolidation sees them."""
-
-    chunks: list[ChunkRow]
-    """In the world, at their settled poses."""
-    S_graph_chunk: dict[int, Sim3]
-    """The same poses in the frame of the graph, which do not change when the world is turned upright."""
-    S_exact_settled: dict[int, Sim3]
-    """In the world: from where a chunk is settled to where it lies."""
-    moved: frozenset[int]
-    """Ids of the chunks that were not settled here before."""
-
-
 def settle(
     store: Store,
     summaries: Mapping[int, ChunkSummary],
     settings: SettlingSettings | None = None,
     among: Iterable[int] | None = None,
-) -> Settled:
-    """The settled poses of all chunks, or of those `among` them: the one kept in the store unless the chunk has moved
-    on or belongs to another component, then its own.
+) -> frozenset[int]:
+    """Settle all chunks, or those `among` them, and return those that were settled anew: a chunk keeps its settled pose
+    unless it has moved on or belongs to another component.
 
     Writes to the table `settled`, so that a build that goes on takes up the same poses.
     """
     s = settings or SettlingSettings()
     chunks = store.chunks() if among is None else [store.chunk(k) for k in sorted(among)]
-    T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
-    T_graph_world = T_world_graph.inverse()
+    T_graph_world = _world_of_graph(store).inverse()
     before = store.settled()
     fresh: dict[int, SettledRow] = {}
-    graph: dict[int, Sim3] = {}
     for c in chunks:
         S_graph_chunk, row = T_graph_world @ c.S_world_chunk, before.get(c.chunk_id)
-        graph[c.chunk_id] = S_graph_chunk if row is None else row.S_graph_chunk
         unit = float(S_graph_chunk.scale) * (1.0 if c.scale_kind == "metric" else summaries[c.chunk_id].unit)
         if row is None or row.component != c.component or not _near(row.S_graph_chunk, S_graph_chunk, unit, s):
-            graph[c.chunk_id] = S_graph_chunk
             extent = _extent(summaries[c.chunk_id], S_graph_chunk, 0.5 * _FAR_M * unit)
             fresh[c.chunk_id] = SettledRow(c.component, S_graph_chunk, extent)
     if fresh:
         store.put_settled(fresh)
-    moved = [replace(c, S_world_chunk=T_world_graph @ graph[c.chunk_id]) for c in chunks]
-    return Settled(moved, graph, _corrections(chunks, moved), frozenset(fresh))
+    return frozenset(fresh)
 
 
-def _corrections(exact: Sequence[ChunkRow], settled: Sequence[ChunkRow]) -> dict[int, Sim3]:
-    return {e.chunk_id: e.S_world_chunk @ s.S_world_chunk.inverse() for e, s in zip(exact, settled, strict=True)}
+def settled_chunks(store: Store) -> list[ChunkRow]:
+    """Return all chunks, which must be settled, at their settled poses in the world."""
+    T_world_graph, rows = _world_of_graph(store), store.settled()
+    return [replace(c, S_world_chunk=T_world_graph @ rows[c.chunk_id].S_graph_chunk) for c in store.chunks()]
+
+
+def _world_of_graph(store: Store) -> Sim3:
+    return Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
 
 
 def _near(a: Sim3, b: Sim3, unit: float, s: SettlingSettings) -> bool:

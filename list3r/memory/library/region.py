@@ -1,0 +1,260 @@
+"""What a derivation reads of chunks: settled poses, shapes, overlaps and links, each once, when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from list3r.memory.change.detection import across_sessions
+from list3r.memory.change.free_space import FreeSpaceCarving
+from list3r.memory.geometry import Array, Sim3
+from list3r.memory.library.rows import pack_scores, unpack_scores
+from list3r.memory.library.rules import ConsolidationSettings, World
+from list3r.memory.library.settled_poses import neighbours
+from list3r.memory.merging.edges import Links, links_of
+from list3r.memory.merging.moving import Tracks, without_moving
+from list3r.memory.merging.nodes import Nodes
+from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, pair_scores
+from list3r.memory.overlap.summaries import ChunkSummary, Summaries
+from list3r.memory.overlap.voxels import ChunkShapes, Ints
+from list3r.memory.records import ChunkRow, MotionTrack
+from list3r.memory.store.derived import LruCache
+from list3r.memory.store.store import Store
+from list3r.memory.store.tables.library import SettledRow
+
+_KEPT = 6000
+"""Pairs of chunks whose links are kept: a walk that stays in one room comes to the same pairs again. They take some
+3 kB each."""
+
+
+@dataclass(frozen=True)
+class DirtySet:
+    """What has to be derived anew; the whole memory is one case."""
+
+    chunks: frozenset[int]
+    """Chunks all of whose local instances are looked at again."""
+    moved: frozenset[int]
+    """Those of them that are new or lie elsewhere, so that their overlaps are measured anew."""
+    before: Mapping[int, SettledRow]
+    """Where chunks that moved lay at the last derivation."""
+    edited: frozenset[Key]
+    """Local instances named by edits since the last derivation."""
+    whole: bool
+    """Whether these are all chunks, so that what none of them names is removed."""
+
+
+@dataclass(frozen=True)
+class _LinkedPair:
+    """A pair of chunks, valid as long as neither is settled anew."""
+
+    rows: tuple[SettledRow, SettledRow]
+    stamp: int
+    scores: PairScores
+    links: Links
+
+
+class PairCache(LruCache[tuple[int, int], _LinkedPair]):
+    """Pairs of chunks by their ids."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT)
+
+
+class Region:
+    """The chunks of a memory as one derivation sees them."""
+
+    def __init__(self, store: Store, summaries: Summaries, world: World, settings: ConsolidationSettings) -> None:
+        self.store, self.world, self.settings = store, world, settings
+        self.summaries = summaries
+        self.rows = store.settled()
+        """The settled chunks by id."""
+        self._extents = np.array([r.extent for r in self.rows.values()])
+        self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+        self._carving = FreeSpaceCarving(store, settings.changes.visibility)
+        self.has_motion = store.has_moving()
+        """Whether any local instance was seen moving."""
+        self._summary: dict[int, ChunkSummary] = {}
+        self._poses: dict[int, Sim3] = {}
+        self._nodes: dict[int, Nodes] = {}
+        self._times: dict[int, dict[tuple[int, int], float]] = {}
+        self._pairs: dict[tuple[int, int], _LinkedPair] = {}
+        self._paired: set[int] = set()
+        self._linked: tuple[frozenset[tuple[int, int]], tuple[Numbering, Links]] | None = None
+
+    # ------------------------------------------------------------------ one chunk
+
+    def summary(self, chunk_id: int) -> ChunkSummary:
+        """Return the summary of a chunk."""
+        if chunk_id not in self._summary:
+            self._summary[chunk_id] = self.summaries[chunk_id]
+        return self._summary[chunk_id]
+
+    def shapes(self, chunk_id: int) -> ChunkShapes:
+        """Return the local instances of a chunk."""
+        return self.summary(chunk_id).shapes
+
+    def keys_of(self, chunk_ids: Iterable[int]) -> set[Key]:
+        """Return all local instances of some chunks."""
+        return {(k, n) for k in chunk_ids for n in self.shapes(k).local_id.tolist()}
+
+    def frames_of(self, key: Key) -> Ints:
+        """Return Frame.index of the frames in which a local instance is seen. Shape (V,)."""
+        shapes = self.shapes(key[0])
+        return shapes.frames[int(np.searchsorted(shapes.local_id, key[1]))]
+
+    def pose(self, chunk_id: int) -> Sim3:
+        """Return S_world_chunk where the chunk is settled."""
+        if chunk_id not in self._poses:
+            self._poses[chunk_id] = self._T_world_graph @ self.rows[chunk_id].S_graph_chunk
+        return self._poses[chunk_id]
+
+    def pose_before(self, row: SettledRow) -> Sim3:
+        """Return S_world_chunk of where a chunk was settled before."""
+        return self._T_world_graph @ row.S_graph_chunk
+
+    def settled_chunk(self, chunk_id: int) -> ChunkRow:
+        """Return the row of a chunk, with its settled pose."""
+        return replace(self.store.chunk(chunk_id), S_world_chunk=self.pose(chunk_id))
+
+    def times_of(self, chunk_id: int) -> dict[tuple[int, int], float]:
+        """Return seconds by (session id, Frame.index) of the frames in the span of a chunk."""
+        if chunk_id not in self._times:
+            self._times[chunk_id] = self.store.frame_times(self.store.chunk(chunk_id))
+        return self._times[chunk_id]
+
+    def near(self, chunk_id: int, here: SettledRow | None = None) -> list[int]:
+        """Return the chunks that lie near a chunk, itself among them; `here` if not where it is settled."""
+        return neighbours(self.rows, chunk_id, here, self._extents)
+
+    def components(self, keys: Iterable[Key]) -> dict[int, int]:
+        """Return the connected component of each chunk that has one of these local instances."""
+        return {k: self.rows[k].component for k in {k for k, _ in keys}}
+
+    # ------------------------------------------------------------------ pairs of chunks
+
+    def measure_overlaps(self, dirty: DirtySet) -> set[Key]:
+        """Write the overlaps of dirty chunks, measured anew where one of the two has moved; return the local instances
+        of which most lay on another one, or the other way round, by what was written before.
+        """
+        stored = self.store.overlaps(sorted(dirty.chunks))
+        near = {(min(k, n), max(k, n)) for k in dirty.chunks for n in self.near(k)}
+        kept = {p for p in near if p in stored and dirty.moved.isdisjoint(p)}
+        fresh = {p: pack_scores(self._score(*p)) for p in sorted(near - kept)}
+        self.store.drop_overlaps(stored.keys() - near)
+        self.store.put_overlaps(fresh)
+        left: set[Key] = set()
+        for u, v in stored.keys() - kept:
+            p = unpack_scores(stored[u, v])
+            most = np.maximum(p.i_on_j, p.j_on_i) >= self.settings.evidence.swallowed
+            left.update((u, int(self.shapes(u).local_id[i])) for i in p.i[most])
+            left.update((v, int(self.shapes(v).local_id[j])) for j in p.j[most])
+        return left
+
+    def _score(self, u: int, v: int) -> PairScores:
+        S_u_v = self.rows[u].S_graph_chunk.inverse() @ self.rows[v].S_graph_chunk if u != v else Sim3.identity()
+        return pair_scores(self.shapes(u), self.shapes(v), S_u_v)
+
+    def pairs_of(self, chunk_ids: Iterable[int]) -> dict[tuple[int, int], PairScores]:
+        """Return the scores of all pairs of which one is among these chunks, in order."""
+        wanted = set(chunk_ids)
+        missing = sorted(wanted - self._paired)
+        for pair in self.store.overlapping(missing) if missing else ():
+            if pair not in self._pairs:
+                self._pairs[pair] = self._linked_pair(pair)
+        self._paired |= wanted
+        return {p: self._pairs[p].scores for p in sorted(self._pairs) if p[0] in wanted or p[1] in wanted}
+
+    def _linked_pair(self, pair: tuple[int, int]) -> _LinkedPair:
+        kept = self.store.derived.of(PairCache)
+        rows, stamp = (self.rows[pair[0]], self.rows[pair[1]]), self.world.stamp
+        found = kept.get(pair)
+        if found is None or any(a is not b for a, b in zip(found.rows, rows, strict=True)) or found.stamp != stamp:
+            shapes = {k: self.shapes(k) for k in pair}
+            known = {pair: unpack_scores(self.store.overlap(pair))}
+            known = without_moving(known, shapes, self.motions(pair))
+            graph = {k: self.rows[k].S_graph_chunk for k in pair}
+            scores = across_sessions(known, shapes, graph, self._carving, self.settings.changes)[pair]
+            u, v = (self.nodes_of(k) for k in pair)
+            found = kept.put(pair, _LinkedPair(rows, stamp, scores, links_of(u, v, scores, self.settings.merging)))
+        return found
+
+    def links_of(self, pairs: Collection[tuple[int, int]]) -> tuple[Numbering, Links]:
+        """Return what argues for local instances of pairs of chunks being one instance, and their numbers."""
+        asked = frozenset(pairs)
+        if self._linked is None or self._linked[0] != asked:
+            numbering = Numbering({k: self.shapes(k) for pair in asked for k in pair})
+            start = numbering.start
+            parts = [(start[u], start[v], self._pairs[u, v].links) for u, v in sorted(asked)]
+            self._linked = asked, (numbering, Links.join(parts))
+        return self._linked[1]
+
+    def links_inside(self, chunk_ids: Collection[int]) -> dict[tuple[int, int], Links]:
+        """Return the links of the pairs of which both are among these chunks."""
+        pairs = (p for p in self.pairs_of(chunk_ids) if p[0] in chunk_ids and p[1] in chunk_ids)
+        return {p: self._pairs[p].links for p in pairs}
+
+    def nodes_of(self, chunk_id: int) -> Nodes:
+        """Return the table of a chunk's local instances that merging looks at."""
+        if chunk_id not in self._nodes:
+            self._nodes[chunk_id] = Nodes.of([self.shapes(chunk_id)], {chunk_id: self.pose(chunk_id)})
+        return self._nodes[chunk_id]
+
+    # ------------------------------------------------------------------ motion
+
+    def motions(self, chunk_ids: Iterable[int]) -> dict[Key, MotionTrack | None]:
+        """Return the local instances of chunks that move, and where they were."""
+        return {(k, n): track for k in chunk_ids for n, track in self.summary(k).motions.items()}
+
+    def tracks(self, chunk_ids: Iterable[int]) -> Tracks:
+        """Return the same with the times of the frames."""
+        chunks = sorted(set(chunk_ids))
+        return Tracks(self.motions(chunks), {f: t for k in chunks for f, t in self.times_of(k).items()})
+
+    def near_in_time(self, chunk_ids: Collection[int]) -> set[int]:
+        """Return the chunks seen so shortly before or after one of these that what moves may be the same."""
+        rows = sorted((self.store.chunk(k) for k in self.rows), key=lambda c: (c.session_id, c.first_frame))
+        at = {c.chunk_id: n for n, c in enumerate(rows)}
+        out = set(chunk_ids)
+        for k in chunk_ids:
+            for way in (rows[: at[k]][::-1], rows[at[k] + 1 :]):
+                for other in way:
+                    if other.session_id != rows[at[k]].session_id or self._gap_s(k, other.chunk_id) > self._most_gap_s:
+                        break
+                    out.add(other.chunk_id)
+        return {k for k in out if any(self.rows[k].component == self.rows[j].component for j in chunk_ids)}
+
+    @property
+    def _most_gap_s(self) -> float:
+        return self.settings.moving.most_gap_s
+
+    def _gap_s(self, a: int, b: int) -> float:
+        """Seconds between the spans of two chunks, negative where they overlap."""
+        one, two = (list(self.times_of(k).values()) or [0.0] for k in (a, b))
+        return max(min(two) - max(one), min(one) - max(two))
+
+    # ------------------------------------------------------------------ places
+
+    def span_of(self, chunk_id: int) -> Array:
+        """Return the box round the points and the cameras of a chunk, in the frame of the graph. Shape (2, 3)."""
+        extent = self.rows[chunk_id].extent
+        frames = [f.T_chunk_cam[:3, 3] for f in self.store.frames_of(self.store.chunk(chunk_id)) if f.state == "posed"]
+        if not frames:
+            return extent
+        at = self.rows[chunk_id].S_graph_chunk.apply(np.array(frames))
+        return np.stack([np.minimum(extent[0], at.min(axis=0)), np.maximum(extent[1], at.max(axis=0))])
+
+    def within_sight(self, chunk_ids: Iterable[int]) -> list[int]:
+        """Return the chunks that the frames of these can tell about, and those whose frames can tell about these."""
+        ids = sorted(self.rows)
+        boxes = np.array([self.span_of(k) for k in ids])
+        part = np.array([self.rows[k].component for k in ids])
+        most_depth = self.settings.changes.visibility.most_depth_m
+        depth = most_depth * self.world.unit / float(self._T_world_graph.scale)
+        found = np.zeros(len(ids), bool)
+        for k in chunk_ids:
+            low, high = boxes[ids.index(k)]
+            meet = np.all((boxes[:, 0] <= high + depth) & (boxes[:, 1] >= low - depth), axis=1)
+            found |= meet & (part == self.rows[k].component)
+        return [k for k, near in zip(ids, found, strict=True) if near]

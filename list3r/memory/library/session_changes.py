@@ -1,0 +1,91 @@
+"""What has changed between sessions: found when a session ends, else as the ledger of changes says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from list3r.memory.change.detection import as_events, find_changes
+from list3r.memory.change.ledger import ChangeLedger, Group
+from list3r.memory.change.records import Changes
+from list3r.memory.geometry import Array
+from list3r.memory.library.grouping import Grouping, chunks_of
+from list3r.memory.library.weighing import Weighing
+from list3r.memory.overlap.summaries import SomeSummaries
+from list3r.memory.records import MergeDecision
+
+
+class SessionChanges:
+    """The groups of dirty chunks with those that moved between sessions joined, and the states that follow."""
+
+    def __init__(self, grouping: Grouping, weighing: Weighing) -> None:
+        self._g, self._weighing = grouping, weighing
+        self._store, self._rows = grouping.region.store, grouping.region.rows
+        self._found: Changes | None = None
+        self._apart: frozenset[int] = frozenset()
+        """Components of later sessions: what those could not see there is unseen."""
+        self._compared: frozenset[Group] = frozenset()
+        """The instances that they could tell about."""
+
+    def stand(self) -> tuple[list[Group], list[MergeDecision]]:
+        """Return the groups that dirty chunks touch, joined as the ledger says, and the decisions."""
+        places, decisions = self._g.partition()
+        groups, self._g.ledger = self._g.ledger.joined(places, self._g.region.components(k for g in places for k in g))
+        return [tuple(g) for g in groups], decisions
+
+    def find(self) -> tuple[list[Group], list[MergeDecision]]:
+        """Find what has changed, among what dirty chunks touch and all that later sessions can tell about; return the
+        groups and the decisions.
+        """
+        region = self._g.region
+        rows = {k: self._store.chunk(k) for k in self._rows}
+        first = min(c.session_id for c in rows.values())
+        later = [k for k, c in rows.items() if c.session_id > first]
+        if not later:
+            self._g.ledger = ChangeLedger(first)
+            return self.stand()
+        self._apart = frozenset(rows[k].component for k in later)
+        seeds = region.keys_of(region.within_sight(later)) | self._g.ledger.keys()
+        self._g.ledger = ChangeLedger(max(rows[k].session_id for k in later))
+        places, decisions = self._g.partition(seeds)
+        self._g.adopt(places)
+        weighed = self._weighing.weigh_only(places)
+        names = chunks_of(places) | {min(k for k, c in rows.items() if c.component == region.world.first)}
+        self._found = find_changes(
+            self._store,
+            places,
+            [weighed.shown[g] for g in places],
+            frozenset(g[0] for g in places if self._g.mover(g) is not None),
+            [region.settled_chunk(k) for k in sorted(names)],
+            SomeSummaries(region.summaries, names, region.world.unit),
+            region.settings.changes,
+        )
+        self._g.ledger = ChangeLedger.of(self._found, places, self._g.ledger.session)
+        groups = [tuple(g) for g in self._found.groups]
+        self._compared = frozenset(groups)
+        return groups, decisions + self._found.decisions
+
+    def state(self, before: str | None, group: Group) -> str:
+        """Return the state of a group, which was in the state `before`."""
+        if self._found is None:
+            return self._g.ledger.state(before, group, {k: self._store.chunk(k) for k in {k for k, _ in group}})
+        if group[0] in self._found.states:
+            return self._found.states[group[0]]
+        unseen = group not in self._compared and self._rows[group[0][0]].component in self._apart
+        return "unseen" if unseen else "present"
+
+    def write(self, groups: Sequence[Group]) -> tuple[dict[int, str], dict[int, Array]]:
+        """Write events, and the states of instances that are not written anew; return these states and the boxes of
+        the instances that came or went.
+        """
+        if self._found is None:
+            return {}, {}
+        owner = self._store.observed_as([g[0] for g in groups])
+        self._store.replace_events(as_events(self._found, owner))
+        states = {n: self._found.states.get(key, "present") for key, n in owner.items()}
+        now = self._store.states()
+        for n, (_, component) in now.items():
+            states.setdefault(n, "unseen" if component in self._apart else "present")
+        fresh = {n: states[n] for n, (was, _) in now.items() if states[n] != was}
+        self._store.set_states(fresh)
+        turned = [n for n, s in fresh.items() if "removed" in (s, now[n][0])]
+        return fresh, {i.id: i.aabb for i in self._store.instances_of(sorted(turned))}
