@@ -78,6 +78,8 @@ class SourceInfo:
     """What is missing and which option supplies it, one sentence each."""
     image_size: tuple[int, int] | None = None
     """Height and width of the frames handed out, px."""
+    poses_metric: bool = True
+    """Whether given poses are in metres; a model of COLMAP has a unit of its own."""
     camera_guess: Camera | None = None
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 

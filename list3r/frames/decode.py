@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.stored import CodedArray, Stored
 from list3r.memory.errors import FrameError
 
 
-def read_color(path: Path, bits: int = 16) -> NDArray[np.uint8]:
-    """An RGB image, turned upright by its EXIF tag. Shape (H, W, 3). Raises `FrameError`.
+def read_color(path: Stored, bits: int = 16, *, upright: bool = True) -> NDArray[np.uint8]:
+    """An RGB image, turned as its EXIF tag says if `upright`. Shape (H, W, 3). Raises `FrameError`.
 
     Of a picture with 16 bits a channel the lower `bits` are in use, see `used_bits`.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    turned = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | turned)
     if image.dtype == np.uint16:
         image = np.minimum(image >> (bits - 8), 255).astype(np.uint8)
     elif image.dtype != np.uint8:
-        image = _decode(path, cv2.IMREAD_COLOR)
+        image = _decode(path, cv2.IMREAD_COLOR | turned)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
-def used_bits(paths: Sequence[Path]) -> int:
+def used_bits(paths: Sequence[Stored]) -> int:
     """How many of their 16 bits pictures of one camera use: 10, 12, 14 or 16; 16 for pictures of 8 bits.
 
     Cameras of 10 to 14 bits write them into 16, and are nearly black where all 16 are looked at.
@@ -43,7 +45,7 @@ def used_bits(paths: Sequence[Path]) -> int:
     return next(bits for bits in (10, 12, 14, 16) if brightest < 2**bits) if brightest else 16
 
 
-def read_gray(path: Path, reduction: int) -> NDArray[np.uint8]:
+def read_gray(path: Stored, reduction: int) -> NDArray[np.uint8]:
     """A grey image, each side reduced by 1, 2, 4 or 8: a JPEG takes less to decode then. Raises `FrameError`."""
     flags = {
         1: cv2.IMREAD_GRAYSCALE,
@@ -54,8 +56,10 @@ def read_gray(path: Path, reduction: int) -> NDArray[np.uint8]:
     return np.asarray(_decode(path, flags[reduction]), np.uint8)
 
 
-def read_raw_depth(path: Path) -> NDArray[Any]:
-    """Depth as stored, any number type. Shape (H, W). Raises `FrameError`."""
+def read_raw_depth(path: Stored | CodedArray) -> NDArray[Any]:
+    """Depth or its confidence as stored, any number type. Shape (H, W). Raises `FrameError`."""
+    if isinstance(path, CodedArray):
+        return path.decode()
     if path.suffix.lower() == ".npy":
         raw = _load_npy(path)
     else:
@@ -84,7 +88,7 @@ def clean_depth(raw: NDArray[Any], scale: float, max_depth_m: float | None) -> N
     return depth
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
+def _decode(path: Stored, flags: int) -> NDArray[Any]:
     """Decode a file with OpenCV, and refuse one whose end is missing, which OpenCV would fill with grey."""
     try:
         data = path.read_bytes()
@@ -121,9 +125,9 @@ def _scan_start(data: bytes) -> int:
     return at
 
 
-def _load_npy(path: Path) -> NDArray[Any]:
+def _load_npy(path: Stored) -> NDArray[Any]:
     try:
-        array = np.load(path, allow_pickle=False)
+        array = np.load(BytesIO(path.read_bytes()), allow_pickle=False)
     except FileNotFoundError:
         raise FrameError(f"{path.name} is missing") from None
     except (OSError, ValueError, EOFError) as error:

@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,7 @@ from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numb
 from list3r.frames.options import SourceOptions
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics, resized
 from list3r.frames.selection import select, sharpness
+from list3r.frames.stored import stored_size
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
@@ -93,7 +95,7 @@ class FolderSource:
         if file.depth is None:
             raise FrameError(f"{file.color.name} has no depth image")
         raw = read_raw_depth(file.depth)
-        return read_color(file.color, self._bits), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
+        return self._color(file), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
     def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
         """The colour image in grey as stored, each side reduced by 1, 2, 4 or 8; None where it cannot be decoded."""
@@ -118,13 +120,30 @@ class FolderSource:
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]
-        color = self._rig.color(read_color(file.color, self._bits))
+        color = self._rig.color(self._color(file))
         depth = None
         if self._has_depth:
             if file.depth is None:
                 raise FrameError(f"{file.color.name} has no depth image")
-            depth = self._rig.depth(read_raw_depth(file.depth))
+            depth = self._rig.depth(self._sure(read_raw_depth(file.depth), file))
+            if file.mask is not None:
+                shown = cv2.resize(read_gray(file.mask, 1), depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+                depth = np.where(shown > 0, depth, np.float32(0.0))
         return Frame(number, self._time_s(number, file), color, depth, self._pose(file))
+
+    def _color(self, file: FrameFile) -> NDArray[np.uint8]:
+        """The picture as stored, upright where that is asked for. Shape (H, W, 3)."""
+        return read_color(file.color, self._bits, upright=self._layout.upright_tags)
+
+    def _sure(self, raw: NDArray[Any], file: FrameFile) -> NDArray[Any]:
+        """Depth as stored, 0 where the sensor is not sure enough of it."""
+        least = self._layout.least_confidence
+        if least is None or file.confidence is None:
+            return raw
+        confidence = read_raw_depth(file.confidence)
+        if confidence.shape != raw.shape:
+            confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        return np.where(confidence >= least, raw, np.zeros((), raw.dtype))
 
     def _time_s(self, number: int, file: FrameFile) -> float:
         return file.time_s if self._clock and file.time_s is not None else number / self._fps
@@ -148,7 +167,7 @@ class FolderSource:
         reason = ""
         for file in _usual_size_first(paths):
             try:
-                color = read_color(file.color)
+                color = read_color(file.color, upright=self._layout.upright_tags)
                 self._first_picture = file.color
                 self._bits = used_bits([f.color for f in paths])
                 if not self._has_depth:
@@ -199,11 +218,13 @@ class FolderSource:
             missing=tuple(missing),
             image_size=rig.color_size,
             camera_guess=guess,
+            poses_metric=layout.poses_metric,
         )
 
     def _camera_guess(self) -> Camera | None:
         """What the first picture's EXIF says of a camera that is unknown."""
-        focal = exif_focal(self._first_picture) if self._rig.camera is None else None
+        picture = self._first_picture
+        focal = exif_focal(picture) if self._rig.camera is None and isinstance(picture, Path) else None
         return None if focal is None else centred_camera(focal, self._rig)
 
 
@@ -242,12 +263,9 @@ def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
 
 def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:
     above, out = f"{root}{os.sep}", []
-    for path in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
-        try:
-            size = path.stat().st_size
-        except OSError:
-            size = -1
-        out.append((str(path).removeprefix(above).replace(os.sep, "/"), size))
+    for stored in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
+        name = str(stored).removeprefix(above).replace(os.sep, "/") if isinstance(stored, Path) else stored.name
+        out.append((name, stored_size(stored)))
     return out
 
 

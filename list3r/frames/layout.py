@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
+from list3r.frames.stored import CodedArray, Stored
 from list3r.memory.errors import OptionError, SourceError
 
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
@@ -21,14 +22,18 @@ IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pp
 class FrameFile:
     """The files of one frame."""
 
-    color: Path
-    depth: Path | None = None
+    color: Stored
+    depth: Stored | CodedArray | None = None
     pose: Path | None = None
     """A text file with a 4x4 pose."""
     T_source_camera: NDArray[np.float64] | None = None
     """A pose that was read with the listing, of the camera that `Layout.poses_of` names. Shape (4, 4)."""
     time_s: float | None = None
     """Seconds of the source's clock, if it has one."""
+    confidence: Stored | CodedArray | None = None
+    """How sure the sensor is of each depth pixel, as whole numbers, see `Layout.least_confidence`."""
+    mask: Stored | None = None
+    """Where it is 0 the picture shows nothing that counts: depth is unknown there."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,10 @@ class Optics:
     """Depth to colour camera, metres; None where depth lies on the colour pixels. Shape (4, 4)."""
     depth_scale: float | None = None
     """Stored units per metre."""
+    intrinsics_size: tuple[int, int] | None = None
+    """(height, width) of the pictures that `intrinsics` are stated for; None for the pictures as stored."""
+    depth_intrinsics_size: tuple[int, int] | None = None
+    """(height, width) of the images that `depth_intrinsics` are stated for; None for depth as stored."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +69,12 @@ class FolderLayout:
     """Colour camera to use when the user says that depth is registered after all, px."""
     notes: tuple[str, ...] = field(default=())
     missing: tuple[str, ...] = field(default=())
+    least_confidence: int | None = None
+    """Depth whose confidence is stored as less than this is unknown; None where there is no confidence."""
+    poses_metric: bool = True
+    """Whether given poses are in metres."""
+    upright_tags: bool = True
+    """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -118,6 +133,14 @@ def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
         return check_intrinsics(values[:4]), check_distortion(values[4:]) if values[4:] else ()
     except OptionError as error:
         raise SourceError(f"{path}: {error}") from None
+
+
+def inside(root: Path, name: str, stated_in: Path) -> Path:
+    """The path of a name within a folder. Raises `SourceError` for one that leads out of it."""
+    path = root / name
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise SourceError(f"{stated_in} names {name}, which lies outside of {root}; copy it there or mend the name")
+    return path
 
 
 def read_json(path: Path) -> object:

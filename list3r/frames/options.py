@@ -14,7 +14,22 @@ from scipy.spatial.transform import Rotation
 
 from list3r.memory.errors import OptionError
 
-KINDS = ("auto", "7scenes", "tum", "replica", "images", "video")
+KINDS = (
+    "auto",
+    "record3d",
+    "stray",
+    "polycam",
+    "arkitscenes",
+    "scannet",
+    "nerfstudio",
+    "7scenes",
+    "tum",
+    "replica",
+    "colmap",
+    "images",
+    "video",
+)
+"""Kinds of sources; docs/sources.md says what each is made of."""
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
@@ -27,7 +42,7 @@ class SourceOptions:
     """All that can be said about a source; what is left out is found in the source or known for its layout."""
 
     kind: str = "auto"
-    """auto, 7scenes, tum, replica, images, video."""
+    """One of `KINDS`."""
     every: int = 1
     """Hand out every n-th frame."""
     start: int | None = None

@@ -10,24 +10,47 @@ from list3r.frames.base import Camera, FrameSource, SourceInfo
 from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.options import SourceOptions
-from list3r.frames.readers import images, replica, seven_scenes, tum
+from list3r.frames.readers import (
+    arkitscenes,
+    colmap,
+    images,
+    nerfstudio,
+    polycam,
+    record3d,
+    replica,
+    scannet,
+    seven_scenes,
+    stray,
+    tum,
+)
 from list3r.memory.errors import SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
 
 FOLDERS: dict[str, Callable[[Path, SourceOptions], FolderLayout | None]] = {
+    "record3d": record3d.find,
+    "polycam": polycam.find,
+    "arkitscenes": arkitscenes.find,
+    "scannet": scannet.find,
+    "nerfstudio": nerfstudio.find,
     "7scenes": seven_scenes.find,
     "tum": tum.find,
     "replica": replica.find,
+    "colmap": colmap.find,
     "images": images.find,
 }
 """Readers of folders, the most particular first: the layout of a folder, or None for one of another kind."""
+FILES: dict[str, tuple[str, Callable[[Path, SourceOptions], FolderLayout]]] = {
+    ".r3d": ("record3d", record3d.find_file),
+    ".sens": ("scannet", scannet.find_file),
+}
+"""Readers of files that hold many pictures, by their ending: the kind, and what lists the frames."""
 
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 _OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 _WANTED = (
-    "give a video file, or a folder in 7-Scenes (frame-000000.color.png), TUM RGB-D (rgb.txt) or Replica "
-    "(results/frame000000.jpg) layout, or of images"
+    "give a video file, a recording of Record3D (.r3d), Stray Scanner, Polycam or ScanNet (.sens), a folder in "
+    "ARKitScenes, nerfstudio (transforms.json), COLMAP, 7-Scenes, TUM RGB-D or Replica layout, or of images"
 )
 
 
@@ -69,10 +92,13 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
         raise SourceError(f"{root} is an empty folder; {_WANTED}")
     if options.kind == "video":
         raise SourceError(f"{root} is a folder, not a video; name the video file in it or leave out the kind")
+    if options.kind in ("auto", "stray") and stray.is_recording(root):
+        return stray.StraySource(root, options)
     for kind, find in FOLDERS.items():
         if options.kind in ("auto", kind):
             layout = find(root, options)
             if layout is not None and layout.files:
+                _check_nothing_ignored(root, kind, options)
                 return FolderSource(root, layout, options)
     videos = sorted(p.name for p in root.iterdir() if p.suffix.lower() in _VIDEO_ENDINGS)
     if videos:
@@ -88,6 +114,22 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     raise SourceError(f"{root} has {said}; {_WANTED}")
 
 
+def _check_nothing_ignored(root: Path, kind: str, options: SourceOptions) -> None:
+    """Raise `SourceError` where a kind that was asked for would ignore depth or poses that another kind reads."""
+    if options.kind == "auto":
+        return
+    if kind in ("images", "colmap") and stray.is_recording(root):
+        raise SourceError(
+            f"{root} is a recording of Stray Scanner with depth and poses; leave out --kind, or use stray"
+        )
+    for other, find in FOLDERS.items():
+        if other in (kind, "images", "colmap") or kind not in ("images", "colmap"):
+            continue
+        found = find(root, options)
+        if found is not None and found.files:
+            raise SourceError(f"{root} is of the kind {other}, and {kind} would ignore its depth or poses; use {other}")
+
+
 def _pictures_to_convert(root: Path) -> str | None:
     """A picture in the folder of a kind that cannot be read, None where there is none."""
     return next((p.name for p in sorted(root.iterdir()) if p.suffix.lower() in _OTHER_PICTURES), None)
@@ -96,12 +138,20 @@ def _pictures_to_convert(root: Path) -> str | None:
 def _open_file(path: Path, options: SourceOptions) -> FrameSource:
     if not os.access(path, os.R_OK):
         raise SourceError(f"{path} may not be read; check its permissions")
-    if options.kind not in ("auto", "video"):
+    kind, find = FILES.get(path.suffix.lower(), ("video", None))
+    if options.kind not in ("auto", kind):
         raise SourceError(f"{path} is a file, but the {options.kind} layout is a folder; name the folder")
     if path.suffix.lower() in IMAGE_ENDINGS:
         raise SourceError(f"{path} is one image; name the folder of images or a video")
     if not path.is_file() or path.stat().st_size == 0:
         raise SourceError(f"{path} is empty or no ordinary file; {_WANTED}")
+    if find is not None:
+        return FolderSource(path, find(path, options), options)
+    if options.kind == "auto" and stray.is_recording(path.parent) and path.name == "rgb.mp4":
+        raise SourceError(
+            f"{path} is the video of a Stray Scanner recording, whose depth and poses would be lost; give the folder "
+            f"{path.parent}, or say --kind video to take its colour alone"
+        )
     from list3r.frames.readers.video import VideoSource
 
     return VideoSource(path, options)

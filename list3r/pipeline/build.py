@@ -116,7 +116,9 @@ def _session(store: Store, job: Job) -> int:
 def _scale_kind(info: SourceInfo, settings: BuildSettings) -> str:
     """Whether a unit is a metre; sensor depth says nothing where the model does not look at it."""
     source = _scale_source(info, settings)
-    return {"none": "relative", "given poses": "metric"}.get(source, info.scale_kind)
+    if source == "given poses":
+        return "metric" if info.poses_metric else "relative"
+    return "relative" if source == "none" else info.scale_kind
 
 
 def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 SourceArgument = Annotated[
     str, typer.Argument(metavar="SOURCE", help="A video file, or a folder of frames.", show_default=False)
 ]
-Kind = Annotated[str, typer.Option("--kind", help="auto, 7scenes, tum, replica, images or video.")]
+Kind = Annotated[str, typer.Option("--kind", help="What the source is: auto, or one of docs/sources.md.")]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Take every N-th frame.")]
 Frames = Annotated[
     str | None,

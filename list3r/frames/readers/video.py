@@ -64,6 +64,19 @@ class VideoSource:
             else:
                 yield Frame(number, self._time_s(number), color, None, None)
 
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """(height, width) of the pictures as stored, upright."""
+        return self._rig.stored_size
+
+    def number(self, position: int) -> int:
+        """The number of the first frame of a position's window."""
+        return int(self._chosen.starts[position])
+
+    def time_s(self, number: int) -> float:
+        """Seconds of a frame."""
+        return self._time_s(number)
+
     def position(self, index: int) -> int:
         """Where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)

@@ -33,6 +33,10 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
         "depth_scale": options.depth_scale,
     }
     optics = replace(optics, **{name: value for name, value in given.items() if value is not None})
+    if options.intrinsics is not None:
+        optics = replace(optics, intrinsics_size=None)
+    if options.depth_intrinsics is not None:
+        optics = replace(optics, depth_intrinsics_size=None)
     if optics.T_color_depth is not None and optics.depth_intrinsics is None:
         optics = replace(optics, depth_intrinsics=optics.intrinsics)
         notes.append("the depth camera is given the colour camera's intrinsics; --depth-intrinsics says otherwise")
@@ -112,7 +116,8 @@ def build_rig(
         raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
-    lens = resized(_camera(optics.intrinsics, stored_size, "intrinsics", optics.distortion), color_size)
+    stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
+    lens = resized(_of_size(stated, stored_size, "the colour pictures"), color_size)
     camera = lens.pinhole() if lens else None
     undistortion = Undistortion(lens) if lens and lens.distortion else None
     registration = None
@@ -136,10 +141,29 @@ def _registration(
         return None
     if camera is None:
         raise SourceError("depth has a camera of its own but the colour camera has none; give --intrinsics fx,fy,cx,cy")
-    depth_camera = _camera(optics.depth_intrinsics, depth_size, "depth intrinsics", ())
+    said = _camera(optics.depth_intrinsics, optics.depth_intrinsics_size or depth_size, "depth intrinsics", ())
+    depth_camera = _of_size(said, depth_size, "the depth images")
     assert depth_camera is not None and optics.T_color_depth is not None
     same = replace(camera, distortion=()) == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
     return None if same else DepthReprojection(depth_camera, camera, optics.T_color_depth)
+
+
+def _of_size(camera: Camera | None, size: tuple[int, int], what: str) -> Camera | None:
+    """The camera for images of another size and the same shape. Raises `SourceError` for another shape."""
+    if camera is None or (camera.height, camera.width) == size:
+        return camera
+    if abs(camera.width * size[0] - camera.height * size[1]) > _MOST_SHEAR * camera.width * size[0]:
+        stated = f"{camera.width}x{camera.height}"
+        turned = "; they are turned" if (camera.height > camera.width) != (size[0] > size[1]) else ""
+        raise SourceError(
+            f"{what} are {_size(size)}, but the source states its camera for {stated}{turned}; give --intrinsics "
+            "fx,fy,cx,cy for the pictures as they are"
+        )
+    return resized(camera, size)
+
+
+_MOST_SHEAR = 0.02
+"""Most that two sizes of one camera's pictures differ in shape: 256 x 192 and 1920 x 1440 are alike, 640 x 360 not."""
 
 
 def _camera(

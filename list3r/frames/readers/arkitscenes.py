@@ -1,0 +1,86 @@
+"""A scan of ARKitScenes: `lowres_wide/`, `lowres_depth/`, `lowres_wide_intrinsics/*.pincam`, `lowres_wide.traj`.
+
+Layout as documented in apple/ARKitScenes (DATA.md): depth in millimetres, one `width height fx fy cx cy` a picture, and
+a trajectory of `time, rotation vector, translation` **from the world to the camera**. The world has z up.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_numbers
+from list3r.frames.options import SourceOptions, check_intrinsics
+from list3r.frames.readers.tum import poses_at
+from list3r.memory.errors import OptionError, SourceError
+
+LEAST_CONFIDENCE = 1
+"""Depth of confidence 0 is unknown (stored 0, 1, 2)."""
+
+
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
+    """The layout, or None without `lowres_wide`. Raises `SourceError` for files that cannot be read."""
+    if not (root / "lowres_wide").is_dir():
+        return None
+    colors = sorted((root / "lowres_wide").glob("*.png"), key=_time_s)
+    times_s = np.array([_time_s(p) for p in colors])
+    if not len(colors) or np.isnan(times_s).any():
+        raise SourceError(f"{root / 'lowres_wide'} holds no pictures named SCAN_SECONDS.png; is the copy complete?")
+    files = tuple(
+        FrameFile(
+            color,
+            _there(root / "lowres_depth" / color.name),
+            T_source_camera=pose,
+            time_s=float(time),
+            confidence=_there(root / "confidence" / color.name),
+        )
+        for color, time, pose in zip(colors, times_s, _poses(root / "lowres_wide.traj", times_s), strict=True)
+    )
+    stated = [_pincam(path) for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))]
+    if options.intrinsics is None and not stated:
+        raise SourceError(f"{root} has no lowres_wide_intrinsics/*.pincam; give --intrinsics fx,fy,cx,cy")
+    intrinsics, size = options.intrinsics, None
+    if intrinsics is None:
+        width, height, *camera = np.median(np.array(stated), axis=0).tolist()
+        intrinsics, size = check_intrinsics(camera), (round(height), round(width))
+    optics = Optics(intrinsics, depth_scale=1000.0, intrinsics_size=size)
+    notes = ("cameras of lowres_wide_intrinsics, poses of lowres_wide.traj",)
+    return FolderLayout(
+        "arkitscenes", files, optics, "color", intrinsics, notes, (), LEAST_CONFIDENCE, upright_tags=False
+    )
+
+
+def _time_s(path: Path) -> float:
+    try:
+        return float(path.stem.rsplit("_", 1)[-1])
+    except ValueError:
+        return float("nan")
+
+
+def _there(path: Path) -> Path | None:
+    return path if path.is_file() else None
+
+
+def _pincam(path: Path) -> list[float]:
+    rows = read_numbers(path)
+    if not rows or len(rows[0]) != 6:
+        raise SourceError(f"{path} is not `width height fx fy cx cy`; mend or remove it")
+    try:
+        check_intrinsics(rows[0][2:])
+    except OptionError as error:
+        raise SourceError(f"{path}: {error}") from None
+    return rows[0]
+
+
+def _poses(path: Path, times_s: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
+    """Poses at the pictures' times, interpolated; the file has them from the world to the camera."""
+    rows = [r for r in read_numbers(path) if len(r) == 7 and np.isfinite(r).all()] if path.is_file() else []
+    if not rows:
+        return [None] * len(times_s)
+    table = np.array(sorted(rows))
+    rotation = Rotation.from_rotvec(table[:, 1:4]).inv()
+    centers = -rotation.apply(table[:, 4:7])
+    return poses_at(times_s, table[:, 0], np.concatenate([centers, rotation.as_quat()], axis=1))

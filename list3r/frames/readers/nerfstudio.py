@@ -1,0 +1,130 @@
+"""nerfstudio's `transforms.json`: pictures, cameras and poses, with depth and masks where it names them.
+
+Conventions as in nerfstudio's page "data conventions": poses are camera-to-world with OpenGL's axes, the world has z
+up, pixel centres lie at whole numbers, depth is in millimetres unless `depth_unit_scale_factor` says otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from list3r.frames.axes import OPENGL_TO_OPENCV
+from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, natural_key, pose_matrix, read_json
+from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
+from list3r.memory.errors import OptionError, SourceError
+
+_PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "")
+_VARIES = 0.01
+"""Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
+
+
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
+    """The layout, or None without `transforms.json`. Raises `SourceError` for one that cannot be used."""
+    path = root / "transforms.json"
+    if not path.is_file():
+        return None
+    content = read_json(path)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(content, dict) or not isinstance(frames, list) or not frames:
+        raise SourceError(f"{path} names no frames; is it nerfstudio's?")
+    rows = sorted((_row(path, number, frame) for number, frame in enumerate(frames)), key=_order)
+    model = str(rows[0].get("camera_model", content.get("camera_model", ""))).upper()
+    if model not in _PINHOLE:
+        raise SourceError(f"{path} states a {model} camera; undistort the pictures first, for instance with COLMAP")
+    files = tuple(_file(root, path, row) for row in rows)
+    intrinsics, distortion, size, spread = _camera(path, content, rows, options)
+    notes = ["poses and cameras of transforms.json"]
+    if spread > _VARIES:
+        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: their median serves all of them")
+    units = _units_per_metre(path, content)
+    optics = Optics(intrinsics, distortion, depth_scale=units, intrinsics_size=size)
+    if intrinsics is not None and not distortion:  # depth of another size has the same camera
+        optics = Optics(intrinsics, (), intrinsics, np.eye(4), units, size, size)
+    return FolderLayout(
+        "nerfstudio",
+        files,
+        optics,
+        "color",
+        intrinsics,
+        tuple(notes),
+        upright_tags=False,
+        poses_metric=_metric(content, files),
+    )
+
+
+def _row(path: Path, number: int, frame: object) -> Mapping[str, Any]:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise SourceError(f"{path}: frame {number} names no file_path; mend or remove it")
+    return frame
+
+
+def _order(row: Mapping[str, Any]) -> list[tuple[int, int, str]]:
+    return natural_key(row["file_path"])
+
+
+def _metric(content: Mapping[str, Any], files: Sequence[FrameFile]) -> bool:
+    """Whether poses are in metres: recorders with depth write them so, COLMAP's have a unit of their own."""
+    return any(f.depth for f in files) or bool(content.get("is_metric"))
+
+
+def _units_per_metre(path: Path, content: Mapping[str, Any]) -> float:
+    unit_m = content.get("depth_unit_scale_factor", 0.001)
+    if not isinstance(unit_m, int | float) or not unit_m > 0:
+        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is no positive number of metres; mend it")
+    return 1.0 / unit_m
+
+
+def _file(root: Path, path: Path, row: Mapping[str, Any]) -> FrameFile:
+    """The files of a frame. Raises `SourceError` for names that lead out of the folder."""
+    color = inside(root, row["file_path"], path)
+    if not color.suffix:
+        color = next((c for c in (color.with_suffix(s) for s in (".png", ".jpg", ".jpeg")) if c.is_file()), color)
+    depth, mask = (row.get(name) for name in ("depth_file_path", "mask_path"))
+    T_world_opengl = pose_matrix(_numbers(row.get("transform_matrix")))
+    return FrameFile(
+        color,
+        inside(root, depth, path) if isinstance(depth, str) and depth else None,
+        T_source_camera=None if T_world_opengl is None else T_world_opengl @ OPENGL_TO_OPENCV,
+        mask=inside(root, mask, path) if isinstance(mask, str) and mask else None,
+    )
+
+
+def _numbers(matrix: object) -> list[float]:
+    """The numbers of nested lists, none where they are not numbers."""
+    try:
+        return [float(v) for v in np.asarray(matrix, dtype=np.float64).ravel()]
+    except (TypeError, ValueError):
+        return []
+
+
+def _camera(
+    path: Path, content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], options: SourceOptions
+) -> tuple[Intrinsics | None, tuple[float, ...], tuple[int, int] | None, float]:
+    """The camera, for which (height, width) it is stated, and by what share focal lengths of frames differ."""
+    known = [v for v in (_stated({**content, **row}) for row in rows) if v is not None]
+    if options.intrinsics is not None or not known:
+        return options.intrinsics, options.distortion or (), None, 0.0
+    fx, fy, cx, cy, width, height, *lens = np.median(np.array(known), axis=0).tolist()
+    try:
+        intrinsics, distortion = check_intrinsics([fx, fy, cx, cy]), check_distortion(lens)
+    except OptionError as error:
+        raise SourceError(f"{path}: {error}") from None
+    size = (round(height), round(width)) if width >= 1 and height >= 1 else None
+    return intrinsics, distortion, size, float(np.ptp([v[0] for v in known]) / fx)
+
+
+def _stated(values: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """fx, fy, cx, cy, width, height, k1, k2, p1, p2, k3 of a frame, None where its focal length is not stated."""
+    try:
+        width, height = float(values.get("w", 0)), float(values.get("h", 0))
+        fx = float(values["fl_x"]) if "fl_x" in values else 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
+        fy = float(values.get("fl_y", fx))
+        cx, cy = float(values.get("cx", (width - 1) / 2)), float(values.get("cy", (height - 1) / 2))
+        lens = [float(values.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
+    except (KeyError, TypeError, ValueError):
+        return None
+    return (fx, fy, cx, cy, width, height, *lens)

@@ -1,0 +1,165 @@
+"""Pictures and depth that are no files of their own: members of a zip, parts of a file, coded depth."""
+
+from __future__ import annotations
+
+import errno
+import zipfile
+import zlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.errors import FrameError, OptionError
+
+MOST_BYTES = 256 * 2**20
+"""Largest member that is unpacked; a depth image of 30 megapixels is half of it."""
+
+
+@dataclass(frozen=True)
+class ZipMember:
+    """A member of a zip archive; it has what is used of a `Path`."""
+
+    archive: Path
+    member: str
+
+    @property
+    def name(self) -> str:
+        """The last part of the member's name."""
+        return self.member.rsplit("/", 1)[-1]
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the name, with its dot."""
+        return Path(self.name).suffix
+
+    @property
+    def size(self) -> int:
+        """Unpacked bytes; -1 where there is no such member."""
+        try:
+            return _archive(self.archive).getinfo(self.member).file_size
+        except KeyError:
+            return -1
+
+    def is_file(self) -> bool:
+        """Whether the archive has the member."""
+        return self.size >= 0
+
+    def read_bytes(self) -> bytes:
+        """Raises `OSError` for a member that is missing, larger than `MOST_BYTES` or damaged."""
+        if self.size < 0:
+            raise OSError(errno.ENOENT, "is missing")
+        if self.size > MOST_BYTES:
+            raise OSError(errno.EFBIG, f"unpacks to {self.size} bytes")
+        try:
+            return _archive(self.archive).read(self.member)
+        except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError) as error:
+            raise OSError(errno.EIO, f"the archive is damaged: {error}") from None
+
+
+@lru_cache(maxsize=4)
+def _archive(path: Path) -> zipfile.ZipFile:
+    """The archive, its list read once in a process."""
+    return zipfile.ZipFile(path)
+
+
+@dataclass(frozen=True)
+class FileSlice:
+    """Some bytes of a file; it has what is used of a `Path`."""
+
+    path: Path
+    start: int
+    size: int
+    name: str
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the name, with its dot."""
+        return Path(self.name).suffix
+
+    def is_file(self) -> bool:
+        """Whether the file reaches as far."""
+        return self.path.is_file() and self.path.stat().st_size >= self.start + self.size
+
+    def read_bytes(self) -> bytes:
+        """Raises `OSError` where the file ends before."""
+        with self.path.open("rb") as file:
+            file.seek(self.start)
+            data = file.read(min(self.size, MOST_BYTES))
+        if len(data) < self.size:
+            raise OSError(errno.EIO, "the file ends before it")
+        return data
+
+
+Stored = Path | ZipMember | FileSlice
+
+
+@dataclass(frozen=True)
+class CodedArray:
+    """Depth or confidence as bare numbers, compressed."""
+
+    data: Stored
+    codec: Literal["zlib", "lzfse"]
+    dtype: str
+    """Little-endian, as NumPy writes it: "<u2", "<f4", "|u1"."""
+    shape: tuple[int, int]
+
+    @property
+    def name(self) -> str:
+        """The name of what is stored."""
+        return self.data.name
+
+    def is_file(self) -> bool:
+        """Whether it is there."""
+        return self.data.is_file()
+
+    def decode(self) -> NDArray[Any]:
+        """The numbers. Shape `shape`. Raises `FrameError`; `OptionError` without the extra."""
+        try:
+            data = self.data.read_bytes()
+        except OSError as error:
+            raise FrameError(f"{self.name} cannot be read ({error.strerror})") from None
+        count = self.shape[0] * self.shape[1] * np.dtype(self.dtype).itemsize
+        if len(data) > 2 * count + 1024:
+            raise FrameError(
+                f"{self.name} has {len(data)} bytes, more than {self.shape[1]}x{self.shape[0]} numbers take"
+            )
+        raw = _inflated(data, count) if self.codec == "zlib" else _lzfse(data)
+        if raw is None or len(raw) != count:
+            had = "damaged" if raw is None else f"{len(raw)} bytes"
+            raise FrameError(f"{self.name} is {had}; {self.shape[1]}x{self.shape[0]} numbers are {count} bytes")
+        return np.frombuffer(raw, self.dtype).reshape(self.shape)
+
+
+def _inflated(data: bytes, count: int) -> bytes | None:
+    """At most one byte more than what is expected, so that a bomb does no harm; None where it is damaged."""
+    try:
+        return zlib.decompressobj().decompress(data, count + 1)
+    except zlib.error:
+        return None
+
+
+def _lzfse(data: bytes) -> bytes | None:
+    try:
+        import lzfse
+    except ImportError:
+        raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
+    try:
+        return bytes(lzfse.decompress(data))
+    except (lzfse.error, MemoryError):
+        return None
+
+
+def stored_size(stored: Stored | CodedArray) -> int:
+    """Bytes of what is stored, -1 where it is missing."""
+    if isinstance(stored, CodedArray):
+        return stored_size(stored.data)
+    if not isinstance(stored, Path):
+        return stored.size
+    try:
+        return stored.stat().st_size
+    except OSError:
+        return -1

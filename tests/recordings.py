@@ -1,0 +1,245 @@
+"""Writers of recordings as phones and tools make them, of one small scene whose geometry is known."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+WIDTH, HEIGHT, DEPTH_WIDTH, DEPTH_HEIGHT = 160, 120, 64, 48
+K = (140.0, 140.0, 79.5, 59.5)
+PLANE = np.array([0.1, -0.2, 0.97, 2.0])
+"""Normal and distance of the wall that all frames see, z-up world, metres."""
+COUNT = 4
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame of the scene."""
+
+    T_world_cam: Array
+    """OpenCV axes, z-up world. Shape (4, 4)."""
+    color: NDArray[np.uint8]
+    """RGB. Shape (HEIGHT, WIDTH, 3)."""
+    depth: NDArray[np.float32]
+    """Metres at DEPTH_WIDTH x DEPTH_HEIGHT. Shape (DEPTH_HEIGHT, DEPTH_WIDTH)."""
+
+
+def shots() -> list[Shot]:
+    """Frames of a tilted wall from cameras that turn and move."""
+    rng = np.random.default_rng(5)
+    out = []
+    for k in range(COUNT):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", [10 * k - 15, 8 * k - 12, 5 * k], degrees=True).as_matrix()
+        T[:3, 3] = 0.1 * k, -0.05 * k, 0.03 * k
+        color = cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), (WIDTH, HEIGHT))
+        out.append(Shot(T, np.asarray(color, np.uint8), plane_depth(T, K, (DEPTH_HEIGHT, DEPTH_WIDTH))))
+    return out
+
+
+def plane_depth(T_world_cam: Array, camera: tuple[float, ...], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Depth of the wall at a size, for a camera stated for WIDTH x HEIGHT. Shape `size`."""
+    x, y = WIDTH / size[1], HEIGHT / size[0]
+    u = (np.arange(size[1]) + 0.5) * x - 0.5
+    v = (np.arange(size[0]) + 0.5) * y - 0.5
+    rays = np.stack(np.broadcast_arrays((u - camera[2]) / camera[0], ((v - camera[3]) / camera[1])[:, None], 1.0), -1)
+    normal = PLANE[:3] / np.linalg.norm(PLANE[:3])
+    turned = rays @ T_world_cam[:3, :3].T
+    return np.asarray((PLANE[3] - T_world_cam[:3, 3] @ normal) / (turned @ normal), np.float32)
+
+
+def off_plane(points: Array) -> Array:
+    """Distance of world points from the wall, metres. Shape (N,)."""
+    return np.asarray(np.abs(points @ (PLANE[:3] / np.linalg.norm(PLANE[:3])) - PLANE[3]))
+
+
+def arkit(T_world_cam: Array) -> Array:
+    """The pose as ARKit has it: world with y up, camera with x right, y up, z back."""
+    y_up_from_z_up = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    return np.asarray(y_up_from_z_up @ T_world_cam @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+def millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+    return np.rint(1000 * depth).astype(np.uint16)
+
+
+def jpeg(color: NDArray[np.uint8]) -> bytes:
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 98])[1])
+
+
+def png(image: NDArray) -> bytes:
+    return bytes(cv2.imencode(".png", image)[1])
+
+
+def put(path: Path, data: bytes | str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def write_record3d(root: Path, *, unsure: bool = False, **changes: object) -> Path:
+    """An .r3d file; with `unsure` the left half of depth has a confidence of 1."""
+    import lzfse
+
+    poses = []
+    members: dict[str, bytes] = {}
+    confidence = np.full((DEPTH_HEIGHT, DEPTH_WIDTH), 2, np.uint8)
+    confidence[:, : DEPTH_WIDTH // 2] = 1 if unsure else 2
+    for k, shot in enumerate(shots()):
+        T = arkit(shot.T_world_cam)
+        poses.append([*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]])
+        members[f"rgbd/{k}.jpg"] = jpeg(shot.color)
+        members[f"rgbd/{k}.depth"] = lzfse.compress(shot.depth.astype("<f4").tobytes())
+        members[f"rgbd/{k}.conf"] = lzfse.compress(confidence.tobytes())
+    meta = {"w": WIDTH, "h": HEIGHT, "dw": DEPTH_WIDTH, "dh": DEPTH_HEIGHT, "fps": 30, "poses": poses}
+    meta |= {"K": [K[0], 0, 0, 0, K[1], 0, K[2], K[3], 1], "frameTimestamps": [10 + k / 30 for k in range(COUNT)]}
+    members["metadata"] = json.dumps(meta | changes).encode()
+    path = root / "walk.r3d"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return path
+
+
+def write_stray(root: Path) -> Path:
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    y_up_from_z_up = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    root.mkdir(parents=True, exist_ok=True)
+    with av.open(str(root / "rgb.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for k, shot in enumerate(shots()):
+            T = y_up_from_z_up @ shot.T_world_cam
+            numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+            rows.append(", ".join([f"{100 + k / 30:.6f}", f"{k:06d}", *(f"{v:.9f}" for v in numbers)]))
+            put(root / "depth" / f"{k:06d}.png", png(millimetres(shot.depth)))
+            put(root / "confidence" / f"{k:06d}.png", png(np.full((DEPTH_HEIGHT, DEPTH_WIDTH), 2, np.uint8)))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(shot.color, "rgb24")))
+        container.mux(stream.encode())
+    put(root / "odometry.csv", "\n".join(rows) + "\n")
+    put(root / "camera_matrix.csv", f"{K[0]}, 0.0, {K[2]}\n0.0, {K[1]}, {K[3]}\n0.0, 0.0, 1.0\n")
+    return root
+
+
+def write_polycam(root: Path) -> Path:
+    for k, shot in enumerate(shots()):
+        T, name = arkit(shot.T_world_cam), f"{5_000_000 + 33_333 * k}"
+        camera = {"fx": K[0], "fy": K[1], "cx": K[2], "cy": K[3], "width": WIDTH, "height": HEIGHT}
+        camera |= {f"t_{r}{c}": T[r, c] for r in range(3) for c in range(4)}
+        put(root / f"keyframes/cameras/{name}.json", json.dumps(camera))
+        put(root / f"keyframes/images/{name}.jpg", jpeg(shot.color))
+        put(root / f"keyframes/depth/{name}.png", png(millimetres(shot.depth)))
+        put(root / f"keyframes/confidence/{name}.png", png(np.full(shot.depth.shape, 255, np.uint8)))
+    return root
+
+
+def write_arkitscenes(root: Path) -> Path:
+    rows = []
+    for k, shot in enumerate(shots()):
+        time, T = 20.0 + k / 10, np.linalg.inv(shot.T_world_cam)
+        small = cv2.resize(shot.color, (DEPTH_WIDTH, DEPTH_HEIGHT))
+        x, y = DEPTH_WIDTH / WIDTH, DEPTH_HEIGHT / HEIGHT
+        camera = (K[0] * x, K[1] * y, (K[2] + 0.5) * x - 0.5, (K[3] + 0.5) * y - 0.5)
+        name = f"40_{time:.3f}"
+        rows.append(" ".join(f"{v:.9f}" for v in (time, *Rotation.from_matrix(T[:3, :3]).as_rotvec(), *T[:3, 3])))
+        put(root / f"lowres_wide/{name}.png", png(cv2.cvtColor(small, cv2.COLOR_RGB2BGR)))
+        put(root / f"lowres_depth/{name}.png", png(millimetres(shot.depth)))
+        put(root / f"confidence/{name}.png", png(np.full(shot.depth.shape, 2, np.uint8)))
+        pincam = " ".join(f"{v:.6f}" for v in (DEPTH_WIDTH, DEPTH_HEIGHT, *camera))
+        put(root / f"lowres_wide_intrinsics/{name}.pincam", pincam)
+    put(root / "lowres_wide.traj", "\n".join(rows))
+    return root
+
+
+def write_nerfstudio(root: Path, **changes: object) -> Path:
+    frames = []
+    for k, shot in enumerate(shots()):
+        put(root / f"images/frame_{k + 1:05d}.jpg", jpeg(shot.color))
+        put(root / f"depth/frame_{k + 1:05d}.png", png(millimetres(shot.depth)))
+        T = shot.T_world_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
+        names = {"file_path": f"images/frame_{k + 1:05d}.jpg", "depth_file_path": f"depth/frame_{k + 1:05d}.png"}
+        frames.append(names | {"transform_matrix": T.tolist()})
+    camera = {"fl_x": K[0], "fl_y": K[1], "cx": K[2], "cy": K[3], "w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
+    put(root / "transforms.json", json.dumps(camera | {"frames": frames} | changes))
+    return root
+
+
+def write_scannet(root: Path) -> Path:
+    x, y = DEPTH_WIDTH / WIDTH, DEPTH_HEIGHT / HEIGHT
+    depth_k = (K[0] * x, K[1] * y, (K[2] + 0.5) * x - 0.5, (K[3] + 0.5) * y - 0.5)
+    for k, shot in enumerate(shots()):
+        put(root / f"color/{k}.jpg", jpeg(shot.color))
+        put(root / f"depth/{k}.png", png(millimetres(shot.depth)))
+        put(root / f"pose/{k}.txt", "\n".join(" ".join(f"{v:.9f}" for v in row) for row in shot.T_world_cam))
+    for name, camera in (("color", K), ("depth", depth_k)):
+        text = "\n".join(" ".join(f"{v:.9f}" for v in row) for row in matrix(camera))
+        put(root / f"intrinsic/intrinsic_{name}.txt", text)
+        put(root / f"intrinsic/extrinsic_{name}.txt", "\n".join(" ".join(map(str, row)) for row in np.eye(4)))
+    return root
+
+
+def write_sens(root: Path, *, lost: int | None = None) -> Path:
+    x, y = DEPTH_WIDTH / WIDTH, DEPTH_HEIGHT / HEIGHT
+    depth_k = (K[0] * x, K[1] * y, (K[2] + 0.5) * x - 0.5, (K[3] + 0.5) * y - 0.5)
+    out = struct.pack("<IQ4s", 4, 4, b"scan")
+    for m in (matrix(K), np.eye(4), matrix(depth_k), np.eye(4)):
+        out += m.astype("<f4").tobytes()
+    out += struct.pack("<iiIIIIfQ", 2, 1, WIDTH, HEIGHT, DEPTH_WIDTH, DEPTH_HEIGHT, 1000.0, COUNT)
+    for k, shot in enumerate(shots()):
+        color, depth = jpeg(shot.color), zlib.compress(millimetres(shot.depth).tobytes())
+        pose = np.full((4, 4), -np.inf) if k == lost else shot.T_world_cam
+        stamp = 1_000_000 + 33_333 * k
+        out += pose.astype("<f4").tobytes() + struct.pack("<QQQQ", stamp, stamp, len(color), len(depth)) + color + depth
+    put(root / "scene.sens", out)
+    return root / "scene.sens"
+
+
+def write_colmap(root: Path, *, binary: bool = False) -> Path:
+    """Text or binary model; lengths three times as long, as in a model of its own unit."""
+    images = []
+    for k, shot in enumerate(shots()):
+        put(root / f"images/{k:04d}.jpg", jpeg(shot.color))
+        T = np.linalg.inv(shot.T_world_cam)
+        q = np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)
+        numbers = " ".join(f"{v:.9f}" for v in (*q, *(3 * T[:3, 3])))
+        images.append(f"{k + 1} {numbers} 1 {k:04d}.jpg\n\n")
+    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {K[0]} {K[1]} {K[2] + 0.5} {K[3] + 0.5}\n"
+    put(root / "sparse/0/cameras.txt", camera)
+    put(root / "sparse/0/images.txt", "".join(images))
+    put(root / "sparse/0/points3D.txt", "")
+    if binary:
+        from pycolmap import Reconstruction
+
+        Reconstruction(str(root / "sparse/0")).write_binary(str(root / "sparse/0"))
+        for name in ("cameras", "images", "points3D", "rigs", "frames"):
+            (root / f"sparse/0/{name}.txt").unlink(missing_ok=True)
+    return root
+
+
+def matrix(camera: tuple[float, ...]) -> Array:
+    out = np.eye(4)
+    out[0, 0], out[1, 1], out[0, 2], out[1, 2] = camera
+    return out
+
+
+WITH_DEPTH: dict[str, Callable[[Path], Path]] = {
+    "record3d": write_record3d,
+    "stray": write_stray,
+    "polycam": write_polycam,
+    "arkitscenes": write_arkitscenes,
+    "nerfstudio": write_nerfstudio,
+    "scannet": write_scannet,
+    "sens": write_sens,
+}
