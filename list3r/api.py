@@ -26,6 +26,7 @@ from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, find
 from list3r.queries.free_words import WordEncoder
 from list3r.queries.match import FilterOptions, Match, Matches
+from list3r.queries.measure import InstanceDistance, measure
 from list3r.queries.nearest import nearest
 from list3r.queries.path import path
 from list3r.queries.pictures import InstancePicture, KeyframePicture, instance_picture, keyframe_pictures, keyframe_rgb
@@ -139,6 +140,11 @@ class SceneMemory(MemoryEdits):
     def path(self) -> Path:
         """The file."""
         return self.store.path
+
+    @property
+    def writable(self) -> bool:
+        """Whether it is open for editing."""
+        return self.store.writable
 
     @property
     def units(self) -> str:
@@ -359,6 +365,11 @@ class SceneMemory(MemoryEdits):
             >>> memory.relations(predicate="between", object=4, other=7)
         """
         return relations(self.store, subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
+
+    @_alone
+    def measure(self, a: int, b: int) -> InstanceDistance:
+        """How far two instances are apart, between surfaces and centres. Raises `UnknownIdError` and `OptionError`."""
+        return measure(self.store, a, b)
 
     @_alone
     def path_between(self, start: int, end: int, *, structure: bool = True) -> Relations:

@@ -25,6 +25,7 @@ from list3r.cli.measure import commands as evaluation_commands
 from list3r.cli.models import commands as model_commands
 from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
+from list3r.cli.serve import mcp as mcp_commands
 from list3r.memory.errors import List3rError
 
 app = typer.Typer(
@@ -49,6 +50,7 @@ for module in (
     scale_commands,
     detect_commands,
     model_commands,
+    mcp_commands,
 ):
     module.register(app)
 

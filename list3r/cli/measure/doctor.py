@@ -32,9 +32,11 @@ _PACKAGES = (
     ("huggingface_hub", "fetching weights"),
     ("safetensors", "reading weights"),
     ("ncnn", "labels by a box detector"),
+    ("mcp", "agents (mcp)"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
 _OPTIONAL = {
+    "mcp",
     "torch",
     "pycolmap",
     "transformers",

@@ -64,7 +64,7 @@ def scene_prompt(
     things = [i for i in memory.instances(structure=None) if i.state != "removed"]
     ranked = ranked_instances(memory, things, question)
     budget = Budget(tokens)
-    writer = _Writer(memory, things, settings)
+    writer = _SceneWriter(memory, things, settings)
     for line in writer.head():
         if not budget.add(line):
             needed = sum(_cost(x) for x in writer.head())
@@ -121,7 +121,7 @@ def length_unit(things: Iterable[Instance], units: str) -> tuple[float, int]:
     return 1.0, int(np.clip(np.ceil(3 - np.log10(extent or 1.0)), 0, 9))
 
 
-class _Writer:
+class _SceneWriter:
     """Lines about one memory."""
 
     def __init__(self, memory: SceneMemory, things: Sequence[Instance], settings: PromptSettings) -> None:

@@ -1,0 +1,282 @@
+"""The MCP server, asked by a real client in the process, over stdio and over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+from PIL import Image
+
+import list3r
+from list3r.cli.app import run
+from list3r.memory.store.store import Store
+from tests.conftest import small_picture, write_small_room
+
+pytest.importorskip("mcp")
+import httpx2
+from mcp import Client, StdioServerParameters
+from mcp.client.streamable_http import streamable_http_client
+
+from list3r.server.app import HttpSettings, make_server
+
+T = TypeVar("T")
+FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
+READING = {
+    *("overview", "find", "nearest", "within", "relations", "between", "measure", "describe", "picture"),
+    *("changes", "path_of"),
+}
+WRITING = {"label", "merge", "split", "delete", "undo"}
+TOKEN = "a token for these tests only"
+
+
+def write_room(path: Path) -> Path:
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store, small_picture())
+    return path
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_room(tmp_path_factory.mktemp("server") / "room.l3r")
+
+
+def ask(path: Path, question: Callable[[Client], Awaitable[T]], *, write: bool = False) -> T:
+    """What a client in this process is answered."""
+
+    async def asked() -> T:
+        with list3r.open(path, writable=write) as memory:
+            async with Client(make_server(memory)) as client:
+                return await question(client)
+
+    return asyncio.run(asked())
+
+
+def call(path: Path, tool: str, *, write: bool = False, **arguments: Any) -> Any:
+    """The structured answer of one tool, or the text of its error."""
+    result = ask(path, lambda client: client.call_tool(tool, arguments), write=write)
+    return result.content[0].text if result.is_error else result.structured_content or result.content[0]
+
+
+# ---------------------------------------------------------------------------------------------- tools
+
+
+def test_the_tools_are_those_that_ask(room: Path) -> None:
+    tools = ask(room, lambda client: client.list_tools()).tools
+    assert {t.name for t in tools} == READING and tools[0].name == "overview"
+    assert all(t.annotations and t.annotations.read_only_hint and t.description for t in tools)
+
+
+def test_overview_says_what_is_there(room: Path) -> None:
+    told = call(room, "overview")
+    assert (told["units"], told["up"], told["instances"]) == ("m", "z", 4)
+    assert told["names"] == {"mug": 2, "table": 1, "chair": 1} and told["structure"] == {"floor": 1, "wall": 1}
+
+
+def test_answers_are_those_of_the_memory(room: Path) -> None:
+    with list3r.open(room) as memory:
+        assert [m["id"] for m in call(room, "find", text="mug on table")["matches"]] == [
+            m.instance.id for m in memory.find("mug on table")
+        ]
+        near = call(room, "nearest", point=[2.0, 1.0, 0.5], limit=2)["matches"]
+        assert [m["id"] for m in near] == [m.instance.id for m in memory.nearest((2.0, 1.0, 0.5), 2)]
+        assert call(room, "nearest", id=MUG, limit=1, label="mug")["matches"][0]["id"] == TWIN
+        measured, told = memory.measure(MUG, TWIN), call(room, "measure", a=MUG, b=TWIN)
+        assert told["gap"] == pytest.approx(measured.gap, abs=1e-4)
+        assert told["from_a_to_b"] == [0.4, -0.2, 0.0] and told["center_distance"] == pytest.approx(0.2**0.5, abs=1e-4)
+    assert {m["id"] for m in call(room, "within", center=[2, 0, 0.7], radius=0.5)["entries"]} == {TABLE, MUG, TWIN}
+    on = call(room, "relations", predicate="on", object=TABLE)
+    assert [(r["subject"], r["object_name"]) for r in on["entries"]] == [(MUG, "table"), (TWIN, "table")]
+    assert call(room, "between", a=MUG, b=TWIN)["state"] == "known"
+    described = call(room, "describe", id=MUG)
+    assert described["center"] == [1.8, 0.1, 0.77] and described["relations"][0]["predicate"] == "on"
+    assert call(room, "path_of", id=MUG)["seen"][0]["session"] == 1
+    assert call(room, "changes") == {"total": 0, "entries": [], "units": "m"}
+
+
+def test_a_picture_is_a_picture(room: Path) -> None:
+    image = Image.open(io.BytesIO(base64.b64decode(call(room, "picture", id=MUG).data)))
+    assert image.format == "JPEG" and max(image.size) >= 200
+    whole = Image.open(io.BytesIO(base64.b64decode(call(room, "picture", id=MUG, whole=True).data)))
+    assert whole.width / whole.height == pytest.approx(64 / 48)
+
+
+def test_lists_come_in_pages(room: Path) -> None:
+    first = call(room, "relations", limit=3)
+    assert first["total"] == 4 and len(first["entries"]) == 3 and first["next_offset"] == 3
+    last = call(room, "relations", limit=3, offset=3)
+    assert len(last["entries"]) == 1 and "next_offset" not in last
+    assert "less than or equal to 100" in call(room, "relations", limit=100000)
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "said"),
+    [
+        ("describe", {"id": 99}, "has no instance 99"),
+        ("picture", {"id": 2**70}, "has no instance"),
+        ("nearest", {}, "give one of id, point and words"),
+        ("nearest", {"point": [1.0]}, "at least 3 items"),
+        ("within", {"center": [0, 0, 0]}, "radius"),
+        ("relations", {"predicate": "eats"}, "eats"),
+        ("label", {"id": 3, "text": "cup"}, "Unknown tool"),
+        ("delete", {"id": 3}, "Unknown tool"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    room: Path, tool: str, arguments: dict[str, Any], said: str
+) -> None:
+    answer = call(room, tool, **arguments)
+    assert isinstance(answer, str) and said in answer and "Traceback" not in answer
+
+
+def test_scene_map_and_instances_are_resources(room: Path) -> None:
+    async def read(client: Client) -> tuple[Any, ...]:
+        uris = ("list3r://scene", "list3r://map.png", "list3r://instance/3")
+        return tuple([(await client.read_resource(uri)).contents[0] for uri in uris])
+
+    scene, plan, one = ask(room, read)
+    assert scene.text.startswith("# room.l3r: 4 things") and json.loads(one.text)["name"] == "mug"
+    assert base64.b64decode(plan.blob).startswith(b"\x89PNG")
+    prompts = ask(room, lambda client: client.list_prompts()).prompts
+    assert {p.name for p in prompts} == {"describe_place", "where_is"}
+
+
+def test_with_write_an_agent_edits_and_takes_back(tmp_path: Path) -> None:
+    path = write_room(tmp_path / "room.l3r")
+    assert {t.name for t in ask(path, lambda c: c.list_tools(), write=True).tools} == READING | WRITING
+    done = call(path, "label", id=MUG, text="blue cup", write=True)
+    assert done["kind"] == "label"
+    with list3r.open(path) as memory:
+        assert memory.instance(MUG).label == "blue cup"
+        assert "agent" in str(memory.merges()[-1])
+    call(path, "undo", entry=done["entry"], write=True)
+    with list3r.open(path) as memory:
+        assert memory.instance(MUG).label is None
+
+
+# ---------------------------------------------------------------------------------------------- stdio
+
+
+def test_over_stdio(room: Path) -> None:
+    async def asked() -> tuple[Any, Any]:
+        server = StdioServerParameters(command=sys.executable, args=["-m", "list3r", "mcp", str(room)])
+        async with Client(server) as client:
+            return await client.call_tool("find", {"text": "chair"}), await client.call_tool("label", {"id": 3})
+
+    found, refused = asyncio.run(asked())
+    assert found.structured_content["matches"][0]["id"] == CHAIR
+    assert refused.is_error
+
+
+# ---------------------------------------------------------------------------------------------- HTTP
+
+
+@pytest.fixture(scope="module")
+def address(room: Path) -> Iterator[str]:
+    """Where a server of the room listens."""
+    server = subprocess.Popen(
+        [sys.executable, "-m", "list3r", "mcp", str(room), "--http", "--port", "0"],
+        env={**os.environ, "LIST3R_MCP_TOKEN": TOKEN},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert server.stderr is not None
+    lines = [server.stderr.readline() for _ in range(2)]
+    threading.Thread(target=server.stderr.read, daemon=True).start()
+    found = re.fullmatch(r"(http://127\.0\.0\.1:\d+/mcp)\n", lines[0])
+    assert found, lines
+    assert TOKEN not in "".join(lines)
+    yield found[1]
+    server.terminate()
+    assert server.wait(timeout=30) in (0, 1, -15)
+
+
+def over_http(address: str, question: Callable[[Client], Awaitable[T]], clients: int = 1) -> list[T]:
+    """What clients that all ask at once are answered."""
+
+    async def one() -> T:
+        async with httpx2.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60) as http:
+            async with Client(streamable_http_client(address, http_client=http)) as client:
+                return await question(client)
+
+    async def all_of_them() -> list[T]:
+        return await asyncio.gather(*(one() for _ in range(clients)))
+
+    return asyncio.run(all_of_them())
+
+
+def test_over_http_ten_clients_at_once(address: str) -> None:
+    answers = over_http(address, lambda client: client.call_tool("find", {"text": "mug"}), clients=10)
+    assert [[m["id"] for m in a.structured_content["matches"]] for a in answers] == [[MUG, TWIN]] * 10
+
+
+def post(address: str, body: str | None = None, **headers: str | None) -> int:
+    """The status that a bare request is answered with."""
+    asked = body or json.dumps({"jsonrpc": "2.0", "id": 1, "method": "tools/list", "params": {}})
+    sent = {
+        "Authorization": f"Bearer {TOKEN}",
+        "Content-Type": "application/json",
+        "Accept": "application/json, text/event-stream",
+    }
+    sent |= {name.replace("_", "-"): value for name, value in headers.items() if value is not None}
+    if headers.get("Authorization", "") is None:
+        del sent["Authorization"]
+    return int(httpx2.post(address, content=asked.encode(), headers=sent, timeout=60).status_code)
+
+
+def test_who_is_not_let_in(address: str) -> None:
+    assert post(address) == 200
+    assert post(address, Authorization="Bearer wrong") == 401
+    assert post(address, Authorization="Bearer " + TOKEN[:-1]) == 401
+    assert post(address, Authorization=None) == 401
+    assert post(address, Origin="https://elsewhere.example") == 403
+    assert post(address, Origin=address.removesuffix("/mcp")) == 200
+    assert post(address, Host="elsewhere.example") == 421
+    assert post(address, body=json.dumps({"jsonrpc": "2.0", "id": 1, "method": "x" * 300_000})) == 413
+    assert post(address, Content_Type="text/plain") == 400
+
+
+def test_a_taken_port_is_said(address: str, room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = address.split(":")[2].split("/")[0]
+    assert run(["mcp", str(room), "--http", "--port", port]) == 2
+    assert f"port {port}" in capsys.readouterr().err
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(list3r.List3rError, match="too short"):
+        HttpSettings(token="short")
+    with pytest.raises(list3r.List3rError, match="port"):
+        HttpSettings(port=70000)
+
+
+# ---------------------------------------------------------------------------------------------- configuration
+
+
+@pytest.mark.parametrize(
+    ("client", "table"),
+    [("claude", "mcpServers"), ("cursor", "mcpServers"), ("gemini", "mcpServers"), ("vscode", "servers")],
+)
+def test_the_entry_starts_the_server(client: str, table: str, room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["ask-config", str(room), "--client", client]) == 0
+    entry = json.loads(capsys.readouterr().out)[table]["list3r-room"]
+    assert entry["command"] == sys.executable and entry["args"] == ["-m", "list3r", "mcp", str(room.resolve())]
+
+
+def test_the_entry_of_codex_is_toml(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import tomllib
+
+    assert run(["ask-config", str(room), "--client", "codex", "--write"]) == 0
+    entry = tomllib.loads(capsys.readouterr().out)["mcp_servers"]["list3r-room"]
+    assert entry["args"][-1] == "--write"
+    assert run(["ask-config", str(room), "--client", "emacs"]) == 2
+    assert run(["ask-config", str(room.with_name("absent.l3r"))]) == 2
