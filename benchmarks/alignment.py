@@ -25,7 +25,7 @@ from machine import machine, write_json
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from list3r.association.overlap.point_maps import align_point_maps
+from benchmarks.peers.point_maps import align_point_maps
 from list3r.memory.geometry import Sim3, rotation_exp
 
 FRAMES, HEIGHT, WIDTH = 30, 378, 518

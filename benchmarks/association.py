@@ -29,6 +29,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from machine import machine, write_json
@@ -153,6 +154,7 @@ def _without_instances(revisits: Any) -> Any:
 
 def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth) -> dict[str, Any]:
     """Build a memory of the chunks (placed only) and measure it."""
+    from benchmarks.peers.plain_alignment import plain_support
     from list3r.association.overlap.motion import flag_moving
     from list3r.frames.base import Camera
     from list3r.memory.store.store import Store
@@ -174,7 +176,8 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth)
                 height, width = result.image_size
                 camera = Camera(width, height, *result.intrinsics)
                 chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
-            add_chunk(store, session, chunk, model, settings, library=False)
+            with patch("list3r.association.overlap.edges.align_support", plain_support):
+                add_chunk(store, session, chunk, model, settings, library=False)
         if not peer:
             finish_session(store, session, settings, library=False)
         return truth.measure(store)

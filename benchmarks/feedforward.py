@@ -13,6 +13,7 @@ import argparse
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from machine import machine, write_json
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+from benchmarks.peers.plain_alignment import plain_support
 from benchmarks.simulation.presets import make_video
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, measure_edge
@@ -117,7 +119,8 @@ def _plain(u: ChunkResult, v: ChunkResult) -> Sim3:
     camera = Camera(width, height, *v.intrinsics)
     settings = EdgeSettings(instance_aware=False)
     try:
-        return measure_edge(EdgeEnd(1, u.samples), EdgeEnd(2, v.samples), camera, False, settings).edge.S_v_u
+        with patch("list3r.association.overlap.edges.align_support", plain_support):
+            return measure_edge(EdgeEnd(1, u.samples), EdgeEnd(2, v.samples), camera, False, settings).edge.S_v_u
     except DegenerateError:
         return Sim3.identity()
 

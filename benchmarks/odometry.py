@@ -23,9 +23,9 @@ from machine import machine, write_json
 from numpy.typing import NDArray
 
 from list3r.association.graph.pose_graph import optimize
-from list3r.association.overlap.alignment import align_overlap
+from list3r.association.overlap.edges import EdgeEnd, measure_edge
 from list3r.association.revisits.search import find_loops
-from list3r.frames.base import Frame
+from list3r.frames.base import Camera, Frame
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, plan_chunks
 from list3r.frames.options import SourceOptions, parse_intrinsics
 from list3r.frames.source import open_source
@@ -46,6 +46,7 @@ class Chunk:
     span: ChunkSpan
     frame_indices: NDArray[np.int64]
     posed: NDArray[np.bool_]
+    camera: Camera
     T_chunk_cam: Poses
     T_source_cam: Poses
     keyframes: tuple[Keyframe, ...]
@@ -118,13 +119,23 @@ def reconstruct(path: str, options: SourceOptions, span: ChunkSpan) -> Chunk:
     missing = np.full((4, 4), np.nan)
     given = np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
     seconds = dict(zip(("read", "reconstruct", "keyframes"), np.diff(marks).tolist(), strict=True))
-    return Chunk(span, result.frame_indices, result.posed, result.T_chunk_cam, given, keyframes, samples, seconds)
+    return Chunk(
+        span,
+        result.frame_indices,
+        result.posed,
+        source.info.camera,
+        result.T_chunk_cam,
+        given,
+        keyframes,
+        samples,
+        seconds,
+    )
 
 
 def associate(chunks: list[Chunk]) -> tuple[list[Edge], list[Edge]]:
     """Edges between neighbours, and loop edges."""
     adjacent = [
-        align_overlap(u.samples, v.samples, k, k + 1, metric=True)
+        measure_edge(EdgeEnd(k, u.samples), EdgeEnd(k + 1, v.samples), v.camera, metric=True).edge
         for k, (u, v) in enumerate(itertools.pairwise(chunks))
     ]
     store, loops = Chunks(), list[Edge]()

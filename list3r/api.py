@@ -33,7 +33,7 @@ from list3r.queries.pictures import InstancePicture, KeyframePicture, instance_p
 from list3r.queries.relations import Place, Relations, relations
 from list3r.queries.seen import Sightings, seen, visible
 from list3r.queries.similar import similar
-from list3r.queries.views.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame
+from list3r.queries.views.camera import PosedCamera, camera_at_pose, camera_at_time, camera_of_frame
 from list3r.queries.within import within
 
 if TYPE_CHECKING:
@@ -219,7 +219,7 @@ class SceneMemory(MemoryEdits):
         upper: ArrayLike | None = None,
         center: ArrayLike | None = None,
         radius: float | None = None,
-        camera: Camera | None = None,
+        camera: PosedCamera | None = None,
         max_depth: float | None = None,
         occlusion: bool = True,
         **filters: Unpack[FilterOptions],
@@ -306,7 +306,7 @@ class SceneMemory(MemoryEdits):
     @_alone
     def visible(
         self,
-        camera: Camera,
+        camera: PosedCamera,
         *,
         min_visible: float = 0.1,
         max_depth: float | None = None,
@@ -327,7 +327,7 @@ class SceneMemory(MemoryEdits):
         position: ArrayLike | None = None,
         quat_wxyz: ArrayLike | None = None,
         session: int | None = None,
-    ) -> Camera:
+    ) -> PosedCamera:
         """The camera of a posed `frame`, of the posed frame nearest to `time_s`, or one put at a pose.
 
         A pose is a `position` in the world and the rotation R_world_cam (OpenCV axes) as a quaternion w, x, y, z.

@@ -13,6 +13,7 @@ from list3r.association.overlap.support import (
     Mask,
     SupportSettings,
     confident,
+    displacement,
     divide,
     inconsistency,
     static_support,
@@ -72,7 +73,8 @@ def test_delta_is_the_papers_and_along_sees_what_it_cannot() -> None:
     pairs = shared_pairs(u, v)
     regions = divide(pairs, pairs.instance_u, CAMERA, SETTINGS)
     none = np.zeros(len(pairs), bool)
-    found = inconsistency(pairs, ~none, regions, S_V, CAMERA, SETTINGS, none)
+    off = displacement(pairs, S_V, CAMERA, ~none, none)
+    found = inconsistency(off, regions, pairs.frame, CAMERA, SETTINGS)
     mover = int(np.flatnonzero(regions.label == MOVER)[0])
     assert found.delta_px.max() < 0.1
     assert found.moving[mover]

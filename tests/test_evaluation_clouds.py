@@ -39,7 +39,7 @@ def test_the_measures_are_what_the_definition_says(seed: int, m: int, n: int) ->
     there = np.abs((na[gaps.argmin(axis=0)] * nb).sum(axis=1)).mean()
     back = np.abs((na * nb[gaps.argmin(axis=1)]).sum(axis=1)).mean()
     precision, recall = (accuracy <= 0.05).mean(), (completeness <= 0.05).mean()
-    errors = evaluate_cloud(a, b, na, nb)
+    errors = evaluate_cloud(a, b, (na, nb))
     assert errors.accuracy_cm == pytest.approx(100 * accuracy.mean())
     assert errors.completeness_cm == pytest.approx(100 * completeness.mean())
     assert errors.chamfer_cm == pytest.approx((errors.accuracy_cm + errors.completeness_cm) / 2)

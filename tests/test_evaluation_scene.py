@@ -34,7 +34,7 @@ def plane(offset: float, step: float = 0.02) -> np.ndarray:
 
 def test_two_parallel_planes_are_their_distance_apart() -> None:
     normals = np.tile([0.0, 0.0, 1.0], (2500, 1))
-    errors = evaluate_cloud(plane(0.0), plane(0.03), normals, -normals)
+    errors = evaluate_cloud(plane(0.0), plane(0.03), (normals, -normals))
     assert errors.accuracy_cm == pytest.approx(3.0)
     assert errors.completeness_cm == pytest.approx(3.0)
     assert errors.chamfer_cm == pytest.approx(3.0)
@@ -55,7 +55,7 @@ def test_half_a_plane_is_accurate_but_not_complete() -> None:
 
 def test_normals_across_each_other_do_not_agree() -> None:
     up, side = np.tile([0.0, 0.0, 1.0], (2500, 1)), np.tile([1.0, 0.0, 0.0], (2500, 1))
-    assert evaluate_cloud(plane(0), plane(0), up, side).normal_consistency == pytest.approx(0.0)
+    assert evaluate_cloud(plane(0), plane(0), (up, side)).normal_consistency == pytest.approx(0.0)
 
 
 def test_clouds_that_cannot_be_compared_are_named() -> None:
@@ -64,7 +64,7 @@ def test_clouds_that_cannot_be_compared_are_named() -> None:
     with pytest.raises(OptionError, match="not finite"):
         evaluate_cloud(plane(0), np.full((2, 3), np.nan))
     with pytest.raises(OptionError, match="normals"):
-        evaluate_cloud(plane(0), plane(0), np.ones((3, 3)), np.ones((2500, 3)))
+        evaluate_cloud(plane(0), plane(0), (np.ones((3, 3)), np.ones((2500, 3))))
 
 
 # ----------------------------------------------------------------------------------------------- boxes

@@ -14,7 +14,7 @@ from PIL import Image
 from list3r.exporters.components import read_components
 from list3r.exporters.palette import instance_color
 from list3r.exporters.plan.frame import PlanFrame, choose_rotation
-from list3r.exporters.plan.labels import Anchor, place_tags
+from list3r.exporters.plan.labels import TagTarget, place_tags
 from list3r.exporters.plan.layout import PlanSettings, choose_layout
 from list3r.exporters.plan.picture import _plain, _round_length, plan_image, write_plan
 from list3r.memory.errors import OptionError
@@ -72,7 +72,7 @@ def test_world_points_land_on_the_page() -> None:
 def test_tags_do_not_cover_each_other(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     anchors = [
-        Anchor((float(x), float(y)), (float(w), float(h)), (24.0, 16.0))
+        TagTarget((float(x), float(y)), (float(w), float(h)), (24.0, 16.0))
         for x, y, w, h in zip(*rng.uniform(0, 1000, (2, count)), *rng.uniform(2, 60, (2, count)), strict=True)
     ]
     places = np.array(place_tags(anchors, (0.0, 0.0, 1000.0, 1000.0)))
@@ -84,7 +84,7 @@ def test_tags_do_not_cover_each_other(count: int, seed: int) -> None:
 
 
 def test_a_tag_on_a_large_thing_is_on_it() -> None:
-    (place,) = place_tags([Anchor((500.0, 500.0), (100.0, 100.0), (24.0, 16.0))], (0.0, 0.0, 1000.0, 1000.0))
+    (place,) = place_tags([TagTarget((500.0, 500.0), (100.0, 100.0), (24.0, 16.0))], (0.0, 0.0, 1000.0, 1000.0))
     assert place == (500.0, 500.0)
 
 

@@ -16,7 +16,7 @@ from list3r.queries.nearest import nearest
 from list3r.queries.relations import relations
 from list3r.queries.seen import visible
 from list3r.queries.views import gather, visibility
-from list3r.queries.views.camera import Camera
+from list3r.queries.views.camera import PosedCamera
 from tests.conftest import instance
 
 COUNT = 400
@@ -127,7 +127,7 @@ def test_a_camera_sees_what_it_saw(store: Store, depth: float | None, monkeypatc
         pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         pose[:3, :3] *= np.sign(np.linalg.det(pose[:3, :3]))
         pose[:3, 3] = rng.uniform(0, 9, 3)
-        camera = Camera(pose, (300.0, 300.0, 159.5, 119.5), (240, 320), 1, 1)
+        camera = PosedCamera(pose, (300.0, 300.0, 159.5, 119.5), (240, 320), 1, 1)
         found = plain(visible(store, camera, min_visible=0.0, max_depth=depth))
         with monkeypatch.context() as patch:
             patch.setattr("list3r.queries.seen.in_front", lambda store, *_: store.instances())
@@ -145,7 +145,7 @@ def test_what_is_left_out_is_said(store: Store, large: pytest.MonkeyPatch) -> No
     assert "more than 20 things are 'red'; 20 of them" in relations(store, subject="red").reason
     assert relations(store, subject=7).reason == ""
     found = nearest(store, words="red box")
-    assert len(found) == 5 and "may be meant by 'red box'; 20 of them were looked at" in found.notes[0]
+    assert len(found) == 5 and "instances match 'red box'; 20 of them were considered" in found.notes[0]
     assert nearest(store, words="red box", point=(4, 4, 1)).notes == ()
 
 

@@ -57,13 +57,14 @@ class CloudDistances:
 def evaluate_cloud(
     truth: ArrayLike,
     estimate: ArrayLike,
-    truth_normals: ArrayLike | None = None,
-    estimate_normals: ArrayLike | None = None,
+    normals: tuple[ArrayLike | None, ArrayLike | None] = (None, None),
     threshold_m: float = 0.05,
     truncate_m: float | None = None,
     distances: CloudDistances | None = None,
 ) -> CloudErrors:
-    """Compare two clouds (M, 3) and (N, 3) of one frame of reference, metres; normals, if any, of unit length.
+    """Compare two clouds (M, 3) and (N, 3) of one coordinate frame, metres.
+
+    `normals` are those of the truth (M, 3) and of the estimate (N, 3), of unit length; None where they are not known.
 
     `truncate_m` caps single distances, where parts of the truth were never in view; None leaves them. `distances` are
     those of `cloud_distances` where they are known already. Raises `OptionError` for an empty cloud, for points that
@@ -78,8 +79,8 @@ def evaluate_cloud(
     if truncate_m is not None:
         to_truth, to_estimate = np.minimum(to_truth, truncate_m), np.minimum(to_estimate, truncate_m)
     consistency = None
-    if truth_normals is not None and estimate_normals is not None:
-        n, m = np.asarray(truth_normals, dtype=np.float64), np.asarray(estimate_normals, dtype=np.float64)
+    if normals[0] is not None and normals[1] is not None:
+        n, m = (np.asarray(side, dtype=np.float64) for side in normals)
         if n.shape != a.shape or m.shape != b.shape:
             raise OptionError(f"normals of shape {n.shape} and {m.shape} for points of shape {a.shape} and {b.shape}")
         there = np.abs(np.einsum("nk,nk->n", n[found.nearest_truth], m)).mean()

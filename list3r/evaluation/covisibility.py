@@ -80,15 +80,16 @@ def covisibility(
     posed = np.isfinite(poses).all(axis=(1, 2))
     grids = [_surface_points(d, camera, chosen.points) for d in maps]
     known = posed & np.array([len(g) > 0 for g in grids], dtype=bool)
-    low, high = _spans(maps)
+    spans = _spans(maps)
     T_cam_world = np.full_like(poses, np.nan)
     T_cam_world[posed] = np.linalg.inv(poses[posed])
     share = np.full((len(maps), len(maps)), np.nan, dtype=np.float32)
     rows = np.flatnonzero(known)
+    views = _Views(T_cam_world[rows], *(span[rows] for span in spans))
     for i in rows:
         rays = grids[i] @ poses[i, :3, :3].T
         world = rays + poses[i, :3, 3]
-        share[i, rows] = _seen_shares(world, rays, T_cam_world[rows], camera, low, high, rows, chosen)
+        share[i, rows] = _seen_shares(world, rays, views, camera, chosen)
         share[i, i] = 1.0
     return share
 
@@ -113,17 +114,21 @@ def _spans(maps: NDArray[Any]) -> tuple[Shares, Shares]:
     return low, high
 
 
-def _seen_shares(
-    world: Array,
-    rays: Array,
-    T_cam_world: Array,
-    camera: Camera,
-    low: Shares,
-    high: Shares,
-    rows: NDArray[np.int64],
-    settings: CovisibilitySettings,
-) -> Array:
-    """Share of world points (P, 3), found along rays (P, 3), that each of G frames sees. Shape (G,)."""
+@dataclass(frozen=True)
+class _Views:
+    """What G frames see."""
+
+    T_cam_world: Array
+    """Shape (G, 4, 4)."""
+    low: Shares
+    """Least depth of each block of 2 x 2 pixels, see `_spans`. Shape (G, h-1, w-1)."""
+    high: Shares
+    """Greatest depth of each block. Shape (G, h-1, w-1)."""
+
+
+def _seen_shares(world: Array, rays: Array, views: _Views, camera: Camera, settings: CovisibilitySettings) -> Array:
+    """Return the share of world points (P, 3), found along rays (P, 3), that each of G frames sees. Shape (G,)."""
+    T_cam_world = views.T_cam_world
     p = np.einsum("gij,pj->gpi", T_cam_world[:, :3, :3], world) + T_cam_world[:, None, :3, 3]
     z = p[..., 2]
     along = np.einsum("gij,pj,gpi->gp", T_cam_world[:, :3, :3], rays, p, optimize=True)
@@ -135,8 +140,8 @@ def _seen_shares(
     inside = ahead & (x > -0.5) & (x < camera.width - 0.5) & (y > -0.5) & (y < camera.height - 0.5)
     column = np.clip(np.where(inside, x, 0.0), 0, camera.width - 2).astype(np.int64)
     line = np.clip(np.where(inside, y, 0.0), 0, camera.height - 2).astype(np.int64)
-    frames = np.broadcast_to(rows[:, None], z.shape)
-    near, far = low[frames, line, column], high[frames, line, column]
+    frames = np.broadcast_to(np.arange(len(z))[:, None], z.shape)
+    near, far = views.low[frames, line, column], views.high[frames, line, column]
     unknown = inside & (far <= 0)
     seen = inside & (z >= near * (1 - settings.tolerance)) & (z <= far * (1 + settings.tolerance))
     count = np.maximum(len(world) - unknown.sum(axis=1), len(world) / 2)

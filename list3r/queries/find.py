@@ -363,19 +363,18 @@ def _viewpoint(search: _Search, o: Instance) -> Place | None:
 def _between(
     search: _Search, found: list[_Candidate], ones: list[_Candidate], others: list[_Candidate]
 ) -> list[_Candidate]:
+    """Return those that stand between one of the ones and one of the others, each with its best pair."""
     noise = noise_of(search.store)
     best: dict[int, _Candidate] = {}
-    for a in ones:
-        for b in others:
-            ends = a.instance.id, b.instance.id
-            box = np.stack([a.instance.aabb, b.instance.aabb])
-            near = set(search.store.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0)))
-            for c in found:
-                if c.instance.id not in near or c.instance.id in ends or ends[0] == ends[1]:
-                    continue
-                r = between(c.instance, a.instance, b.instance, noise)
-                score = 0.0 if r is None else c.score * r.confidence * (0.5 + 0.25 * (a.score + b.score))
-                if r is not None and (c.instance.id not in best or score > best[c.instance.id].score):
-                    why = f"between #{ends[0]} and #{ends[1]} ({r.confidence:.2f})"
-                    best[c.instance.id] = _Candidate(c.instance, score, (*c.reasons, why))
+    pairs = ((a, b) for a in ones for b in others if a.instance.id != b.instance.id)
+    for a, b in pairs:
+        ends = a.instance.id, b.instance.id
+        box = np.stack([a.instance.aabb, b.instance.aabb])
+        near = set(search.store.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0))) - set(ends)
+        for c in (c for c in found if c.instance.id in near):
+            r = between(c.instance, a.instance, b.instance, noise)
+            score = 0.0 if r is None else c.score * r.confidence * (0.5 + 0.25 * (a.score + b.score))
+            if r is not None and (c.instance.id not in best or score > best[c.instance.id].score):
+                why = f"between #{ends[0]} and #{ends[1]} ({r.confidence:.2f})"
+                best[c.instance.id] = _Candidate(c.instance, score, (*c.reasons, why))
     return [best[n] for n in sorted(best)]

@@ -24,7 +24,7 @@ from list3r.queries.match import (
     checked_length,
     checked_point,
 )
-from list3r.queries.views.best_first import box_gaps, nearest_first
+from list3r.queries.views.best_first import NearestSearch, box_gaps, nearest_first
 from list3r.queries.views.gather import is_large, sample
 from list3r.queries.views.surfaces import STRAY, distance_between, distance_to_point, surface_of
 from list3r.queries.words import STRUCTURE, not_borne, wanted_words, word_score
@@ -98,17 +98,22 @@ def _common(store: Store, words: str) -> bool:
 
 
 def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
-    """What passes the filters: all; of a memory that holds too many those that bear the most of the words."""
+    """Return what passes the filters: all; of a large memory those that bear the most of the words."""
     if not is_large(store):
         return filters.select(store.instances())
-    for ids in store.bearing_most(wanted_words(words), _NAMED + 1):
-        for start in range(0, len(ids), _LOADED):
-            found = filters.select(store.instances_of(ids[start : start + _LOADED]))
-            if _named(found, words):
-                if len(ids) > start + _LOADED:
-                    count = f"more than {_NAMED}" if len(ids) > _NAMED else f"{len(ids)}"
-                    notes.append(f"{count} things may be meant by {words!r}; {start + _LOADED} of them were looked at")
-                return found
+    parts = (
+        (ids, start)
+        for ids in store.bearing_most(wanted_words(words), _NAMED + 1)
+        for start in range(0, len(ids), _LOADED)
+    )
+    for ids, start in parts:
+        found = filters.select(store.instances_of(ids[start : start + _LOADED]))
+        if not _named(found, words):
+            continue
+        if len(ids) > start + _LOADED:
+            count = f"more than {_NAMED}" if len(ids) > _NAMED else f"{len(ids)}"
+            notes.append(f"{count} instances match {words!r}; {start + _LOADED} of them were considered")
+        return found
     return []
 
 
@@ -133,18 +138,17 @@ def _near(
     limit: float | None,
     filters: Filters,
 ) -> list[tuple[float, Instance]]:
-    """The k nearest of all, found through the R*Tree."""
-    return nearest_first(
-        store,
-        _aabb(origin, place),
+    """Find the k nearest of all through the R*Tree."""
+    search = NearestSearch(
         k,
         _measure(store, origin, place),
-        filters=filters,
+        filters,
         leave_out=None if origin is None else origin.id,
         component=filters.component if origin is None else origin.component,
         limit=limit,
         touch=0.0 if origin is None else surface_of(store, origin).spacing,
     )
+    return nearest_first(store, _aabb(origin, place), search)
 
 
 def _named(candidates: Sequence[Instance], words: str) -> list[tuple[Instance, float, str]]:

@@ -13,7 +13,7 @@ from list3r.memory.relations.predicates import PREDICATES
 from list3r.memory.relations.scene import RelationSettings
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance, checked_point
-from list3r.queries.views.camera import Camera, camera_of_frame, last_camera
+from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera
 from list3r.queries.views.gather import is_large, sample
 from list3r.queries.views.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
 from list3r.queries.words import not_borne, wanted_words, words_of
@@ -25,7 +25,7 @@ ALL_PREDICATES = (*(p for p in PREDICATES if p != "between"), *VIEWPOINT, "betwe
 _MOST_NAMED = 20_000
 """Instances that words may stand for."""
 
-Place = int | str | Sequence[float] | Camera
+Place = int | str | Sequence[float] | PosedCamera
 """Where to look from: an instance's id, "camera" (where it was last), "camera:FRAME", a point x, y, z, or a camera."""
 
 
@@ -92,7 +92,7 @@ def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
     upright = store.get_value("gravity", "unknown") in ("known", "estimated")
     up = np.array([0.0, 0.0, 1.0])
     where = _parse_place(store, viewpoint) if isinstance(viewpoint, str) else viewpoint
-    if isinstance(where, Camera):
+    if isinstance(where, PosedCamera):
         name = "the camera" if where.frame is None else f"frame {where.frame.frame_index}"
         return Viewer(where.place, up if upright else where.up, name, None, where.component)
     if isinstance(where, int | np.integer):
@@ -102,7 +102,7 @@ def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
     return Viewer(place, up, "the point " + ", ".join(f"{x:g}" for x in place)) if upright else None
 
 
-def _parse_place(store: Store, text: str) -> int | Camera | list[float]:
+def _parse_place(store: Store, text: str) -> int | PosedCamera | list[float]:
     if text == "camera":
         return last_camera(store)
     if match := re.fullmatch(r"camera:([0-9]{1,18})", text):

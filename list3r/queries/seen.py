@@ -9,8 +9,8 @@ from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.records import BestView
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
-from list3r.queries.views.camera import Camera
-from list3r.queries.views.visibility import Seen, in_front, look
+from list3r.queries.views.camera import PosedCamera
+from list3r.queries.views.visibility import Visibility, in_front, look
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _spans(frames: list[Sighting], gap_s: float) -> tuple[tuple[int, float, floa
 
 def visible(
     store: Store,
-    camera: Camera,
+    camera: PosedCamera,
     *,
     min_visible: float = 0.1,
     max_depth: float | None = None,
@@ -99,7 +99,7 @@ def visible(
     return sorted(found, key=lambda m: (-m.score, m.distance_m or 0.0, m.instance.id))
 
 
-def _match(s: Seen, camera: Camera, followed: set[int] | None) -> Match:
+def _match(s: Visibility, camera: PosedCamera, followed: set[int] | None) -> Match:
     reason = f"{s.visible:.0%} of its outline shows, {s.picture:.1%} of the picture"
     if s.inside < 0.995:
         reason += f", {s.inside:.0%} of it inside"
@@ -110,7 +110,7 @@ def _match(s: Seen, camera: Camera, followed: set[int] | None) -> Match:
     return Match(s.instance, round(s.visible * s.inside, 4), s.distance, away, reason, view)
 
 
-def _followed(store: Store, camera: Camera) -> set[int] | None:
+def _followed(store: Store, camera: PosedCamera) -> set[int] | None:
     """Instances whose masks are in the camera's frame, by the chunk that places it; None without a frame."""
     if camera.frame is None:
         return None

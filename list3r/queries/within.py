@@ -11,7 +11,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point
 from list3r.queries.seen import visible
-from list3r.queries.views.camera import Camera
+from list3r.queries.views.camera import PosedCamera
 from list3r.queries.views.surfaces import distance_to_point, surface_of
 
 
@@ -22,7 +22,7 @@ def within(
     upper: ArrayLike | None = None,
     center: ArrayLike | None = None,
     radius: float | None = None,
-    camera: Camera | None = None,
+    camera: PosedCamera | None = None,
     max_depth: float | None = None,
     occlusion: bool = True,
     **options: Unpack[FilterOptions],

@@ -51,7 +51,7 @@ def extend(
     judged, and covariances of the others stay: `optimize` at the end of a session judges all.
     """
     chosen = settings or GraphSettings()
-    mine = [k for k, e in enumerate(edges) if new in (e.u, e.v) and e.accepted]
+    mine = _accepted_of(new, edges)
     others = {_other(edges[k], new) for k in mine}
     if not mine:
         return _with(placed, new, placed.S_graph_chunk.get(new, Sim3.identity()), new, edges, np.zeros((7, 7)))
@@ -74,8 +74,8 @@ def extend(
     squares = problem.squares(poses)
     covariance = _hanging(placed.covariances[here], active[first], here, weights[first])
     if len(active) > 1 and float(squares.max()) > chi2.ppf(0.95, problem.size):
-        poses_of = ChainMap({new: start}, _under(placed.S_graph_chunk))
-        moved = _moved(new, here, edges, mine, poses_of, placed.components, metric, chosen)
+        started = replace(placed, S_graph_chunk=ChainMap({new: start}, _under(placed.S_graph_chunk)))
+        moved = _moved(new, here, edges, started, metric, chosen)
         placed = replace(placed, S_graph_chunk=ChainMap(moved[0], _under(placed.S_graph_chunk)))
         return _with(placed, new, moved[0][new], placed.components[here], moved[1], covariance)
     out = list(edges)
@@ -86,17 +86,19 @@ def extend(
     return _with(placed, new, unstack(poses, ids)[new], placed.components[here], out, covariance)
 
 
+def _accepted_of(chunk: int, edges: Sequence[Edge]) -> list[int]:
+    """Return the numbers of the accepted edges of a chunk."""
+    return [k for k, e in enumerate(edges) if chunk in (e.u, e.v) and e.accepted]
+
+
 def _moved(
-    new: int,
-    here: int,
-    edges: Sequence[Edge],
-    mine: Sequence[int],
-    poses_of: Mapping[int, Sim3],
-    components: Mapping[int, int],
-    metric: bool,
-    settings: GraphSettings,
+    new: int, here: int, edges: Sequence[Edge], started: GraphResult, metric: bool, settings: GraphSettings
 ) -> tuple[dict[int, Sim3], list[Edge]]:
-    """The neighbourhood, moved by a step, and all edges; believed as before but for the new chunk's loops."""
+    """Move the neighbourhood by a step and judge the new chunk's loops; other edges are believed as before.
+
+    `started` holds the new chunk too, where its edge to `here` puts it. Returns the poses that moved, and all edges.
+    """
+    poses_of, components, mine = started.S_graph_chunk, started.components, _accepted_of(new, edges)
     known = [k for k, e in enumerate(edges) if e.accepted and e.u in poses_of and e.v in poses_of]
     ends = np.array([(edges[k].u, edges[k].v) for k in known])
     near = _near(new, here, ends, {_other(edges[k], new) for k in mine}, settings.most_moved)

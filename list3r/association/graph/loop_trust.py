@@ -92,8 +92,8 @@ def judge(
 ) -> Believed:
     """Solve the graph and find which edges to believe. `loop` (E,) marks those that may be false."""
     kinds = loop.astype(np.int64)
-    limit = chi2.ppf(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
-    poses, trust, factors = _as_stated_or_drifted(problem, start, tree, loop, limit, robust, settings)
+    limit = _limits(problem, loop, settings)
+    poses, trust, factors = _as_stated_or_drifted(problem, start, tree, loop, robust, settings)
     freedom = np.full(2, settings.prior_freedom)
     for judged_anew in range(settings.rounds if loop.any() else 0):
         scaled = problem.scaled(factors[kinds])
@@ -109,18 +109,18 @@ def judge(
     return Believed(poses, trust, scaled.squares(poses), limit, factors, freedom, known)
 
 
+def _limits(problem: GraphProblem, loop: NDArray[np.bool_], settings: TrustSettings) -> Array:
+    """Return the largest squared Mahalanobis distance at which each edge is believed. Shape (E,)."""
+    limit = chi2.ppf(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
+    return np.asarray(limit)
+
+
 def _as_stated_or_drifted(
-    problem: GraphProblem,
-    start: Sim3,
-    tree: Tree,
-    loop: NDArray[np.bool_],
-    limit: Array,
-    robust: bool,
-    settings: TrustSettings,
+    problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], robust: bool, settings: TrustSettings
 ) -> tuple[Sim3, Array, Array]:
-    """Poses, trust and variance factors with errors as stated; where too few edges are believed so, with the chain's
-    drift as large as the loops say it is."""
-    ones = np.ones(len(loop))
+    """Return poses, trust and variance factors with errors as stated; where too few edges are believed so, with the
+    chain's drift as large as the loops say it is."""
+    ones, limit = np.ones(len(loop)), _limits(problem, loop, settings)
     if not loop.any() or not robust:
         return problem.solve(start, ones, settings.iterations), ones, np.ones(2)
     poses, trust = _first(problem, start, tree, loop, limit, settings)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,17 @@ class Pieces:
     relations: list[tuple[Edge, FrameRelations]]
     """Of adjacent edges that are believed."""
 
+    @cached_property
+    def first(self) -> dict[int, int]:
+        """Row of each chunk's first node among all nodes, by chunk id."""
+        counts = [len(nodes.at) for nodes in self.nodes.values()]
+        return dict(zip(self.nodes, np.cumsum([0, *counts]).tolist(), strict=False))
+
+    @property
+    def count(self) -> int:
+        """Nodes of all chunks."""
+        return sum(len(nodes.at) for nodes in self.nodes.values())
+
 
 def bend_chunks(
     read_samples: Callable[[int], FrameSamples],
@@ -73,13 +85,10 @@ def bend_chunks(
     if not chosen.enabled or not believed:
         return graph, {}
     pieces = pieces_of(read_samples, sorted(graph.S_graph_chunk), believed, rigid, chosen)
-    first, count = {}, 0
-    for chunk, nodes in pieces.nodes.items():
-        first[chunk], count = count, count + len(nodes.at)
     start = [graph.S_graph_chunk[c] for c, nodes in pieces.nodes.items() for _ in nodes.at]
-    problem = _problem(pieces, believed, first, count, graph.components, metric, chosen, weights or GraphSettings())
+    problem = _problem(pieces, believed, graph.components, metric, chosen, weights or GraphSettings())
     placed = problem.solve(stack(start), np.ones(len(problem.u)), _STEPS)
-    return _settled(placed, pieces.nodes, first, graph, rigid)
+    return _settled(placed, pieces.nodes, pieces.first, graph, rigid)
 
 
 def pieces_of(
@@ -113,14 +122,13 @@ def pieces_of(
 def _problem(
     pieces: Pieces,
     believed: Sequence[Edge],
-    first: Mapping[int, int],
-    count: int,
     components: Mapping[int, int],
     metric: bool,
     settings: NodeSettings,
     weights: GraphSettings,
 ) -> GraphProblem:
-    """All nodes and all that ties them."""
+    """Lay out all nodes and all that ties them."""
+    first = pieces.first
     ends: list[tuple[int, int]] = []
     between: list[Sim3] = []
     covariances: list[Array] = []
@@ -153,7 +161,7 @@ def _problem(
         factors[[not e.accepted for e in rest]] *= _NOTHING
         stiff = replace(weights, weights=replace(weights.weights, bend=0.0))  # the nodes bend instead
         information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
-    fixed = np.zeros(count, bool)
+    fixed = np.zeros(pieces.count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True
     u, v = np.array(ends).T
     return GraphProblem.build(u, v, stack(between), information, fixed)

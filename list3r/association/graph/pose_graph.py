@@ -180,46 +180,65 @@ def _components(ids: Sequence[int], edges: Sequence[Edge]) -> dict[int, int]:
     return component
 
 
+class _SpanningTree:
+    """Poses along a spanning tree that prefers adjacent edges, then confident ones (Prim's algorithm, few edges)."""
+
+    def __init__(self, ids: Sequence[int], edges: Sequence[Edge]) -> None:
+        self.placed: dict[int, Sim3] = {}
+        self._edges = edges
+        self._neighbours = _neighbours(edges)
+        self._row = {chunk: k for k, chunk in enumerate(ids)}
+        self._parent, self._by = np.arange(len(ids)), np.full(len(ids), -1)
+        self._order: list[int] = []
+
+    def grow(self, root: int, S_graph_root: Sim3) -> None:
+        """Place the component of a chunk."""
+        self.placed[root] = S_graph_root
+        self._order.append(self._row[root])
+        waiting = self._along_adjacent(root)
+        while waiting := [k for k in waiting if self._leads_on(self._edges[k])]:
+            best = max(waiting, key=lambda k: (self._edges[k].confidence, -self._edges[k].u, -self._edges[k].v))
+            here, there = self._edges[best].u, self._edges[best].v
+            here, there = (here, there) if here in self.placed else (there, here)
+            self._place(there, here, best)
+            waiting += self._along_adjacent(there)
+
+    def tree(self) -> Tree:
+        """Return the tree of all components grown so far."""
+        return Tree(self._parent, self._by, np.array(self._order, np.int64))
+
+    def _along_adjacent(self, start: int) -> list[int]:
+        """Place what adjacent edges reach from a chunk. Returns the other edges met on the way."""
+        queue, others = deque([start]), []
+        while queue:
+            chunk = queue.popleft()
+            fresh = ((other, k) for other, k in self._neighbours.get(chunk, []) if other not in self.placed)
+            for other, k in fresh:
+                if self._edges[k].kind != "adjacent":
+                    others.append(k)
+                else:
+                    self._place(other, chunk, k)
+                    queue.append(other)
+        return others
+
+    def _leads_on(self, edge: Edge) -> bool:
+        return (edge.u in self.placed) != (edge.v in self.placed)
+
+    def _place(self, there: int, here: int, k: int) -> None:
+        self.placed[there] = across(self.placed[here], self._edges[k], here)
+        self._parent[self._row[there]], self._by[self._row[there]] = self._row[here], k
+        self._order.append(self._row[there])
+
+
 def _chain(
     ids: Sequence[int], edges: Sequence[Edge], component: Mapping[int, int], initial: Mapping[int, Sim3]
 ) -> tuple[dict[int, Sim3], Tree]:
-    """Poses along a spanning tree that prefers adjacent edges, then confident ones (Prim's algorithm, few edges)."""
-    neighbours = _neighbours(edges)
-    row = {chunk: k for k, chunk in enumerate(ids)}
-    parent, by, order = np.arange(len(ids)), np.full(len(ids), -1), []
-    placed: dict[int, Sim3] = {}
-
-    def place(there: int, here: int, k: int) -> None:
-        placed[there] = across(placed[here], edges[k], here)
-        parent[row[there]], by[row[there]] = row[here], k
-        order.append(row[there])
-
+    """Chain poses along a spanning tree from the first chunk of each component."""
+    growing = _SpanningTree(ids, edges)
     for root in ids:
-        if component[root] != root:
-            continue
-        placed[root] = initial.get(root, Sim3.identity())
-        order.append(row[root])
-        queue = deque([root])
-        waiting: list[int] = []
-        while queue or waiting:
-            while queue:
-                chunk = queue.popleft()
-                for other, k in neighbours.get(chunk, []):
-                    if other in placed:
-                        continue
-                    if edges[k].kind != "adjacent":
-                        waiting.append(k)
-                        continue
-                    place(other, chunk, k)
-                    queue.append(other)
-            waiting = [k for k in waiting if (edges[k].u in placed) != (edges[k].v in placed)]
-            if waiting:
-                best = max(waiting, key=lambda k: (edges[k].confidence, -edges[k].u, -edges[k].v))
-                here, there = (edges[best].u, edges[best].v)
-                here, there = (here, there) if here in placed else (there, here)
-                place(there, here, best)
-                queue.append(there)
-    return placed, Tree(parent, by, np.array(order, np.int64))
+        if component[root] == root:
+            growing.grow(root, initial.get(root, Sim3.identity()))
+    return growing.placed, growing.tree()
 
 
 def chain_poses(ids: Sequence[int], edges: Sequence[Edge]) -> tuple[dict[int, Sim3], dict[int, int]]:

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.association.overlap.alignment_covariance import measure_uncertainty
+from list3r.association.overlap.alignment_covariance import FittedPairs, measure_uncertainty
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
 
 Array = NDArray[np.float64]
 
@@ -51,10 +50,6 @@ class AlignmentSettings:
     """Variance added for bending, in units of what the shared frames' own walk shows. In simulation 10 holds where the
     bending goes together over a tenth to a third of the shared frames; what bends more slowly than the frames that
     are shared cannot be seen in them and asks for more."""
-    cells: int = 10
-    """Cells across the spread of the points, for even coverage."""
-    least_inliers: float = 0.3
-    """Least share of the weight within three residual scales for an edge to be accepted."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +106,8 @@ def align(
     start = _robust_start(pairs.thinned(chosen.start_pairs), metric, spread, chosen)
     S_v_u, trust, limit = _refine(pairs, start, metric, spread, chosen)
     scale, back = float(S_v_u.scale), S_v_u.inverse().apply(pairs.v)
-    known = measure_uncertainty(
-        pairs.u, back, pairs.weight, trust, limit / scale, pairs.group, metric, chosen.bending_gain
-    )
+    fitted = FittedPairs(pairs.u, back, pairs.weight, trust, limit / scale, pairs.group)
+    known = measure_uncertainty(fitted, metric, chosen.bending_gain)
     _check_extent(pairs.u, back, pairs.weight * trust)
     _check_determined(known.covariance, metric, chosen)
     residual = np.full(len(every.u), np.inf)
@@ -318,80 +312,3 @@ def _check_determined(covariance: Array, metric: bool, settings: AlignmentSettin
         raise DegenerateError(
             f"the points leave the scale open (to {scale:.0%}): they have no extent beside their noise"
         )
-
-
-# ---------------------------------------------------------------------------------------------- shared frames
-
-
-def align_overlap(
-    u: FrameSamples,
-    v: FrameSamples,
-    u_id: int,
-    v_id: int,
-    metric: bool,
-    settings: AlignmentSettings | None = None,
-) -> Edge:
-    """The edge between two chunks that share frames, by all points of them; a rigid one when `metric`.
-
-    Raises `DegenerateError` when the shared points do not determine it.
-    """
-    chosen = settings or AlignmentSettings()
-    pick_u, pick_v = _shared(u, v)
-    if len(pick_u) < chosen.least_pairs:
-        raise DegenerateError(
-            f"chunks {u_id} and {v_id} share {len(pick_u)} points; at least {chosen.least_pairs} are needed"
-        )
-    p_v = v.points[pick_v].astype(np.float64)
-    weight = u.confidence[pick_u].astype(np.float64) * v.confidence[pick_v]
-    weight *= coverage(p_v, chosen.cells)
-    found = align(u.points[pick_u], p_v, weight, u.frame[pick_u], metric, chosen)
-    accepted = found.close >= chosen.least_inliers
-    frames = len(np.unique(u.frame[pick_u]))
-    fit = f"{found.inliers} of {len(pick_u)} shared points of {frames} frames agree to {found.rms:.4f}"
-    outside = f"only {found.close:.0%} of the weight lies within {3 * chosen.residual_scale * found.spread:.3f}"
-    return Edge(
-        u=u_id,
-        v=v_id,
-        kind="adjacent",
-        S_v_u=found.S_v_u,
-        confidence=found.confidence,
-        weight=found.confidence,
-        inliers=found.inliers,
-        residual_m=found.rms,
-        accepted=accepted,
-        reason=fit if accepted else f"{fit}; {outside}",
-        scores={
-            "pairs": float(len(pick_u)),
-            "spread": found.spread,
-            "close": found.close,
-            "shared_frames": float(frames),
-        },
-        covariance=found.covariance,
-    )
-
-
-def _shared(u: FrameSamples, v: FrameSamples) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Positions in u and v of the samples at the same pixel of the same frame."""
-    key_u = (u.frame << np.int64(32)) + u.pixel
-    key_v = (v.frame << np.int64(32)) + v.pixel
-    _, pick_u, pick_v = np.intersect1d(key_u, key_v, assume_unique=True, return_indices=True)
-    return pick_u, pick_v
-
-
-def coverage(points: Array, cells: int) -> Array:
-    """Weights (N,) that fall with the root of the number of points in a cell, `cells` of them across the spread."""
-    cell = np.floor(points / (_spread(points) / cells)).astype(np.int64)
-    _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(1.0 / np.sqrt(count[which.ravel()]))
-
-
-def coverage_rank(points: Array, weight: Array, cells: int) -> NDArray[np.int64]:
-    """Place of each point in its cell, the heaviest first, `cells` of them across the spread. Taking points in order of
-    it gives each cell a like share. Shape (N,)."""
-    cell = np.floor((points - points.min(axis=0)) / (_spread(points) / cells)).astype(np.int64)
-    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
-    order = np.lexsort((-weight, key))
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    rank = np.empty(len(points), np.int64)
-    rank[order] = np.arange(len(points)) - np.repeat(starts, np.diff([*starts, len(points)]))
-    return rank

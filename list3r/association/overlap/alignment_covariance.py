@@ -44,26 +44,37 @@ class Uncertainty:
     """How much more the thirds of the groups disagree than the groups' own scatter explains; 1 for no bending."""
 
 
-def measure_uncertainty(
-    p_u: Array,
-    q_u: Array,
-    weight: Array,
-    trust: Array,
-    limit_u: float,
-    group: NDArray[np.int64],
-    metric: bool,
-    bending_gain: float = 1.0,
-) -> Uncertainty:
-    """The uncertainty of the symmetric fit under Tukey's biweight.
+@dataclass(frozen=True)
+class FittedPairs:
+    """N pairs of points after a fit under Tukey's biweight."""
 
-    `p_u` (N, 3) are u's points and `q_u` (N, 3) v's points brought to u by the fit; `weight` (N,) is as given, `trust`
-    (N,) that of the biweight, which is 0 from `limit_u` on (u's units); `group` (N,) numbers frames in order of time.
-    """
-    w = weight * trust / (weight * trust).sum()
-    center = w @ p_u
-    lever = float(np.sqrt(w @ ((p_u - center) ** 2).sum(axis=1)))
+    p_u: Array
+    """Points of u, in u. Shape (N, 3)."""
+    q_u: Array
+    """Points of v, brought to u by the fit. Shape (N, 3)."""
+    weight: Array
+    """As given to the fit. Shape (N,)."""
+    trust: Array
+    """Factor of the biweight on the weight, 0 from `limit_u` on. Shape (N,)."""
+    limit_u: float
+    """Residual beyond which a pair has no say, u's units."""
+    group: NDArray[np.int64]
+    """Number of the frame of each pair, in order of time. Shape (N,)."""
+
+    def normalised(self, center: Array, lever: float) -> FittedPairs:
+        """Return the pairs about `center` (3,), lengths in units of `lever`."""
+        p, q = (self.p_u - center) / lever, (self.q_u - center) / lever
+        return FittedPairs(p, q, self.weight, self.trust, self.limit_u / lever, self.group)
+
+
+def measure_uncertainty(pairs: FittedPairs, metric: bool, bending_gain: float = 1.0) -> Uncertainty:
+    """Estimate the uncertainty of the symmetric fit under Tukey's biweight, rigid when `metric`."""
+    weight = pairs.weight * pairs.trust
+    w = weight / weight.sum()
+    center = w @ pairs.p_u
+    lever = float(np.sqrt(w @ ((pairs.p_u - center) ** 2).sum(axis=1)))
     size = 6 if metric else 7
-    terms = _Terms.build((p_u - center) / lever, (q_u - center) / lever, weight, trust, limit_u / lever, group, size)
+    terms = _Terms.build(pairs.normalised(center, lever), size)
     count = len(terms.score)
     scatter = _steadied(_left_out(terms.information, terms.score), terms.information.sum(axis=0), count)
     scatter, bending = _with_bending(scatter + _ROUNDING**2 * np.eye(size), terms, bending_gain)
@@ -91,11 +102,10 @@ class _Terms:
     """Groups; where there is a single one, its pairs in order are cut into bands that stand in for groups."""
 
     @staticmethod
-    def build(
-        p: Array, q: Array, weight: Array, trust: Array, limit: float, group: NDArray[np.int64], size: int
-    ) -> _Terms:
-        """The estimating equations of the symmetric fit are those of least squares with the Jacobian at the middle of
-        the two noisy points; the information is the exact second derivative of the biweight."""
+    def build(pairs: FittedPairs, size: int) -> _Terms:
+        """Sum the estimating equations of the symmetric fit: those of least squares with the Jacobian at the middle of
+        the two noisy points. The information is the exact second derivative of the biweight."""
+        p, q, weight, trust, group = pairs.p_u, pairs.q_u, pairs.weight, pairs.trust, pairs.group
         order = np.argsort(group, kind="stable")
         order = order[trust[order] > 0]
         off, middle = p[order] - q[order], (p[order] + q[order]) / 2.0
@@ -104,7 +114,7 @@ class _Terms:
         jacobian = jacobian[:, :, :size]
         w, t = weight[order], trust[order]
         along = np.einsum("nij,ni->nj", jacobian, off)
-        curl = -4.0 * w * np.sqrt(t) / limit**2
+        curl = -4.0 * w * np.sqrt(t) / pairs.limit_u**2
         starts = np.flatnonzero(np.diff(group[order], prepend=np.iinfo(np.int64).min))
         frames = len(starts)
         if frames == 1:

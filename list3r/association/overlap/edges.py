@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.alignment import Alignment, AlignmentSettings, align
 from list3r.association.overlap.balance import BalancedSupport, balanced_support
-from list3r.association.overlap.plain_alignment import plain_align
 from list3r.association.overlap.shared_points import Pairs, shared_pairs
 from list3r.association.overlap.support import (
     Fit,
@@ -35,7 +34,7 @@ class EdgeSettings:
     """How an edge is measured."""
 
     instance_aware: bool = True
-    """False for the paper's baseline: all pairs that are confident enough, aligned as VGGT-Long does."""
+    """Whether regions that move leave the support; otherwise an edge stands on all pairs that are confident enough."""
     least_pairs: int = 60
     """Fewest pairs that an edge stands on."""
     least_inliers: float = 0.3
@@ -94,9 +93,8 @@ def measure_edge(
     settings: EdgeSettings | None = None,
     *,
     kind: str = "adjacent",
-    frames: tuple[int, int] | None = None,
 ) -> MeasuredEdge:
-    """The edge between two chunks that share frames; a rigid one when `metric`.
+    """Measure the edge between two chunks that share frames, a rigid one when `metric`.
 
     `camera` is that of the colour images. Raises `DegenerateError` where the shared points determine no transform; an
     edge that they determine but do not agree on is returned with `accepted` false and the reason.
@@ -111,7 +109,7 @@ def measure_edge(
     except DegenerateError as error:
         raise DegenerateError(f"chunks {u.chunk_id} and {v.chunk_id} cannot be aligned: {error}") from error
     return MeasuredEdge(
-        edge=_edge(static, support, found, u.chunk_id, v.chunk_id, chosen, kind, frames),
+        edge=_edge(static, support, found, (u.chunk_id, v.chunk_id), kind, chosen),
         moving_u=static.moving_u,
         moving_v=static.moving_v,
         support=EdgeSupport(pairs.frame, pairs.pixel, static.confident, static.removed, support.used),
@@ -121,31 +119,30 @@ def measure_edge(
 def _aligned(
     pairs: Pairs, known: Mask, camera: Camera, metric: bool, settings: EdgeSettings
 ) -> tuple[StaticSupport, BalancedSupport, Alignment]:
-    """What an edge stands on, and the alignment; without instances where they leave too little."""
+    """Choose what an edge stands on and align it; without instances where they leave too little."""
     if settings.instance_aware:
         static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
         support = balanced_support(pairs, static, camera, settings.support)
     else:
         static, support = _confident_support(pairs, settings.support)
     try:
-        found = _align(support, metric, settings)
+        found = align_support(support, metric, settings)
     except DegenerateError:
         if not settings.instance_aware or not static.removed.any():
             raise
         static, support = _confident_support(pairs, settings.support)
-        found = _align(support, metric, settings)
+        found = align_support(support, metric, settings)
     return static, support, found
 
 
-def _align(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
+def align_support(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
+    """Align what an edge stands on. `benchmarks/association.py` puts a plain alignment in its place."""
     s = support
-    if settings.instance_aware:
-        return align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment)
-    return plain_align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment.residual_scale)
+    return align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment)
 
 
 def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
-    """Robust alignment of a thinned part of the pairs."""
+    """Return a robust alignment of a thinned part of the pairs."""
 
     def fit(pairs: Pairs, mask: Mask) -> Sim3:
         rows = np.flatnonzero(mask)
@@ -160,7 +157,7 @@ def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
 
 
 def _confident_support(pairs: Pairs, settings: SupportSettings) -> tuple[StaticSupport, BalancedSupport]:
-    """All pairs that confidence alone would take, by their confidence."""
+    """Return all pairs that confidence alone would take, weighted by their confidence."""
     sure = confident(pairs, settings)
     none = np.zeros(len(pairs), bool)
     nobody: frozenset[int] = frozenset()
@@ -172,12 +169,11 @@ def _edge(
     static: StaticSupport,
     support: BalancedSupport,
     found: Alignment,
-    u_id: int,
-    v_id: int,
-    settings: EdgeSettings,
+    chunk_ids: tuple[int, int],
     kind: str,
-    frames: tuple[int, int] | None,
+    settings: EdgeSettings,
 ) -> Edge:
+    """Return the record of an edge, accepted or rejected with the reason."""
     shared_frames = len(np.unique(support.frame))
     moving = float((static.removed & static.confident).sum()) / max(1, int(static.confident.sum()))
     reason = (
@@ -192,8 +188,8 @@ def _edge(
     elif moving > settings.most_moving:
         reason, accepted = f"{reason}; too little stands still", False
     return Edge(
-        u=u_id,
-        v=v_id,
+        u=chunk_ids[0],
+        v=chunk_ids[1],
         kind=kind,
         S_v_u=found.S_v_u,
         confidence=found.confidence,
@@ -212,6 +208,5 @@ def _edge(
             "removed_instances": float(max(len(static.left_out_u), len(static.left_out_v))),
             "delta_max_px": static.delta_max_px,
         },
-        frames=frames,
         covariance=found.covariance,
     )

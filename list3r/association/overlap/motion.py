@@ -127,7 +127,8 @@ def seen_through(
             seen & np.isfinite(grid.nearest[row, column]) & (grid.nearest[row, column] > z * (1 + step[used.place, k]))
         )
         hidden = grid.farthest[row, column] < z * (1 - step[used.place, k])
-        behind &= ~_found_again(used, k, behind, z, grid, camera, chosen)
+        reach = chosen.footprint * grid.spacing_px * z / camera.fx
+        behind &= ~_found_again(used, k, behind, reach)
         for mask, target in ((behind, through), (seen & ~hidden & ~behind, again)):
             np.add.at(target, (used.instance[mask], used.place[mask], k), 1.0)
     visible = np.zeros((count, size))
@@ -263,10 +264,9 @@ def _depth_steps(
     return out
 
 
-def _found_again(
-    used: _Samples, k: int, behind: Mask, z: Floats, grid: _DepthGrid, camera: Camera, settings: MotionSettings
-) -> Mask:
-    """Points near their own instance's points in frame k: thin things slip through the grid. Shape (S,)."""
+def _found_again(used: _Samples, k: int, behind: Mask, reach: Floats) -> Mask:
+    """Return which points lie within `reach` (S,) of their own instance's points in frame k: thin things slip through
+    the depth grid. Shape (S,)."""
     out = np.zeros(len(behind), bool)
     asked = np.flatnonzero(behind)
     own = np.flatnonzero((used.place == k) & (used.instance >= 0))
@@ -275,7 +275,7 @@ def _found_again(
     far = 1e3 * float(np.abs(used.points).max() + 1.0)
     tree = cKDTree(np.column_stack([used.points[own], far * used.instance[own]]))
     distance, _ = tree.query(np.column_stack([used.points[asked], far * used.instance[asked]]))
-    out[asked] = distance < settings.footprint * grid.spacing_px * z[asked] / camera.fx
+    out[asked] = distance < reach[asked]
     return out
 
 

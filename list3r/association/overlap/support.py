@@ -156,8 +156,8 @@ def static_support(
     removed = known | doubted
     of_u = of_v = None
     for _ in range(settings.rounds):
-        of_u = inconsistency(pairs, sure, by_u, S_v_u, camera, settings, removed)
-        of_v = inconsistency(pairs, sure, by_v, S_v_u, camera, settings, removed)
+        off = displacement(pairs, S_v_u, camera, sure, removed)
+        of_u, of_v = (inconsistency(off, by, pairs.frame, camera, settings) for by in (by_u, by_v))
         removed_now = known | of_u.moving[by_u.of_pair] | of_v.moving[by_v.of_pair]
         if np.array_equal(removed_now, removed):
             break
@@ -180,16 +180,22 @@ def static_support(
     )
 
 
-def inconsistency(
-    pairs: Pairs,
-    sure: Mask,
-    regions: Regions,
-    S_v_u: Sim3,
-    camera: Camera,
-    settings: SupportSettings,
-    removed: Mask,
-) -> Inconsistency:
-    """How far each region is off, and whether that is more than what stands still is off by.
+@dataclass(frozen=True)
+class Displacement:
+    """How far the two chunks place each of N pairs apart."""
+
+    share: Floats
+    """In the camera of v, as a share of the depth. Shape (N, 3)."""
+    delta_px: Floats
+    """In the picture. Shape (N,)."""
+    sure: Mask
+    """Pairs that confidence alone would take. Shape (N,)."""
+    rest: Mask
+    """Those of them that were not removed. Shape (N,)."""
+
+
+def displacement(pairs: Pairs, S_v_u: Sim3, camera: Camera, sure: Mask, removed: Mask) -> Displacement:
+    """Measure how far the two chunks place each pair apart.
 
     The pose error of a frame displaces all that the frame shows and says nothing of motion, so points are compared in
     the camera of their frame, each chunk's by its own pose, after the frame's common change of scale is taken out;
@@ -203,8 +209,16 @@ def inconsistency(
     off = relative_to_frame(pairs, S_v_u, rest)
     if _typical(off, depth, rest) > _typical(off_world, depth, rest):
         off = off_world
-    share = off / depth[:, None]
-    medians, row, weight = _by_region_and_frame(share, regions, pairs.frame, sure)
+    return Displacement(off / depth[:, None], delta, sure, rest)
+
+
+def inconsistency(
+    off: Displacement, regions: Regions, frame: Ints, camera: Camera, settings: SupportSettings
+) -> Inconsistency:
+    """Tell how far each region is off, and whether that is more than what stands still is off by. `frame` has shape
+    (N,)."""
+    sure, rest = off.sure, off.rest
+    medians, row, weight = _by_region_and_frame(off.share, regions, frame, sure)
     total = np.maximum(np.bincount(row, weight, len(regions.count)), 1e-12)
     focal = np.array([camera.fx, camera.fy])
     across = np.bincount(row, weight * np.linalg.norm(medians[:, :2] * focal, axis=1), len(regions.count)) / total
@@ -213,7 +227,7 @@ def inconsistency(
     still = np.bincount(regions.of_pair, rest, len(regions.count))
     limit_across = _limit(across, still, judged, settings, settings.least_pixels * camera.width)
     limit_along = _limit(along, still, judged, settings, settings.least_depth)
-    mean_delta = np.bincount(regions.of_pair, delta * sure, len(regions.count)) / np.maximum(
+    mean_delta = np.bincount(regions.of_pair, off.delta_px * sure, len(regions.count)) / np.maximum(
         np.bincount(regions.of_pair, sure, len(regions.count)), 1
     )
     excess = np.where(judged, np.maximum(across / limit_across, along / limit_along), 0.0)

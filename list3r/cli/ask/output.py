@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from list3r.memory.records import BestView, Relation
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
-    from list3r.queries.views.camera import Camera
+    from list3r.queries.views.camera import PosedCamera
 
 Count = Annotated[int, typer.Option("-k", help="How many at most.")]
 MinConfidence = Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")]
@@ -42,7 +42,7 @@ MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera 
 
 def camera_from(
     scene: SceneMemory, view: int | None, time: float | None, pose: str | None, session: int | None
-) -> Camera | None:
+) -> PosedCamera | None:
     """The camera that the options name; None for none of them. Raises `OptionError`."""
     from list3r.memory.errors import OptionError
 

@@ -80,7 +80,7 @@ def cloud(
     S_truth_estimate, how = _cloud_alignment(align, true, found, true_path, path or estimate, truth, scale)
     found = thinned(found.moved(S_truth_estimate), voxel, points)
     distances = cloud_distances(true.points, found.points)
-    errors = evaluate_cloud(true.points, found.points, true.normals, _normals(found), threshold, truncate, distances)
+    errors = evaluate_cloud(true.points, found.points, (true.normals, _normals(found)), threshold, truncate, distances)
     if plot is not None:
         title = (
             f"{estimate.name} against {truth.name}: Chamfer {errors.chamfer_cm:.2f} cm, F {100 * errors.f_score:.1f} %"

@@ -15,7 +15,7 @@ _ANGLES = np.deg2rad(np.arange(0.0, 360.0, 15.0) - 90.0)
 
 
 @dataclass(frozen=True)
-class Anchor:
+class TagTarget:
     """A thing that wants a tag."""
 
     xy: tuple[float, float]
@@ -31,7 +31,7 @@ class Anchor:
         return self.half[0] < self.tag[0] or self.half[1] < self.tag[1] * 1.2
 
 
-def place_tags(anchors: Sequence[Anchor], page: Rect) -> list[tuple[float, float]]:
+def place_tags(anchors: Sequence[TagTarget], page: Rect) -> list[tuple[float, float]]:
     """Middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
 
     Tags avoid each other and the small things. Where nothing is free within the search radius the place of least
@@ -54,7 +54,7 @@ def _around(xy: tuple[float, float], half: tuple[float, float]) -> Rect:
     return xy[0] - half[0], xy[1] - half[1], xy[0] + half[0], xy[1] + half[1]
 
 
-def _nearest_free(anchor: Anchor, boxes: NDArray[np.float64], page: Rect) -> tuple[float, float]:
+def _nearest_free(anchor: TagTarget, boxes: NDArray[np.float64], page: Rect) -> tuple[float, float]:
     half = np.array(anchor.tag) / 2
     low, high = np.array(page[:2]) + half, np.array(page[2:]) - half
     best, least = anchor.xy, np.inf
@@ -71,7 +71,7 @@ def _nearest_free(anchor: Anchor, boxes: NDArray[np.float64], page: Rect) -> tup
     return best
 
 
-def _rings(anchor: Anchor) -> Iterator[NDArray[np.float64]]:
+def _rings(anchor: TagTarget) -> Iterator[NDArray[np.float64]]:
     """Places round an anchor, the best first: on it if it is large, then rings of growing radius. Shape (R, 2) each."""
     middle, across = np.array(anchor.xy), np.array(anchor.tag)
     start = np.array(anchor.half) + across / 2 + 3 if anchor.small else np.zeros(2)

@@ -15,7 +15,7 @@ from list3r.exporters.components import Component, has_box, read_components, thi
 from list3r.exporters.output import part_path, replacing, units
 from list3r.exporters.palette import Color, instance_color
 from list3r.exporters.plan.frame import PlanFrame, choose_rotation, is_wall, quarter_turn
-from list3r.exporters.plan.labels import Anchor, place_tags
+from list3r.exporters.plan.labels import TagTarget, place_tags
 from list3r.exporters.plan.layout import Layout, PlanSettings, choose_layout
 from list3r.exporters.plan.loops import loop_ends
 from list3r.exporters.plan.map import pale_picture
@@ -263,7 +263,7 @@ class _Sheet:
             width, name = self._chip_width(instance.id), _short_name(instance)
             room = width + self.draw.textlength(name, font=self.text_font) + 8 * k
             names.append(name if room < 1.8 * half[0] and half[1] > 20 * k else "")
-            anchors.append(Anchor((x, y), (half[0], half[1]), (room if names[-1] else width, 18.0 * k)))
+            anchors.append(TagTarget((x, y), (half[0], half[1]), (room if names[-1] else width, 18.0 * k)))
         page = (self.left + 4.0, self.top + 4.0, self.left + self.map_size[0] - 4.0, self.top + self.map_size[1] - 4.0)
         places = place_tags(anchors, page)
         for anchor, place in zip(anchors, places, strict=True):
@@ -274,7 +274,7 @@ class _Sheet:
             self._chip((left + width / 2, y), (width, anchor.tag[1]), instance.id)
             self._text((left + width + 5 * k, y), name, self.text_font, _INK, anchor="lm", halo=True)
 
-    def _leader(self, anchor: Anchor, place: tuple[float, float]) -> None:
+    def _leader(self, anchor: TagTarget, place: tuple[float, float]) -> None:
         (x, y), k = anchor.xy, _OVERSAMPLING
         reach = (anchor.tag[0] / 2, anchor.tag[1] / 2) if anchor.small else anchor.half
         if abs(place[0] - x) <= reach[0] and abs(place[1] - y) <= reach[1]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,10 @@ _AMPLE = 1.25
 """The first surroundings reach this much further than the k-th nearest of late: most questions are answered in one."""
 
 
+_ROUNDING = 1e-9
+"""Rounding errors of distances, world units."""
+
+
 class UsualReach:
     """How far the k-th nearest lay, over the last questions to an open store."""
 
@@ -26,27 +31,36 @@ class UsualReach:
         self.reach: float | None = None
 
 
-def nearest_first(
-    store: Store,
-    aabb: NDArray[np.float64],
-    k: int,
-    measure: Callable[[Instance], float],
-    *,
-    filters: Filters,
-    leave_out: int | None = None,
-    component: int | None = None,
-    limit: float | None = None,
-    touch: float = 0.0,
-) -> list[tuple[float, Instance]]:
-    """The k instances with the smallest `measure`, by it and then by id; nothing further than `limit`.
+@dataclass(frozen=True)
+class NearestSearch:
+    """What is searched for."""
 
-    `measure` must be at least the gap between an instance's box and `aabb` (2, 3), or `touch` less than that. So the
-    search ends when the surroundings that were looked at are as wide as the k-th best is far.
+    k: int
+    """How many instances are wanted."""
+    measure: Callable[[Instance], float]
+    """Distance of an instance, world units: at least the gap between its box and the box asked about, less `touch`."""
+    filters: Filters
+    leave_out: int | None = None
+    """Id of an instance that is no answer."""
+    component: int | None = None
+    """The only connected component that answers."""
+    limit: float | None = None
+    """Largest distance of an answer, world units."""
+    touch: float = 0.0
+    """How much smaller a distance may be than the gap between boxes, world units."""
+
+
+def nearest_first(store: Store, aabb: NDArray[np.float64], search: NearestSearch) -> list[tuple[float, Instance]]:
+    """Return the k nearest instances with their distances from a box (2, 3), by distance and then by id.
+
+    Boxes bound distances from below. So the search ends when the surroundings that were searched are as wide as the
+    k-th best is far.
     """
+    k, filters, limit = search.k, search.filters, search.limit
     bounds = store.world_bounds()
     if bounds is None:
         return []
-    touch += STRAY * float(np.linalg.norm(bounds[1] - bounds[0]))
+    touch = search.touch + STRAY * float(np.linalg.norm(bounds[1] - bounds[0]))
     whole = float(np.linalg.norm(np.maximum(np.abs(bounds - aabb[0]), np.abs(bounds - aabb[1])).max(axis=0))) + 1.0
     farthest = whole if limit is None else min(limit + touch, whole)
     kept = store.derived.of(UsualReach)
@@ -62,14 +76,14 @@ def nearest_first(
             structure=filters.structure,
             min_confidence=filters.min_confidence,
             state=filters.stored_state,
-            component=component,
+            component=search.component,
             limit=most,
         )
         if len(ids) == most:
             reach, shrinking = 0.5 * reach, shrinking - 1
             continue
         shrinking = 0
-        best = _measure(store, ids, box_gaps(boxes, aabb), k, measure, filters, leave_out, touch, measured)
+        best = _measure(store, ids, box_gaps(boxes, aabb), replace(search, touch=touch), measured)
         worst = best[k - 1][0] + touch if len(best) >= k else np.inf
         if worst <= reach or reach >= farthest:
             if len(best) >= k:
@@ -82,27 +96,24 @@ def _measure(
     store: Store,
     ids: NDArray[np.int64],
     gaps: NDArray[np.float64],
-    k: int,
-    measure: Callable[[Instance], float],
-    filters: Filters,
-    leave_out: int | None,
-    touch: float,
+    search: NearestSearch,
     measured: dict[int, tuple[float, Instance] | None],
 ) -> list[tuple[float, Instance]]:
-    """The best so far, in order, after looking at the surfaces of whatever could be among them."""
+    """Measure whatever could be among the k nearest. Returns the best so far, in order."""
+    k, farther = search.k, search.touch + _ROUNDING
     best = sorted((m for m in measured.values() if m is not None), key=lambda m: (m[0], m[1].id))[:k]
     order = np.lexsort((ids, gaps))
     start, width = 0, k + 2
     while start < len(order):
         part = order[start : start + width]
-        if len(best) >= k and gaps[part[0]] > best[k - 1][0] + touch + 1e-9:
+        if len(best) >= k and gaps[part[0]] > best[k - 1][0] + farther:
             break
-        fresh = [int(ids[n]) for n in part if int(ids[n]) not in measured and int(ids[n]) != leave_out]
+        fresh = [int(ids[n]) for n in part if int(ids[n]) not in measured and int(ids[n]) != search.leave_out]
         gap = dict(zip(ids[part].tolist(), gaps[part].tolist(), strict=True))
         for i in store.instances_of(fresh):
-            if len(best) >= k and gap[i.id] > best[k - 1][0] + touch + 1e-9:
+            if len(best) >= k and gap[i.id] > best[k - 1][0] + farther:
                 continue
-            measured[i.id] = (measure(i), i) if filters.passes(i) else None
+            measured[i.id] = (search.measure(i), i) if search.filters.passes(i) else None
             if (found := measured[i.id]) is not None:
                 best = sorted([*best, found], key=lambda m: (m[0], m[1].id))[:k]
         start, width = start + width, 2 * width
@@ -110,12 +121,12 @@ def _measure(
 
 
 def box_gaps(boxes: NDArray[np.float64], aabb: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances of boxes (N, 2, 3) from a box (2, 3), 0 where they meet. Shape (N,)."""
+    """Return the distances of boxes (N, 2, 3) from a box (2, 3), 0 where they meet. Shape (N,)."""
     apart = np.maximum(0.0, np.maximum(boxes[:, 0] - aabb[1], aabb[0] - boxes[:, 1]))
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
 
 
 def _spacing(store: Store, bounds: NDArray[np.float64], k: int) -> float:
-    """A first guess of how far the k-th nearest lies: as if all ids ever given were spread over the world."""
+    """Guess how far the k-th nearest lies, as if all ids ever given were spread evenly over the world."""
     side = np.maximum(bounds[1] - bounds[0], 1e-3)
     return float(np.cbrt(np.prod(side) * k / max(store.next_id(), 1)))

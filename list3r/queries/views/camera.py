@@ -16,7 +16,7 @@ from list3r.queries.match import checked_point
 
 
 @dataclass(frozen=True)
-class Camera:
+class PosedCamera:
     """A picture that was taken, or that could be."""
 
     T_world_cam: NDArray[np.float64]
@@ -42,7 +42,7 @@ class Camera:
         return -self.T_world_cam[:3, 1]
 
 
-def camera_of_frame(store: Store, frame: int, session: int | None = None) -> Camera:
+def camera_of_frame(store: Store, frame: int, session: int | None = None) -> PosedCamera:
     """The camera of a posed frame, of the first session that has it unless one is named.
 
     Raises `OptionError` for a frame that is not there or has no pose, with the nearest one that has.
@@ -56,7 +56,7 @@ def camera_of_frame(store: Store, frame: int, session: int | None = None) -> Cam
     return _camera(store, found[0])
 
 
-def camera_at_time(store: Store, time_s: float, session: int | None = None) -> Camera:
+def camera_at_time(store: Store, time_s: float, session: int | None = None) -> PosedCamera:
     """The camera of the posed frame nearest to a time, seconds of the source's clock. Raises `OptionError`."""
     if not np.isfinite(time_s):
         raise OptionError(f"time {time_s} must be a finite number of seconds")
@@ -71,7 +71,7 @@ def camera_at_pose(
     position: ArrayLike,
     quat_wxyz: ArrayLike,
     session: int | None = None,
-) -> Camera:
+) -> PosedCamera:
     """The camera of a session, put at a position of the world and turned by R_world_cam (OpenCV axes).
 
     Raises `OptionError` for a pose that is none and for a memory that has no camera.
@@ -89,10 +89,10 @@ def camera_at_pose(
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_from_quat_wxyz(quat), place
     c = chunks[0]
-    return Camera(pose, c.intrinsics, c.image_size, c.component, c.session_id)
+    return PosedCamera(pose, c.intrinsics, c.image_size, c.component, c.session_id)
 
 
-def last_camera(store: Store, session: int | None = None) -> Camera:
+def last_camera(store: Store, session: int | None = None) -> PosedCamera:
     """Where the camera was last. Raises `OptionError` when no frame has a pose."""
     rows = [f for f in store.frames(_checked_session(store, session)) if f.state == "posed"]
     if not rows:
@@ -107,12 +107,12 @@ def _checked_session(store: Store, session: int | None) -> int | None:
     return session
 
 
-def _camera(store: Store, frame: FrameRow) -> Camera:
+def _camera(store: Store, frame: FrameRow) -> PosedCamera:
     chunk = _chunk_of(store.chunks(frame.session_id), frame)
     S_world_cam = chunk.S_world_chunk @ Sim3.from_matrix(frame.T_chunk_cam)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = S_world_cam.rotation, S_world_cam.translation
-    return Camera(pose, chunk.intrinsics, chunk.image_size, chunk.component, frame.session_id, frame)
+    return PosedCamera(pose, chunk.intrinsics, chunk.image_size, chunk.component, frame.session_id, frame)
 
 
 def _chunk_of(chunks: Sequence[ChunkRow], frame: FrameRow) -> ChunkRow:

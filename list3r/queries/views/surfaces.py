@@ -23,7 +23,7 @@ _KEPT_POINTS = 4_000_000
 
 
 @dataclass(frozen=True)
-class Surface:
+class InstanceSurface:
     """What is known of the surface of one instance, world coordinates."""
 
     support: NDArray[np.float64] | None
@@ -55,14 +55,14 @@ class Surface:
         return float(np.median(np.asarray(self.tree.query(sample, k=2)[0])[:, 1]))
 
 
-class SurfaceCache(LruCache[tuple[int, bytes], Surface]):
+class SurfaceCache(LruCache[tuple[int, bytes], InstanceSurface]):
     """Surfaces by instance id and what tells that the instance is as it was."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_POINTS, lambda surface: surface.weight)
 
 
-def surface_of(store: Store, instance: Instance) -> Surface:
+def surface_of(store: Store, instance: Instance) -> InstanceSurface:
     """The surface of an instance: its support, or its box where it has none."""
     known = store.derived.of(SurfaceCache)
     stamp = instance.aabb.tobytes() + instance.center.tobytes() + instance.observations.to_bytes(8, "little")
@@ -76,7 +76,7 @@ def surface_points(store: Store, instance: Instance) -> tuple[NDArray[np.float64
     return surface.points, surface.spacing
 
 
-def _surface(store: Store, instance: Instance) -> Surface:
+def _surface(store: Store, instance: Instance) -> InstanceSurface:
     """Support points inside the box, as deriving the box left strays out; those just outside are moved to its side, so
     that a thing is never nearer than its box.
     """
@@ -86,10 +86,10 @@ def _surface(store: Store, instance: Instance) -> Surface:
         slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
         points = points[np.all((points >= low - slack) & (points <= high + slack), axis=1)]
     if len(points) == 0:
-        return Surface(None, instance)
+        return InstanceSurface(None, instance)
     stray = STRAY * float(np.max(instance.box.size))
     points = np.clip(points[:: -(-len(points) // _MAX_POINTS)], low - stray, high + stray)
-    return Surface(points, instance)
+    return InstanceSurface(points, instance)
 
 
 _FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.float64) * 0.5 - 0.5

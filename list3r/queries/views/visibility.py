@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
-from list3r.queries.views.camera import Camera
+from list3r.queries.views.camera import PosedCamera
 
 _WIDTH = 160
 """Cells across the depth buffer."""
@@ -37,7 +37,7 @@ _NOISE = 0.02
 
 
 @dataclass(frozen=True)
-class Seen:
+class Visibility:
     """How one thing shows in a picture."""
 
     instance: Instance
@@ -63,12 +63,12 @@ class _Drawn:
 
 def look(
     store: Store,
-    camera: Camera,
+    camera: PosedCamera,
     instances: Sequence[Instance],
     *,
     max_depth: float | None = None,
     occlusion: bool = True,
-) -> list[Seen]:
+) -> list[Visibility]:
     """The instances of which something shows, by id; those of other components than the camera's cannot be seen.
 
     `instances` are all that may hide or show. `max_depth` is the far end of the frustum, world units along z. Without
@@ -94,11 +94,11 @@ def look(
         x0, y0, x1, y1 = columns.min() * step, rows.min() * step, (columns.max() + 1) * step, (rows.max() + 1) * step
         box = (float(x0), float(y0), float(min(x1, camera.image_size[1])), float(min(y1, camera.image_size[0])))
         share, part = float(shows.mean()), float(shows.sum()) / (height * width)
-        out.append(Seen(d.instance, d.inside, share, part, float(d.depth[shows].min()), box))
+        out.append(Visibility(d.instance, d.inside, share, part, float(d.depth[shows].min()), box))
     return out
 
 
-def in_front(store: Store, camera: Camera, max_depth: float | None = None) -> list[Instance]:
+def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) -> list[Instance]:
     """What may show or hide in a picture, by id: what the R*Tree finds in the box around the frustum.
 
     In a memory of more than `_MANY` things those are left out that are narrower there than two cells of the buffer.
@@ -126,7 +126,7 @@ def in_front(store: Store, camera: Camera, max_depth: float | None = None) -> li
     return [i for i in store.instances_of(sorted(ids.tolist())) if i.state != "removed"]
 
 
-def _depths(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def _depths(boxes: NDArray[np.float64], camera: PosedCamera) -> NDArray[np.float64]:
     """Depths of the corners of boxes (N, 2, 3). Shape (N, 8)."""
     ahead = camera.T_world_cam[:3, 2]
     parts = (boxes - camera.place) * ahead
@@ -135,7 +135,7 @@ def _depths(boxes: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
 
 
 def _draw(
-    store: Store, camera: Camera, instance: Instance, step: float, size: tuple[int, int], max_depth: float | None
+    store: Store, camera: PosedCamera, instance: Instance, step: float, size: tuple[int, int], max_depth: float | None
 ) -> _Drawn | None:
     """The cells that an instance covers when nothing else is there, and its depth in each; None for none."""
     R, t = camera.T_world_cam[:3, :3], camera.T_world_cam[:3, 3]

@@ -1,4 +1,4 @@
-"""The alignment of VGGT-Long, kept to compare with: confident pairs alone, a fixed kernel, scale by ratio of spreads.
+"""The alignment of VGGT-Long as rows of `benchmarks/association.py` use it: a fixed kernel, scale by ratio of spreads.
 
 After the description of its settings: Huber kernel of 0.1, five rounds of re-weighting, scale the ratio of the weighted
 RMS radii, rotation by SVD with the determinant fixed (Umeyama 1991).
@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.overlap.alignment import Alignment
-from list3r.association.overlap.alignment_covariance import measure_uncertainty
+from list3r.association.overlap.alignment_covariance import FittedPairs, measure_uncertainty
+from list3r.association.overlap.balance import BalancedSupport
+from list3r.association.overlap.edges import EdgeSettings, align_support
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 
@@ -19,6 +21,14 @@ Array = NDArray[np.float64]
 HUBER = 0.1
 """Limit of the quadratic part of the kernel, units of v."""
 ROUNDS = 5
+
+
+def plain_support(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
+    """Align what an edge stands on: plainly where settings leave instances out, else as the product does."""
+    if settings.instance_aware:
+        return align_support(support, metric, settings)
+    s = support
+    return plain_align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment.residual_scale)
 
 
 def plain_align(
@@ -57,7 +67,7 @@ def _covariance(
 ) -> Array:
     limit = max(3 * 1.4826 * float(np.median(residual)), 1e-9)
     trust = np.maximum(0.0, 1.0 - (residual / limit) ** 2) ** 2
-    return measure_uncertainty(p_u, q_u, weight, trust, limit, group, metric).covariance
+    return measure_uncertainty(FittedPairs(p_u, q_u, weight, trust, limit, group), metric).covariance
 
 
 def _ratio_of_radii(p_u: Array, p_v: Array, weight: Array, metric: bool) -> Sim3:
