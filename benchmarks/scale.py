@@ -35,7 +35,7 @@ from list3r.queries.find import find
 from list3r.queries.nearest import nearest
 from list3r.queries.seen import visible
 from list3r.queries.similar import similar
-from list3r.queries.views.camera import Camera
+from list3r.queries.views.camera import PosedCamera
 from list3r.queries.within import within
 
 SPACE = "synthetic@1/256"
@@ -204,7 +204,7 @@ def camera_in(place: Floats) -> Camera:
     """A camera that looks along x, level."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], place
-    return Camera(pose, (525.0, 525.0, 319.5, 239.5), (480, 640), 1, 1)
+    return PosedCamera(pose, (525.0, 525.0, 319.5, 239.5), (480, 640), 1, 1)
 
 
 def features(count: int, seed: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from list3r.memory.records import Observation
 from list3r.memory.store.store import Store
 from list3r.queries.match import Match
 from list3r.queries.seen import seen, visible
-from list3r.queries.views.camera import Camera, camera_at_pose, camera_at_time, camera_of_frame, last_camera
+from list3r.queries.views.camera import PosedCamera, camera_at_pose, camera_at_time, camera_of_frame, last_camera
 from list3r.queries.within import within
 from tests.conftest import box_points, chunk_result, instance, local_instance, write_small_room
 
@@ -33,7 +33,7 @@ def ids(matches: list[Match]) -> list[int]:
     return [m.instance.id for m in matches]
 
 
-def at(store: Store, *place: float) -> Camera:
+def at(store: Store, *place: float) -> PosedCamera:
     return camera_at_pose(store, place, LOOKING_ALONG_X)
 
 

@@ -37,8 +37,8 @@ class NodeSettings:
     """Frames of a node: long enough to average what single frames err by, short against the 30 of an overlap."""
     measured_share: float = 0.3
     """Share of the measured change of relation along overlaps that is taken as a random walk of the chunks: errors
-    of single frames are in it, and bending grows slower than a walk does. Chosen among 0.03 to 3 on 18 simulated
-    videos (seeds 101 and up): mean ATE 0.0602 m, 0.0633 m at 0.1, 0.0612 m at 1, 0.076 m for rigid chunks."""
+    of single frames are in it, and bending grows slower than a walk does. Chosen among 0.03 to 3, see
+    docs/decisions/0043."""
     shift_walk: float = 1e-4
     """Deviation of the shift that a frame adds beyond what overlaps show, as a share of the depth: chunks of the same
     depth images err alike, and do not see it."""

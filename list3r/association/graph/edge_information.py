@@ -26,7 +26,7 @@ class WeightSettings:
     sharpness: float = 6.0
     """The paper's exponent g of the edge weight."""
     sharpen: bool = False
-    """Multiply the information of edges by the paper's weight; see `information` for why not."""
+    """Whether the information of edges is multiplied by the paper's weight; why not: docs/decisions/0041."""
     lever_m: float = 1.0
     """Distance at which a turn counts as much as a shift where an edge does not say, metres; without metric scale half
     the spread of its points takes its place."""
@@ -55,10 +55,8 @@ def edge_weights(confidence: Array, settings: WeightSettings) -> Array:
 def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
     """Inverse covariances of the edges' tangent errors with bending, in u's units.
 
-    Shape (E, D, D), D = 6 if metric else 7. The paper's sharpened confidence (A.4) is not multiplied in. 24 simulated
-    graphs of 60 chunks and 40 loops, mean ATE: plain 0.0535, confidence 0.0522, the paper's weight 0.0504, information
-    0.0398, information times the paper's weight 0.0395; but with 30 % false loops that agree 0.0430 and 0.159. Three
-    videos of the simulated feed-forward model: plain 0.056, information 0.030, times the paper's weight 0.033.
+    Shape (E, D, D), D = 6 if metric else 7. The paper's sharpened confidence (A.4) is not multiplied in, see
+    docs/decisions/0041.
     """
     size = 6 if metric else 7
     covariance = np.empty((len(edges), 7, 7))

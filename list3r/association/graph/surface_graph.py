@@ -1,15 +1,8 @@
-"""Where chunks of structure from motion lie for the things in them: by what depth says, not by the paths of cameras.
+"""Place chunks of structure from motion a second time, for their instances: by depth instead of camera paths.
 
-A path of a few decimetres tells the scale of a chunk worse than its depth does: on redkitchen (chunks of 100 frames)
-the scale between neighbours is off by 0.04 in the logarithm by the cameras, which the graph of cameras needs for its
-trajectory, while depth drifts against a sensor by 0.021 within a chunk and loops tell its scale to 0.012. So one mug
-lay at places up to 0.25 m apart. Here the same chunks are placed once more: neighbours by the cameras' directions
-and the ratio of the depths of the frames that they share, loops as they are. The cameras stay where their graph has
-them; what lies between is part of each chunk's bend.
-
-Measured on redkitchen as colour alone, two builds: spread of a mug over the chunks that found it 0.098 to 0.060 and
-0.073 to 0.061 (a metre is 1.2), things 85 to 79 and 61 to 54, fragments of true things 47 to 43 and 27 to 23; the
-trajectory is the same. Scales of nodes let loose in the graph of cameras instead: 0.057, but an ATE of 0.062 for 0.042.
+A path of a few decimetres tells the scale of a chunk worse than its depth does (docs/decisions/0044). Neighbours are
+tied by the cameras' directions and the ratio of the depths of shared frames, loops as they are. The cameras stay where
+their graph has them; the difference is part of each chunk's bend.
 """
 
 from __future__ import annotations

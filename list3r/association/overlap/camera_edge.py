@@ -1,9 +1,7 @@
-"""The relation of two chunks by the cameras of the frames that they share.
+"""Measure the relation of two chunks by the cameras of the frames that they share.
 
-Structure from motion places cameras far better than surfaces: on redkitchen the scale between neighbouring chunks is
-within 1 to 2 % of that of the whole video by the paths of the shared cameras, and 5 to 15 % off by their points, dense
-or triangulated, because what is seen at the end of a chunk was seen from few places. The path must be long enough to
-tell; else the points stay.
+Structure from motion places cameras far better than surfaces (docs/decisions/0048). The path must be long enough to
+tell the scale; otherwise the edge by points stays.
 """
 
 from __future__ import annotations

@@ -1,17 +1,10 @@
-"""Find places seen before (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
+"""Find loop closures (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
 
 Frame descriptors propose with a relaxed threshold (`frame_search`); the two chunks' instances add s_sem and s_rel
 (`instance_cues`); what s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel) holds likely is verified by the keyframes'
 features and depth where they have them (`verification`), else by a joint window (`joint_window`); and nothing is
 believed that the way the camera went contradicts (`chain`). Every candidate becomes an edge, accepted or not, with its
-scores and the reason.
-
-Chosen on 13 simulated videos (seeds 101 to 106; twins, kidnap, loop, corridor, sparse, calm), pairs of chunks against
-true covisibility: ranked by s_loop alone with lambda 0, 0.3, 0.5, 0.7, 1 the average precision is 0.915, 0.924, 0.935,
-0.947, 0.922 without twins and 0.617, 0.580, 0.554, 0.510, 0.446 in twins, so 0.5. A least s_loop of 0.7, 0.8, 0.9
-keeps 98, 90, 82 % of the true pairs and 37, 29, 11 % of the false ones (without twins). No score tells twin rooms
-apart: at precision 0.99 frame similarity finds 2 % of all true pairs and s_loop 3 %. After verification 82 % are found
-at precision 0.996 and no twin is taken for the other (without twins: frame similarity 44 %, verified 79 %).
+scores and the reason. How the weights were chosen: docs/decisions/0045.
 """
 
 from __future__ import annotations
