@@ -200,7 +200,7 @@ def _described(edge_m: float, color: str, shape: str) -> str:
     return f"{size} {color} {shape}, {100 * edge_m:.0f} cm"
 
 
-def camera_in(place: Floats) -> Camera:
+def camera_in(place: Floats) -> PosedCamera:
     """A camera that looks along x, level."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], place

@@ -15,9 +15,9 @@ from list3r.evaluation.revisits import (
     OPEN,
     TRUE,
     Candidates,
+    RevisitScores,
     RevisitTruthSettings,
     average_precision,
-    evaluate_revisits,
     frame_labels,
     judge,
     recall_at_precision,
@@ -64,8 +64,12 @@ def test_true_false_and_open_candidates_are_told_apart() -> None:
     assert judged.true_pairs == {(1, 4), (2, 4)}
 
 
+def scored(wanted: Candidates, known: Covisibility, spans: dict[int, tuple[int, int]]) -> RevisitScores:
+    return score([judge(wanted, known, spans)])
+
+
 def test_agreement_counts_pairs_of_chunks_once() -> None:
-    found = evaluate_revisits(
+    found = scored(
         candidates((4, 1, 27, 3, True, 0.9, 1.5), (1, 4, 5, 29, True, 0.8, 1.4), (1, 3, 2, 20, True, 0.95, 0.4)),
         truth(),
         SPANS,
@@ -80,7 +84,7 @@ def test_agreement_counts_pairs_of_chunks_once() -> None:
 
 
 def test_the_better_ranking_has_the_greater_recall() -> None:
-    found = evaluate_revisits(
+    found = scored(
         candidates((1, 4, 3, 27, False, 0.9, 1.5), (2, 4, 9, 33, False, 0.7, 1.4), (1, 3, 2, 20, False, 0.95, 0.4)),
         truth(),
         SPANS,
@@ -114,10 +118,10 @@ def test_videos_are_scored_together() -> None:
 
 def test_nothing_at_all_is_no_crash() -> None:
     empty = Covisibility(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 0), np.float32))
-    found = evaluate_revisits(candidates((1, 4, 3, 27, True, 0.9, 1.5)), empty, SPANS)
+    found = scored(candidates((1, 4, 3, 27, True, 0.9, 1.5)), empty, SPANS)
     assert (found.chunks.true, found.chunks.open, found.chunks.precision) == (0, 1, None)
     assert score([]).chunks.recall is None
-    assert evaluate_revisits(candidates(), truth(), SPANS).chunks.recall == 0.0
+    assert scored(candidates(), truth(), SPANS).chunks.recall == 0.0
 
 
 def test_unknown_covisibility_counts_neither_way() -> None:

@@ -13,7 +13,6 @@ pytest.importorskip("pxr")
 from pxr import Gf, Usd, UsdGeom, UsdUtils
 
 from list3r.exporters.palette import linear_from_srgb
-from list3r.exporters.usd.camera import camera_matrix
 from list3r.exporters.usd.stage import UsdSettings, class_token, usd_stage, write_usd
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
@@ -163,7 +162,8 @@ def test_class_token(label: str | None, description: str, structure: str | None,
 def test_the_camera_goes_where_the_frames_went(stage: Usd.Stage, room: Store) -> None:
     prim = stage.GetPrimAtPath("/World/Camera")
     for frame, S_world_cam in room.camera_poses():
-        assert np.allclose(local_to_world(prim, frame.frame_index), camera_matrix(S_world_cam), atol=1e-9)
+        T_world_usdcam = S_world_cam.as_matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
+        assert np.allclose(local_to_world(prim, frame.frame_index), T_world_usdcam, atol=1e-9)
         assert prim.GetAttribute("list3r:time").Get(frame.frame_index) == pytest.approx(frame.time_s)
     looking = local_to_world(prim, 0)[:3, :3] @ [0.0, 0.0, -1.0]
     assert np.allclose(looking, [1.0, 0.0, 0.0])

@@ -146,17 +146,6 @@ class RevisitScores:
         return asdict(self)
 
 
-def evaluate_revisits(
-    candidates: Candidates,
-    covisibility: Covisibility,
-    spans: Mapping[int, tuple[int, int]],
-    neighbours: Collection[tuple[int, int]] | None = None,
-    settings: RevisitTruthSettings | None = None,
-) -> RevisitScores:
-    """Judge and score the candidates of one video; see `judge` and `score`."""
-    return score([judge(candidates, covisibility, spans, neighbours, settings)], settings)
-
-
 def judge(
     candidates: Candidates,
     covisibility: Covisibility,
@@ -164,7 +153,7 @@ def judge(
     neighbours: Collection[tuple[int, int]] | None = None,
     settings: RevisitTruthSettings | None = None,
 ) -> Judgement:
-    """What is true of candidates.
+    """Tell which candidates of a video are true.
 
     `spans` gives the first and last Frame.index of each chunk. `neighbours` are pairs of chunks that are no revisits
     whatever they see; None takes those that share frames. A candidate's frame is looked up at the nearest frame of

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.association.graph.edge_information import WeightSettings, information, own_shapes, plain_information
 from list3r.association.graph.loop_trust import Believed, Tree, TrustSettings, judge
@@ -167,17 +168,12 @@ def _weak(edges: Sequence[Edge], ids: Sequence[int], weights: Array, settings: G
 
 
 def _components(ids: Sequence[int], edges: Sequence[Edge]) -> dict[int, int]:
-    """The smallest chunk id that each chunk is connected to."""
-    neighbours = _neighbours(edges)
-    component: dict[int, int] = {}
-    for root in ids:
-        queue = deque([root] if root not in component else [])
-        while queue:
-            chunk = queue.popleft()
-            if chunk not in component:
-                component[chunk] = root
-                queue.extend(other for other, _ in neighbours.get(chunk, []))
-    return component
+    """Return the first chunk id of each chunk's connected component, by chunk id. Edges join chunks of `ids`."""
+    joined: DisjointSet[int] = DisjointSet(ids)
+    for edge in edges:
+        joined.merge(edge.u, edge.v)
+    first: dict[int, int] = {}
+    return {chunk: first.setdefault(joined[chunk], chunk) for chunk in ids}
 
 
 class _SpanningTree:

@@ -87,8 +87,6 @@ class Inconsistency:
 
     delta_px: Floats
     """The paper's delta. Shape (R,)."""
-    across_px: Floats
-    """Displacement across the ray relative to the frame, px. Shape (R,)."""
     along: Floats
     """Displacement along the ray relative to the frame, as a share of the depth. Shape (R,)."""
     excess: Floats
@@ -231,7 +229,7 @@ def inconsistency(
         np.bincount(regions.of_pair, sure, len(regions.count)), 1
     )
     excess = np.where(judged, np.maximum(across / limit_across, along / limit_along), 0.0)
-    return Inconsistency(mean_delta, across, along, excess)
+    return Inconsistency(mean_delta, along, excess)
 
 
 def relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3, skew
+from list3r.association.graph.solver import adjoint
+from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
@@ -40,7 +41,6 @@ class Prediction:
     S_v_u: Sim3
     covariance: Array
     """Of x in S_true = S_v_u exp(x), u's units. Shape (7, 7)."""
-    hops: int
 
     def deviations(self, S_v_u: Sim3) -> float:
         """How many standard deviations away a measured relation is (Mahalanobis distance)."""
@@ -99,17 +99,7 @@ def _along(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings:
         covariance = covariance + moved @ noise @ moved.T
         S = step @ S
         here = edge.v if edge.u == here else edge.u
-    return Prediction(S, covariance + 1e-12 * np.eye(7), len(path))
-
-
-def adjoint(S: Sim3) -> Array:
-    """The matrix with S exp(x) S^-1 = exp(Ad x), tangents (rho, omega, sigma). Shape (7, 7)."""
-    out = np.eye(7)
-    out[:3, :3] = S.scale * S.rotation
-    out[:3, 3:6] = skew(S.translation) @ S.rotation
-    out[:3, 6] = -S.translation
-    out[3:6, 3:6] = S.rotation
-    return out
+    return Prediction(S, covariance + 1e-12 * np.eye(7))
 
 
 def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int) -> list[Edge] | None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from list3r.association.revisits.chain import adjoint
+from list3r.association.graph.solver import adjoint
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe

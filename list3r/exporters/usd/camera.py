@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from list3r.exporters.components import Component, frames_per_second
@@ -85,11 +84,3 @@ def set_time_range(stage: Usd.Stage, components: list[Component], store: Store) 
     rate = next((r for r in rates if r is not None), 30.0)
     stage.SetTimeCodesPerSecond(round(rate, 3))
     stage.SetFramesPerSecond(round(rate, 3))
-
-
-def camera_matrix(S_world_cam: Sim3) -> NDArray[np.float64]:
-    """T_world_usdcam as USD's cameras have it, column vectors. Shape (4, 4)."""
-    T_world_usdcam = np.eye(4)
-    T_world_usdcam[:3, :3] = S_world_cam.rotation @ USD_FROM_OPENCV
-    T_world_usdcam[:3, 3] = S_world_cam.translation
-    return T_world_usdcam
