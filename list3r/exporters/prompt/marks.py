@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from list3r.exporters.palette import Color, instance_color
-from list3r.exporters.plan.labels import Anchor, place_tags
+from list3r.exporters.plan.labels import TagTarget, place_tags
 from list3r.memory.masks import decode_mask
 from list3r.queries.pictures import InstanceSight, mask_border
 
@@ -67,7 +67,7 @@ def _anchor(
     zoom: int,
     draw: ImageDraw.ImageDraw,
     font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
-) -> Anchor:
+) -> TagTarget:
     """Where a tag belongs: on the pixel of the mask that is farthest from its edge."""
     from scipy.ndimage import distance_transform_edt
 
@@ -77,7 +77,7 @@ def _anchor(
     reach = float(inside.max()) * zoom
     wide = draw.textlength(str(sight.instance_id), font=font) + 8.0
     tall = float(font.getbbox("0")[3]) + 6.0
-    return Anchor(((float(x) - 0.5) * zoom, (float(y) - 0.5) * zoom), (reach, reach), (wide, tall))
+    return TagTarget(((float(x) - 0.5) * zoom, (float(y) - 0.5) * zoom), (reach, reach), (wide, tall))
 
 
 def _tag(
