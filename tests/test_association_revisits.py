@@ -18,10 +18,11 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 from list3r.memory.store.derived import Derived
 from list3r.memory.store.tables.chunks import LocalNode
-from list3r.reconstruction.features.local import FeatureSettings, match, relative_pose
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.features.local import match, relative_pose
+from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.view import SensorNoise
 from tests.rgbd_scenes import CAMERA, frames_along, pose_errors, walk
 
 GAUGE = Sim3.exp([0.3, -0.2, 0.5, 0.2, 0.4, -0.1, 0.0]).as_matrix()

@@ -23,7 +23,8 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.masks import encode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.keyframe_record import SampleSettings, frame_samples
+from list3r.reconstruction.keyframe_record import frame_samples
+from list3r.reconstruction.settings import SampleSettings
 from tests.association_scenes import BOX, BOXES, CAMERA, FLOOR, MOVER, WALL, Thing, film
 
 S_V = Sim3.exp([-0.3, 0.6, 0.1, -0.2, 0.4, 0.9, -0.3])

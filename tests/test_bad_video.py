@@ -27,9 +27,10 @@ from list3r.pipeline.build import _runs, build
 from list3r.pipeline.calibration import camera_notes
 from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
 from list3r.pipeline.session import Job, plan_session
-from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, _focal_sigma
+from list3r.reconstruction.sfm.calibration import _focal_sigma
 from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings
 from tests.conftest import write_small_room
 from tests.rgbd_scenes import CAMERA, render
 

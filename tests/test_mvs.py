@@ -12,11 +12,12 @@ import torch
 
 from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
-from list3r.reconstruction.mvs.fill import RegionFillSettings, fill_regions
-from list3r.reconstruction.mvs.fusion import DepthFusionSettings, DepthMap, fill_flat
+from list3r.reconstruction.mvs.fill import fill_regions
+from list3r.reconstruction.mvs.fusion import DepthMap, fill_flat
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up, resized_camera
+from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import dense_depth, plane_residual, stereo_noise
-from list3r.reconstruction.mvs.views import SweepViewSettings, choose_sources, pair_views, plane_depths
+from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
 COUNT = 20

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from list3r.association.revisits.frame_search import CLASSICAL
-from list3r.reconstruction.features.local import FeatureSettings, detect
+from list3r.reconstruction.features.local import detect
+from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.features.vlad import Vocabulary, describe_frame
 from tests.rgbd_scenes import CAMERA, frames_along, walk
 

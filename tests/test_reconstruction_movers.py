@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame
-from list3r.reconstruction.motion.movers import MoverSettings, surfaces
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.motion.movers import surfaces
+from list3r.reconstruction.motion.settings import MoverSettings
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.view import SensorNoise, make_view, shrink_camera
+from list3r.reconstruction.rgbd.view import make_view, shrink_camera
 from tests.rgbd_scenes import CAMERA, frames_along, pose_errors, walk
 
 SPEED_M_PER_S = 0.3

@@ -15,9 +15,10 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.reconstruction.registry import MODELS, ModelOptions, make_reconstructor
-from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, calibrate
+from list3r.reconstruction.sfm.calibration import calibrate
 from list3r.reconstruction.sfm.mapping import SparseMap, best_of
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings
 from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import CAMERA, render
 

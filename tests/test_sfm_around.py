@@ -14,17 +14,10 @@ from list3r.frames.chunking.borrowing import frames_around
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import umeyama
 from list3r.reconstruction.sfm.consistency import contradicted
-from list3r.reconstruction.sfm.links import LinkSettings, step_beside
-from list3r.reconstruction.sfm.mapping import (
-    KeyframeView,
-    MappingSettings,
-    MapProblem,
-    SparseMap,
-    agreed,
-    build_maps,
-    first_pairs,
-)
+from list3r.reconstruction.sfm.links import step_beside
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, agreed, build_maps, first_pairs
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
+from list3r.reconstruction.sfm.settings import LinkSettings, MappingSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import FRAMES, Held, centres, walk

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.sfm.calibration import CameraCalibrationSettings, _agreeing, _Estimate, _parted
-from list3r.reconstruction.sfm.tracks import CornerSettings, as_bright, follow_corners
+from list3r.reconstruction.sfm.calibration import _agreeing, _Estimate, _parted
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, CornerSettings
+from list3r.reconstruction.sfm.tracks import as_bright, follow_corners
 
 
 def wall(count: int = 24) -> list[np.ndarray]:

@@ -18,16 +18,11 @@ from list3r.reconstruction.features.learned import LearnedDetector, make_detecto
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.consistency import contradicted, epipolar_errors
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
-from list3r.reconstruction.sfm.keyframe_features import (
-    FinderSettings,
-    LocalFeatures,
-    likely_pairs,
-    make_finder,
-    match_features,
-)
+from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, likely_pairs, make_finder, match_features
 from list3r.reconstruction.sfm.links import keyframe_problem
 from list3r.reconstruction.sfm.mapping import build_maps
-from list3r.reconstruction.sfm.reconstructor import SfmReconstructor, SfmSettings
+from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
+from list3r.reconstruction.sfm.settings import FinderSettings, SfmSettings
 from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import pose

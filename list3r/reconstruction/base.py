@@ -13,6 +13,23 @@ from list3r.frames.base import Camera, Frame
 
 
 @dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviation of depth, a + b (z - c)^2, the law of structured light.
+
+    The constants are those of Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise", 2012, eq. 3.
+    """
+
+    constant_m: float = 0.0012
+    quadratic_per_m: float = 0.0019
+    nearest_m: float = 0.4
+
+    def sigma(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Standard deviation of depth values, metres. Any shape."""
+        away = depth - np.float32(self.nearest_m)
+        return np.float32(self.constant_m) + np.float32(self.quadratic_per_m) * away * away
+
+
+@dataclass(frozen=True)
 class DepthNoise:
     """How rough depth is that a model computed: standard deviation base + quadratic * z^2, chunk units.
 

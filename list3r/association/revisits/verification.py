@@ -16,9 +16,12 @@ from list3r.association.revisits.keyframe_covariance import KeyframeErrorSetting
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
-from list3r.reconstruction.features.local import FeaturePose, FeatureSettings, match, relative_pose
-from list3r.reconstruction.rgbd.registration import Anchors, FrameRegistration, RegistrationSettings, Samples, register
-from list3r.reconstruction.rgbd.view import SensorNoise, WorkingFrame, surface
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.features.local import FeaturePose, match, relative_pose
+from list3r.reconstruction.features.settings import FeatureSettings
+from list3r.reconstruction.rgbd.registration import Anchors, FrameRegistration, Samples, register
+from list3r.reconstruction.rgbd.settings import RegistrationSettings
+from list3r.reconstruction.rgbd.view import WorkingFrame, surface
 
 Pose = NDArray[np.float64]
 

@@ -18,7 +18,8 @@ from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Motion
 from list3r.reconstruction.base import Reconstruction, backproject
 from list3r.reconstruction.motion.follow import Blob, measure_blob, middles
 from list3r.reconstruction.motion.moving import SmallFrames
-from list3r.reconstruction.rgbd.confidence import ConfidenceSettings, depth_confidence
+from list3r.reconstruction.rgbd.confidence import depth_confidence
+from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 
 Array = NDArray[np.float64]
 

@@ -9,33 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.features.vlad import root_sift
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise
+from list3r.reconstruction.rgbd.view import Floats
 
 SIFT_WIDTH = 128
 LEARNED_RATIO = 0.95
 """Ratio of best to second best distance for learned descriptors: on redkitchen ALIKED then has SIFT's precision at 0.85
 for frames one second apart and 1.5 times its right pairs."""
-
-
-@dataclass(frozen=True)
-class FeatureSettings:
-    """How local features are found, matched and verified."""
-
-    count: int = 400
-    """Most features on a frame."""
-    contrast: float = 0.015
-    """SIFT's contrast threshold; low, so that plain rooms give some."""
-    ratio: float = 0.85
-    """Lowe's ratio of best to second best distance."""
-    trials: int = 400
-    """RANSAC samples of three pairs."""
-    least_pairs: int = 12
-    """Fewest pairs that must agree."""
-    gate_sigmas: float = 4.0
-    """Largest distance of an agreeing pair, in standard deviations of its depth."""
-    gate_least_m: float = 0.02
-    """That distance is never less, metres."""
 
 
 @dataclass(frozen=True)

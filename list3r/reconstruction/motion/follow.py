@@ -10,34 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.motion.moving import SmallFrames
+from list3r.reconstruction.motion.settings import FollowSettings
 from list3r.reconstruction.rgbd.view import pixel_rays
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FollowSettings:
-    """What belongs together over time."""
-
-    least_share: float = 0.0015
-    """Smallest blob, share of the picture."""
-    gap_m: float = 0.15
-    """Blobs of one frame whose boxes come this near to each other are one thing."""
-    reach_m: float = 0.25
-    """How far from where it is expected a thing may be,"""
-    speed_m_per_s: float = 2.5
-    """and how much further for each second since it was last seen."""
-    most_gap_s: float = 2.0
-    """Longest time out of sight."""
-    most_color: float = 45.0
-    """Largest difference of mean colours, RGB."""
-    min_frames: int = 5
-    """Fewest frames of a thing that moves."""
-    moved_m: float = 0.1
-    """Least way between two of its places,"""
-    moved_share: float = 0.35
-    """and in shares of its own width."""
-    most_tracks: int = 200
 
 
 @dataclass(frozen=True)

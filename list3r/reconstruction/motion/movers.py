@@ -12,51 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.reconstruction.rgbd.registration import (
-    FrameRegistration,
-    RegistrationSettings,
-    Samples,
-    register,
-    steps_without,
-)
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, WorkingFrame
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.motion.settings import MoverSettings
+from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register, steps_without
+from list3r.reconstruction.rgbd.settings import RegistrationSettings
+from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
 Mask = NDArray[np.bool_]
 Pose = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class MoverSettings:
-    """When a surface counts as moving of its own."""
-
-    least_share: float = 0.02
-    """Smallest surface that is looked at, share of the picture."""
-    most_share: float = 0.5
-    """Largest one; more than half of the picture is what the camera moves against."""
-    depth_step: float = 0.03
-    """Steps of depth beyond this share of it, and beyond noise, part surfaces."""
-    suspect_m: float = 0.0025
-    """The rest must want to shift a surface by at least this, and by a standard deviation, for a closer look."""
-    suspect_stride: int = 10
-    """Every n-th model point takes part in the search for suspects."""
-    check_stride: int = 3
-    """Every n-th model point takes part in the closer look."""
-    gray_sigma: float = 6.0
-    """Standard deviation of brightness between views of one surface, grey levels."""
-    truncate: float = 3.0
-    """Standard deviations beyond which a pixel counts as plainly not explained."""
-    gain: float = 0.05
-    """What all pixels together must gain of their cost under the pose of the rest, though the surface itself loses."""
-    rest_gain: float = 0.4
-    """Or what the rest alone must gain, whatever the surface loses."""
-    contrast: float = 2.5
-    """Least cost of the surface, against that of the rest, under the pose of the rest."""
-    least_seen: float = 0.3
-    """Share of a surface that must be comparable for a verdict."""
-    least_pairs: int = 20
-    """Fewest compared points for a surface to count as one that the model does not know."""
-    trial_frames: int = 10
-    """Frames after which a mover is looked at again: one that stayed where it was moves no more."""
 
 
 @dataclass(frozen=True)

@@ -10,62 +10,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise
+from list3r.reconstruction.motion.settings import MovingSurfaceSettings
+from list3r.reconstruction.rgbd.view import Floats
 
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class MovingSurfaceSettings:
-    """When a surface counts as seen through."""
-
-    width: int = 160
-    """Width of the small images, px: every n-th pixel of the frame."""
-    references: int = 12
-    """Frames, spread evenly over the chunk, that every other frame is compared with."""
-    search_step: int = 4
-    """Every n-th frame and every second small pixel are searched; the rest only where something was found."""
-    search_frames: int = 2
-    """Searched frames in which something must be found."""
-    votes: int = 2
-    """Frames that must have seen through a point, where more than that have looked."""
-    clear: int = 5
-    """Edge of the window, small px, in which a frame must read a surface behind: a pose may be wrong by half of it."""
-    through_m: float = 0.04
-    """How far behind, in metres,"""
-    through_share: float = 0.02
-    """in shares of the distance,"""
-    through_sigma: float = 4.0
-    """and in standard deviations of depth, together."""
-    same_m: float = 0.02
-    same_share: float = 0.01
-    """Two readings this near to each other, and within as many standard deviations, are of one surface."""
-    poses: float = 4.0
-    """Times the median disagreement of two frames, as of poses that are a little wrong, is added to both."""
-    near_share: float = 0.2
-    """Readings further apart than this share of the distance are of two surfaces and say nothing about poses."""
-    edge_share: float = 0.03
-    """Steps of depth beyond this share, and beyond noise, part surfaces."""
-    least_share: float = 0.0015
-    """Smallest part of the picture that is looked at."""
-    part: float = 0.5
-    """Share of the compared pixels of a surface, or of what of it was not seen to stay, that must be seen through."""
-    embedded: float = 0.35
-    """Share of its outline at which it may go on, without a step of depth, as a surface that stays: feet on a floor."""
-    hinted: float = 0.15
-    """The same for a surface that the odometry found to move of its own."""
-    carried: float = 0.6
-    """Share of a surface that must lie on what moved in the frame before, as far away, to go on with it,"""
-    surely_carried: float = 0.8
-    """and of a whole surface that goes on with it though nobody saw through it: a thing that stands still."""
-    noise: SensorNoise = field(default_factory=SensorNoise)
 
 
 @dataclass(frozen=True)

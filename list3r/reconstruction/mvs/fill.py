@@ -2,39 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.reconstruction.mvs.settings import RegionFillSettings
+
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class RegionFillSettings:
-    """Which regions are filled. Pixels are those of the working width, 320."""
-
-    edge: float = 9.0
-    """Change of colour across two pixels that parts regions, grey levels."""
-    least_px: int = 12
-    most_share: float = 0.2
-    """Larger regions, as a share of the picture, are left unknown."""
-    rim_px: int = 4
-    """Width of the rim."""
-    rim_color: float = 20.0
-    """The rim looks like its region within this, grey levels: what stands before a wall is no rim of the wall."""
-    rim_least: int = 24
-    tolerance: float = 0.015
-    """Distance from the plane, share of depth."""
-    agree: float = 0.6
-    """Share of the rim that must lie on the plane,"""
-    around: float = 0.6
-    """and share of the region that this part of the rim must surround."""
-    sigma: float = 0.05
-    """Deviation that filled depth is said to have, share of depth."""
-    hypotheses: int = 80
 
 
 def fill_regions(

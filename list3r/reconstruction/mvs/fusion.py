@@ -8,32 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up
-
-
-@dataclass(frozen=True)
-class DepthFusionSettings:
-    """How depth is checked, fused and filled."""
-
-    match_px: float = 0.35
-    """Deviation of a match along its line, px at the refined width."""
-    drift: float = 0.006
-    """Disagreement of keyframes that is left where matches are perfect, share of depth (poses, rounding)."""
-    gate: float = 2.5
-    """Deviations within which two keyframes agree."""
-    most_gate: float = 0.04
-    """They never agree further apart than this share of depth."""
-    least_agree: int = 2
-    """Other keyframes that must agree; all of them where fewer see the place, but never none."""
-    fill_radius_px: int = 8
-    """Half the window that holes are filled from; something must be known this near on all four sides."""
-    fill_share: float = 0.35
-    """Share of the window that must be known,"""
-    fill_residual: float = 0.012
-    """and how flat it must be: deviation from a plane, share of depth."""
-    fill_sigma: float = 0.04
-    """Deviation that filled depth is said to have, share of depth."""
-    carried_from: int = 6
-    """Keyframes whose depth is carried into a frame."""
+from list3r.reconstruction.mvs.settings import DepthFusionSettings
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.reconstruction.base import DepthNoise
-from list3r.reconstruction.mvs.fill import RegionFillSettings, fill_regions
+from list3r.reconstruction.mvs.fill import fill_regions
 from list3r.reconstruction.mvs.fusion import (
-    DepthFusionSettings,
     DepthMap,
     SweptDepth,
     agree_and_fuse,
@@ -30,9 +29,12 @@ from list3r.reconstruction.mvs.fusion import (
     speckles_out,
 )
 from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, make_pictures, sharpness
-from list3r.reconstruction.mvs.sweep import DepthMatch, SweepReference, SweepSettings, coarse_match, refine
+from list3r.reconstruction.mvs.settings import (
+    MatchTrustSettings,
+    MvsSettings,
+)
+from list3r.reconstruction.mvs.sweep import DepthMatch, SweepReference, coarse_match, refine
 from list3r.reconstruction.mvs.views import (
-    SweepViewSettings,
     ViewPairs,
     choose_keyframes,
     choose_neighbours,
@@ -45,31 +47,6 @@ __all__ = ["MvsSettings", "Sparse", "dense_depth", "stereo_noise"]
 
 Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Places (N, 2) in px and depths (N,) of a frame's triangulated points."""
-
-
-@dataclass(frozen=True)
-class MatchTrustSettings:
-    """Which matches mean something, and what confidence says."""
-
-    most_cost: float = 0.35
-    """Matching cost above which a match is none (ZNCC 0.3)."""
-    least_margin: float = 0.02
-    """A different depth must cost this much more, or it may be that one."""
-    least_texture: float = 0.5
-    """Variance of the window over that of noise below which there is nothing to match."""
-    half_sigma: float = 0.02
-    """Deviation, share of depth, at which confidence is one half."""
-
-
-@dataclass(frozen=True)
-class MvsSettings:
-    """Dense depth of a chunk."""
-
-    views: SweepViewSettings = field(default_factory=SweepViewSettings)
-    sweep: SweepSettings = field(default_factory=SweepSettings)
-    fusion: DepthFusionSettings = field(default_factory=DepthFusionSettings)
-    fill: RegionFillSettings = field(default_factory=RegionFillSettings)
-    trust: MatchTrustSettings = field(default_factory=MatchTrustSettings)
 
 
 @dataclass(frozen=True)

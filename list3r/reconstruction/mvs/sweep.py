@@ -8,35 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up
-
-
-@dataclass(frozen=True)
-class SweepSettings:
-    """How one keyframe is matched with its sources."""
-
-    coarse_width_px: int = 160
-    """Width at which all depths are tried."""
-    width_px: int = 320
-    """Width at which depth is refined, fused and filtered."""
-    planes: int = 96
-    radius_px: int = 2
-    """Half the matching window, at either width."""
-    image_noise: float = 0.006
-    """Standard deviation of a small picture's brightness; texture below it tells nothing."""
-    path_small: float = 0.03
-    """Cost of a step of one plane between neighbours; matching costs lie in [0, 1]."""
-    path_large: float = 0.22
-    """Cost of a larger step between neighbours of equal brightness."""
-    path_edge: float = 0.04
-    """Difference of brightness that halves the cost of a larger step."""
-    refine_steps: tuple[float, ...] = (0.5, 0.25)
-    """Spacing of the depths that each refinement tries, planes."""
-    edge_reach_px: int = 5
-    """How far the coarse windows carry a surface beyond its edge; so far depth is chosen anew, at the refined width."""
-    edge_likeness: float = 0.05
-    """Difference of brightness at which a neighbour's evidence counts e times less."""
-    edge_doubt: float = 0.02
-    """Cost that must lie between two surfaces close by; with less it is unknown which of them a pixel shows."""
+from list3r.reconstruction.mvs.settings import SweepSettings
 
 
 @dataclass(frozen=True)

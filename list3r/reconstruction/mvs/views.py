@@ -10,34 +10,9 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.mvs.images import Poses
+from list3r.reconstruction.mvs.settings import SweepViewSettings
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class SweepViewSettings:
-    """How keyframes and their sources are chosen. Angles are of triangulation."""
-
-    stride: int = 8
-    """Most frames from one keyframe to the next; the sharpest of each run is taken."""
-    least_keyframes: int = 6
-    """Short chunks have shorter runs, so that there are about so many."""
-    step: float = 0.06
-    """A run also ends when the camera has moved by this share of the depth,"""
-    turn_deg: float = 8.0
-    """or turned by this."""
-    sources: int = 6
-    neighbours: int = 6
-    """Other keyframes that a keyframe's depth is compared with."""
-    ideal_deg: float = 5.0
-    """Angle that trades precision against change of looks best."""
-    angle_spread: float = 0.6
-    """How soon another angle counts less, natural logarithm."""
-    least_deg: float = 0.6
-    """Sources with less parallax tell nothing."""
-    most_deg: float = 30.0
-    least_overlap: float = 0.3
-    """Share of the picture that a source must see."""
 
 
 @dataclass(frozen=True)

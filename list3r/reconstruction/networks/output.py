@@ -14,8 +14,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import TrackingError
 from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.rgbd.confidence import beside_edge
-from list3r.reconstruction.rgbd.odometry import OdometrySettings
 from list3r.reconstruction.rgbd.reconstructor import select_keyframes
+from list3r.reconstruction.rgbd.settings import OdometrySettings
 
 LEAST_CONFIDENCE = 0.05
 """Depth that the network believes in less than this is unknown (what the authors of pi3 keep in their odometry)."""

@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, shrink_camera, shrink_depth, surface
-
-
-@dataclass(frozen=True)
-class ConfidenceSettings:
-    """How confidence falls off."""
-
-    half_sigma_m: float = 0.01
-    """Depth noise at which confidence is one half, metres."""
-    full_cosine: float = 0.5
-    """Cosine between ray and normal above which the angle costs nothing."""
-    edge_step: float = 0.02
-    """Depth step between neighbours that makes an edge, as a share of depth."""
-    edge_confidence: float = 0.1
-    """Factor at pixels beside an edge, where depth mixes two surfaces."""
-    working_width: int = 160
-    """Width of the image on which the angle is measured, px."""
-    noise: SensorNoise = field(default_factory=SensorNoise)
+from list3r.reconstruction.rgbd.settings import ConfidenceSettings
+from list3r.reconstruction.rgbd.view import Floats, shrink_camera, shrink_depth, surface
 
 
 def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> NDArray[np.float16]:

@@ -17,65 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.reconstruction.features.local import Features, FeatureSettings, detect, match, relative_pose
-from list3r.reconstruction.motion.movers import Mask, MoverMemory, MoverSettings, find_mover, fit, without
-from list3r.reconstruction.rgbd.registration import FrameRegistration, RegistrationSettings, Samples, register
-from list3r.reconstruction.rgbd.surfels import SurfelModel, SurfelSettings
-from list3r.reconstruction.rgbd.view import SensorNoise, WorkingFrame, make_view, shrink_camera
+from list3r.reconstruction.features.local import Features, detect, match, relative_pose
+from list3r.reconstruction.motion.movers import Mask, MoverMemory, find_mover, fit, without
+from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register
+from list3r.reconstruction.rgbd.settings import OdometrySettings
+from list3r.reconstruction.rgbd.surfels import SurfelModel
+from list3r.reconstruction.rgbd.view import WorkingFrame, make_view, shrink_camera
 
 Pose = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class OdometrySettings:
-    """How the camera is followed."""
-
-    working_width: int = 160
-    """Width of the images that are registered, px."""
-    samples: int = 6000
-    """Model points used for one frame."""
-    least_known: float = 0.08
-    """Least share of pixels with depth and normal for a frame to be of use."""
-    least_overlap: float = 0.2
-    """Least share of the model points in view that fall on known depth, relative to the frame's known share."""
-    least_inliers: float = 0.6
-    """Least share of those that agree."""
-    most_residual: float = 3.0
-    """Largest robust deviation of the depth residuals, in units of the sensor's noise."""
-    least_correlation: float = 0.5
-    """Least correlation of brightness with the model's, where either has any."""
-    most_looseness_m: float = 0.02
-    """Largest standard deviation of the worst determined motion, at the median depth: guards against bare walls."""
-    doubt: float = 0.85
-    """A frame whose inliers fall below this share of the usual is searched for as well."""
-    forget: float = 0.98
-    """What remains of the usual share of inliers from one frame to the next that has less."""
-    most_speed_m_per_s: float = 3.0
-    most_turn_deg_per_s: float = 360.0
-    gap_s: float = 0.15
-    """Frames further apart than this are searched for; a prediction of their motion means little."""
-    most_gap_s: float = 1.5
-    """Frames further apart than this are searched for by features only."""
-    short_segment: int = 5
-    """Frames after which a new segment stands on its own."""
-    search_keyframes: int = 6
-    """Most keyframes whose features are compared in a search."""
-    sweep_samples: int = 800
-    """Model points used by the coarse registrations of a search."""
-    sweep: RegistrationSettings = field(
-        default_factory=lambda: RegistrationSettings(
-            iterations=10, gate_m=0.4, gate_halvings=4, gate_hold=2, huber=3.0, normal_agreement=0.6
-        )
-    )
-    """Those coarse registrations: a wide gate that closes slowly."""
-    keyframe_turn_deg: float = 12.0
-    keyframe_shift: float = 0.12
-    """Translation between keyframes as a share of the median depth."""
-    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    fusion: SurfelSettings = field(default_factory=SurfelSettings)
-    features: FeatureSettings = field(default_factory=FeatureSettings)
-    movers: MoverSettings = field(default_factory=MoverSettings)
-    noise: SensorNoise = field(default_factory=SensorNoise)
 
 
 @dataclass(eq=False)

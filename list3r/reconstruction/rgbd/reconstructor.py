@@ -16,26 +16,17 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.motion.follow import FollowSettings, follow_movers
-from list3r.reconstruction.motion.moving import MovingSurfaceSettings, SmallFrames, find_moving
+from list3r.reconstruction.motion.follow import follow_movers
+from list3r.reconstruction.motion.moving import SmallFrames, find_moving
 from list3r.reconstruction.registry import ModelOptions
-from list3r.reconstruction.rgbd.confidence import ConfidenceSettings, depth_confidence
-from list3r.reconstruction.rgbd.odometry import CameraTracker, OdometrySettings
+from list3r.reconstruction.rgbd.confidence import depth_confidence
+from list3r.reconstruction.rgbd.odometry import CameraTracker
+from list3r.reconstruction.rgbd.settings import OdometrySettings, RgbdSettings
 
 
 def make(options: ModelOptions) -> RgbdReconstructor:
     """The model with its default settings; it runs on the CPU whatever device is named."""
     return RgbdReconstructor(poses=options.poses)
-
-
-@dataclass(frozen=True)
-class RgbdSettings:
-    """How a chunk of RGB-D frames is reconstructed."""
-
-    odometry: OdometrySettings = field(default_factory=OdometrySettings)
-    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
-    moving: MovingSurfaceSettings = field(default_factory=MovingSurfaceSettings)
-    follow: FollowSettings = field(default_factory=FollowSettings)
 
 
 @dataclass(frozen=True)

@@ -15,33 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import skew
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, WorkingFrame
-
-
-@dataclass(frozen=True)
-class RegistrationSettings:
-    """How a view is registered."""
-
-    iterations: int = 12
-    gate_m: float = 0.10
-    """First limit of the point-to-plane distance."""
-    gate_halvings: int = 2
-    """How often that limit is halved on the way."""
-    gate_hold: int = 1
-    """Iterations before it is halved again."""
-    huber: float = 1.345
-    """Limit of the quadratic part of the kernel, in robust standard deviations."""
-    normal_agreement: float = 0.7
-    """Least cosine between the normals of a pair."""
-    photometric_weight: float = 2.0
-    """Weight of a brightness residual against a depth residual of the same number of standard deviations."""
-    normal_noise: float = 0.05
-    """Standard deviation of a measured normal, radians; what such noise seems to determine does not count."""
-    gradient_noise: float = 2.0
-    """Brightness gradients below this determine nothing, grey levels per pixel."""
-    least_pairs: int = 150
-    converged: float = 3e-5
-    """Largest component of the last step, metres and radians."""
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.rgbd.settings import RegistrationSettings
+from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
 
 @dataclass(frozen=True)

@@ -6,26 +6,14 @@ Surface elements instead of a volume: no resolution or extent to choose, and cos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.rgbd.registration import Samples
-from list3r.reconstruction.rgbd.view import Floats, SensorNoise, WorkingFrame
-
-
-@dataclass(frozen=True)
-class SurfelSettings:
-    """How views are fused into a model."""
-
-    weight_cap: float = 50.0
-    """Most views that an element remembers, so that it can still follow a change."""
-    normal_agreement: float = 0.6
-    """Least cosine between an element and a measurement that update it."""
-    drop_below: float = 0.02
-    """Weight under which an element that later views saw through is dropped."""
+from list3r.reconstruction.rgbd.settings import SurfelSettings
+from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
 
 class SurfelModel:

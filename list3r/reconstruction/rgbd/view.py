@@ -10,28 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.base import SensorNoise
 
 Floats = NDArray[np.float32]
 
 _MAX_GRAZING_SLOPE = 4.0
 """Tangent of the steepest angle between view ray and surface normal that still counts as a surface (76 degrees)."""
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviation of depth, a + b (z - c)^2, the law of structured light.
-
-    The constants are those of Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise", 2012, eq. 3.
-    """
-
-    constant_m: float = 0.0012
-    quadratic_per_m: float = 0.0019
-    nearest_m: float = 0.4
-
-    def sigma(self, depth: Floats) -> Floats:
-        """Standard deviation of depth values, metres. Any shape."""
-        away = depth - np.float32(self.nearest_m)
-        return np.float32(self.constant_m) + np.float32(self.quadratic_per_m) * away * away
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ for all. A window's parallax decides how much it says. All chunks use the camera
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,53 +15,10 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
 from list3r.reconstruction.sfm.colmap import pycolmap
-from list3r.reconstruction.sfm.links import LinkSettings, keyframe_problem
-from list3r.reconstruction.sfm.mapping import KeyframeView, MappingSettings, MapProblem, Poses, SparseMap, build_maps
-from list3r.reconstruction.sfm.tracks import CornerSettings, CornerTracks, follow_corners
-
-
-@dataclass(frozen=True)
-class CameraCalibrationSettings:
-    """Which frames are looked at, and what is believed."""
-
-    windows: int = 5
-    """Stretches of the video that are looked at."""
-    frames: int = 100
-    """Frames in each."""
-    least_frames: int = 60
-    """... and in each of a video too short for so many: the windows of a short one overlap by half, so that where it
-    stands still, shows a wall or jumps in the middle there is one without that. One window of four clips of 160 frames
-    of redkitchen tells focal lengths 8, 12, 6 and (a guess) 38 % off, three of 80 frames 11, 0, 3 and 1 %."""
-    least_windows: int = 3
-    """Windows of such a video."""
-    most_window_ratio: float = 1.3
-    """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
-    zoom_ratio: float = 1.5
-    """Windows whose focal length is farther off than this are told of: more than four deviations of one window. Windows
-    shorter than `frames` say too little for that."""
-    zoom_distortion: float = 0.2
-    """... unless their k1 is farther off than this, see below."""
-    most_error_px: float = 2.0
-    """Observations farther from their point's image than this are left out."""
-    rounds: int = 3
-    """Joint adjustments, each without what the one before contradicts."""
-    focal_range: tuple[float, float] = (0.4, 3.0)
-    """Focal lengths believed, by the longer side of the picture."""
-    distortion_range: tuple[float, float] = (-0.5, 0.2)
-    """k1 believed. With little parallax a map bends a focal length that is too long straight by a large positive k1,
-    as no lens of a camera has it: of 19 windows of redkitchen three say 887, 971 and 2947 px of 524, with 0.26, 0.32
-    and 5.3."""
-    least_shift_px: float = 0.3
-    """Distortion that shifts the corners of the picture by less is none."""
-    window_sigma: float = 0.09
-    """Standard deviation of the logarithm of one window's focal length (redkitchen, 60 to 100 frames: 0.087)."""
-    window_weight: float = 4.0
-    """So many windows' worth is that belief when the windows of a video tell their own spread."""
-    doubted_sigmas: float = 2.5
-    """A given focal length farther off than this is doubted aloud."""
-    tracks: CornerSettings = field(default_factory=CornerSettings)
-    links: LinkSettings = field(default_factory=LinkSettings)
-    mapping: MappingSettings = field(default_factory=MappingSettings)
+from list3r.reconstruction.sfm.links import keyframe_problem
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, Poses, SparseMap, build_maps
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings
+from list3r.reconstruction.sfm.tracks import CornerTracks, follow_corners
 
 
 @dataclass(frozen=True)

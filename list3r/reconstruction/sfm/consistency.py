@@ -8,27 +8,17 @@ lines that the map's poses give (decision 0065).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.memory.geometry import skew
+from list3r.reconstruction.sfm.settings import ConsistencySettings
 
 Floats = NDArray[np.float64]
 Seen = Mapping[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Where verified matches are seen in two keyframes, px, by keys. Shapes (M, 2)."""
-
-
-@dataclass(frozen=True)
-class ConsistencySettings:
-    """When a keyframe is contradicted."""
-
-    most_px: float = 4.0
-    """Largest epipolar error of a match that agrees, px of a picture 640 wide."""
-    least_share: float = 0.75
-    """Least share of a keyframe's matches that must agree."""
 
 
 def contradicted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,21 +13,11 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
-from list3r.reconstruction.sfm.mapping import MappingSettings, Poses, SparseMap
+from list3r.reconstruction.sfm.mapping import Poses, SparseMap
+from list3r.reconstruction.sfm.settings import FramePoseSettings, MappingSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class FramePoseSettings:
-    """How the frames between keyframes are posed."""
-
-    bridge: int = 4
-    """Frames without corners in a row, between two that are posed, that are looked for by the structure known there."""
-    bridge_window_px: int = 31
-    """Window by which its points are looked for."""
-    mapping: MappingSettings = field(default_factory=MappingSettings)
 
 
 @dataclass

@@ -15,29 +15,10 @@ from numpy.typing import NDArray
 from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.features.local import LEARNED_RATIO, nearest_pairs
 from list3r.reconstruction.features.vlad import root_sift
+from list3r.reconstruction.sfm.settings import FinderSettings
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class FinderSettings:
-    """How features of keyframes are found and matched."""
-
-    count: int = 2000
-    """SIFT features of a keyframe."""
-    learned_count: int = 1200
-    """Learned ones."""
-    contrast: float = 0.015
-    """SIFT's contrast threshold."""
-    ratio: float = 0.85
-    """Lowe's ratio of SIFT."""
-    few: int = 300
-    """The surest features, by which keyframes worth matching are chosen."""
-    least_few: int = 4
-    """Fewest of them that must agree."""
-    partners: int = 8
-    """Keyframes that one is matched with, those that most agree."""
 
 
 @dataclass(frozen=True)

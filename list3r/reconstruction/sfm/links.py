@@ -8,39 +8,13 @@ features as well, because corners alone bend a chunk with little motion (decisio
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from list3r.reconstruction.sfm.keyframe_features import (
-    Finder,
-    FinderSettings,
-    likely_pairs,
-    make_finder,
-    match_features,
-)
+from list3r.reconstruction.sfm.keyframe_features import Finder, likely_pairs, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, shared_rows
+from list3r.reconstruction.sfm.settings import LinkSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
-
-
-@dataclass(frozen=True)
-class LinkSettings:
-    """Which keyframes are related, and how features are found."""
-
-    features: FinderSettings = field(default_factory=FinderSettings)
-    least_matches: int = 20
-    """Fewest shared corners or features that make a pair."""
-    beside: int = 8
-    """Frames on either side of a chunk that are mapped with it."""
-    beside_step: float = 2.0
-    """How far apart they are, by the distance of the chunk's keyframes."""
-    most_step: int = 25
-    """... and no more frames than this."""
-    ahead: int = 6
-    """Keyframes that each is matched with, ahead of it."""
-    ahead_features: int = 600
-    """Features of each for that."""
-
 
 _FEATURE_IDS = 1_000_000
 """Numbers of features start here for the first keyframe, so that they never meet those of tracks."""

@@ -19,46 +19,12 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.consistency import contradicted
+from list3r.reconstruction.sfm.settings import MappingSettings
 from list3r.reconstruction.sfm.turning import only_turns
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class MappingSettings:
-    """How keyframes become a map. Errors in px of a picture 640 wide."""
-
-    least_matches: int = 20
-    """Fewest correspondences of two keyframes that count."""
-    matched_share: float = 1.0 / 3.0
-    """Share of what two keyframes matched by looks that must agree on their geometry. On redkitchen (every 20th and
-    30th frame) and simulated walks 99 % of the right pairs have 0.34 and more; what only chance relates 0.2 to 0.3."""
-    pair_error_px: float = 2.0
-    """Largest epipolar error of a match."""
-    pose_error_px: float = 4.0
-    """Largest error of a correspondence of structure and picture when a keyframe is added."""
-    point_error_px: float = 2.0
-    """Largest error of an observation that stays."""
-    first_angle_deg: float = 6.0
-    """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
-    told_angle_deg: float = 3.0
-    """... where they are told, or the camera is to be found as well."""
-    told_steps: tuple[int, int] = (4, 7)
-    """Keyframes from the first to the second that are told, at least and at most."""
-    same_error: float = 1.005
-    """Two maps whose errors are that near are the same, and no third is grown: right ones of one chunk differ by 0.1 to
-    0.7 %, bent ones are 9 to 12 % off (simulated walks 101 to 104)."""
-    growth: float = 1.4
-    """The whole map is adjusted each time it has grown by this factor."""
-    alike: float = 0.95
-    """Maps with at least this share of the keyframes of the largest are compared by their error."""
-    point_angle_deg: float = 1.0
-    """Least angle between the rays to a point."""
-    least_points: int = 40
-    """Fewest points of a map that is believed."""
-    seed: int = 1
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,18 @@ from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
-from list3r.reconstruction.mvs.stereo import MvsSettings, dense_depth, stereo_noise
+from list3r.reconstruction.mvs.stereo import dense_depth, stereo_noise
 from list3r.reconstruction.registry import ModelOptions
-from list3r.reconstruction.rgbd.odometry import OdometrySettings
 from list3r.reconstruction.rgbd.reconstructor import is_rigid, select_keyframes
-from list3r.reconstruction.sfm.fill import FramePoseSettings, PosedSegment, fill_segments
+from list3r.reconstruction.rgbd.settings import OdometrySettings
+from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
 from list3r.reconstruction.sfm.keyframe_features import make_finder
-from list3r.reconstruction.sfm.links import LinkSettings, keyframe_problem, step_beside, with_neighbours
-from list3r.reconstruction.sfm.mapping import MappingSettings, MapProblem, SparseMap, build_maps, triangulate
-from list3r.reconstruction.sfm.tracks import CornerSettings, CornerTracks, Gray, follow_corners
+from list3r.reconstruction.sfm.links import keyframe_problem, step_beside, with_neighbours
+from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap, build_maps, triangulate
+from list3r.reconstruction.sfm.settings import (
+    SfmSettings,
+)
+from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
 
 Poses = NDArray[np.float64]
 
@@ -47,23 +50,6 @@ def make(options: ModelOptions) -> SfmReconstructor:
         where = "cpu" if options.device == "auto" else options.device
         detector = make_detector(options.local_features, Path(options.feature_weights or ""), where)
     return SfmReconstructor(poses=options.poses, device=device, camera_known=options.camera_known, detector=detector)
-
-
-@dataclass(frozen=True)
-class SfmSettings:
-    """How a chunk of RGB frames is reconstructed."""
-
-    tracks: CornerSettings = field(default_factory=CornerSettings)
-    links: LinkSettings = field(default_factory=LinkSettings)
-    mapping: MappingSettings = field(default_factory=MappingSettings)
-    fill: FramePoseSettings = field(default_factory=FramePoseSettings)
-    dense: MvsSettings = field(default_factory=MvsSettings)
-    least_flow: float = 0.01
-    """A camera whose picture moves less than this through a whole chunk, by the longer side, stands still."""
-    least_side_px: int = 128
-    """In pictures whose longer side is shorter than this nothing can be followed because of that."""
-    least_segment: int = 8
-    """Frames of a part of a chunk, besides the largest, that is worth keeping."""
 
 
 @dataclass(frozen=True)

@@ -17,45 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.reconstruction.sfm.settings import CornerSettings
+
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class CornerSettings:
-    """How corners are found and followed."""
-
-    width: int = 1024
-    """Pictures are shrunk to at most this many px on their longer side."""
-    corners: int = 600
-    """Corners followed at a time."""
-    quality: float = 0.003
-    """Least strength of a corner by that of the strongest."""
-    least_strength: float = 2e-4
-    """Least smaller eigenvalue of a corner's gradients; below is sensor noise (black frames, bare walls)."""
-    spacing: float = 0.0125
-    """Corners are no nearer to each other, by the longer side (8 px of 640)."""
-    window_px: int = 21
-    levels: int = 4
-    most_creep_px: float = 2.0
-    """Farthest that the refined position may lie from where the corner was followed to."""
-    most_back_px: float = 1.0
-    """Farthest from its start that a corner may come out when it is followed back."""
-    most_difference: float = 22.0
-    """Largest mean difference of grey values between a corner and where it was first seen."""
-    least_brightening: float = 3.0
-    """Grey values that a picture has to be brighter or darker than another to be brought to its brightness first."""
-    keyframe_flow: float = 0.05
-    """A frame is a keyframe when half of the corners of the last one have moved so far, by the longer side."""
-    keyframe_survival: float = 0.55
-    """... or when no more than this share of them is left."""
-    least_survival: float = 0.25
-    """Less than this share left from one frame to the next means that the corners were lost."""
-    look_past: int = 3
-    """Frames in which corners are lost and found again behind."""
-    least_corners: int = 30
-    """Fewer corners than this are not followed."""
 
 
 @dataclass(frozen=True)

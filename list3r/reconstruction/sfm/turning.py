@@ -8,35 +8,19 @@ Multiple View Geometry, 8.4.2; decision 0071).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.sfm.settings import TurningSettings
 
 Floats = NDArray[np.float64]
 Places = Mapping[int, NDArray[np.float32]]
 """Where something is seen in each view, px. Shape (N, 2)."""
 Rows = Mapping[tuple[int, int], NDArray[np.int64]]
 """Rows of two views that show the same, by the two views' keys, the smaller first. Shape (M, 2)."""
-
-
-@dataclass(frozen=True)
-class TurningSettings:
-    """When a camera only turns."""
-
-    most_px: float = 2.0
-    """Error that matches have anyhow, px of a picture 640 wide."""
-    share: float = 0.8
-    """So many of the matches must be explained."""
-    least_matches: int = 20
-    """Fewest matches of a pair."""
-    focal_ratio: float = 1.6
-    """Focal lengths that are tried differ from the camera's by no more than this."""
-    rounds: int = 3
-    """Rotations fitted to a pair, each to the matches that the one before explains best."""
 
 
 def only_turns(

@@ -1,0 +1,42 @@
+"""Settings of every reconstruction, and of what a chunk keeps of its frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.features.settings import FeatureSettings
+
+
+@dataclass(frozen=True)
+class KeyframeSettings:
+    """What is kept of a keyframe."""
+
+    depth_width: int = 160
+    """Width of the small depth image, px."""
+    jpeg_quality: int = 85
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    learned_count: int = 800
+    """Most learned features on a frame."""
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """Which points of its frames a chunk keeps for alignment.
+
+    Three nested grids, fixed in the picture, so that two chunks that share a frame share pixels whatever each found in
+    it: every fourth column and row of the finest in frames of the interior, every second in frames near the ends,
+    which neighbouring chunks share, and one grid finer on small things.
+    """
+
+    columns: int = 64
+    """Columns of the finest grid."""
+    rows: int = 48
+    """Rows of the finest grid."""
+    end_frames: int = 30
+    """Frames at either end of the chunk that count as near it: the usual overlap."""
+    small_share: float = 0.02
+    """Share of the picture up to which a mask counts as a small thing's."""
+    resolution_bits: int = 15
+    """Points are rounded to 2^-bits of their extent (0.2 mm in 6 m), so that they compress."""

@@ -1,0 +1,215 @@
+"""Settings of reconstruction `sfm`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from list3r.reconstruction.mvs.settings import MvsSettings
+
+
+@dataclass(frozen=True)
+class CornerSettings:
+    """How corners are found and followed."""
+
+    width: int = 1024
+    """Pictures are shrunk to at most this many px on their longer side."""
+    corners: int = 600
+    """Corners followed at a time."""
+    quality: float = 0.003
+    """Least strength of a corner by that of the strongest."""
+    least_strength: float = 2e-4
+    """Least smaller eigenvalue of a corner's gradients; below is sensor noise (black frames, bare walls)."""
+    spacing: float = 0.0125
+    """Corners are no nearer to each other, by the longer side (8 px of 640)."""
+    window_px: int = 21
+    levels: int = 4
+    most_creep_px: float = 2.0
+    """Farthest that the refined position may lie from where the corner was followed to."""
+    most_back_px: float = 1.0
+    """Farthest from its start that a corner may come out when it is followed back."""
+    most_difference: float = 22.0
+    """Largest mean difference of grey values between a corner and where it was first seen."""
+    least_brightening: float = 3.0
+    """Grey values that a picture has to be brighter or darker than another to be brought to its brightness first."""
+    keyframe_flow: float = 0.05
+    """A frame is a keyframe when half of the corners of the last one have moved so far, by the longer side."""
+    keyframe_survival: float = 0.55
+    """... or when no more than this share of them is left."""
+    least_survival: float = 0.25
+    """Less than this share left from one frame to the next means that the corners were lost."""
+    look_past: int = 3
+    """Frames in which corners are lost and found again behind."""
+    least_corners: int = 30
+    """Fewer corners than this are not followed."""
+
+
+@dataclass(frozen=True)
+class FinderSettings:
+    """How features of keyframes are found and matched."""
+
+    count: int = 2000
+    """SIFT features of a keyframe."""
+    learned_count: int = 1200
+    """Learned ones."""
+    contrast: float = 0.015
+    """SIFT's contrast threshold."""
+    ratio: float = 0.85
+    """Lowe's ratio of SIFT."""
+    few: int = 300
+    """The surest features, by which keyframes worth matching are chosen."""
+    least_few: int = 4
+    """Fewest of them that must agree."""
+    partners: int = 8
+    """Keyframes that one is matched with, those that most agree."""
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """Which keyframes are related, and how features are found."""
+
+    features: FinderSettings = field(default_factory=FinderSettings)
+    least_matches: int = 20
+    """Fewest shared corners or features that make a pair."""
+    beside: int = 8
+    """Frames on either side of a chunk that are mapped with it."""
+    beside_step: float = 2.0
+    """How far apart they are, by the distance of the chunk's keyframes."""
+    most_step: int = 25
+    """... and no more frames than this."""
+    ahead: int = 6
+    """Keyframes that each is matched with, ahead of it."""
+    ahead_features: int = 600
+    """Features of each for that."""
+
+
+@dataclass(frozen=True)
+class ConsistencySettings:
+    """When a keyframe is contradicted."""
+
+    most_px: float = 4.0
+    """Largest epipolar error of a match that agrees, px of a picture 640 wide."""
+    least_share: float = 0.75
+    """Least share of a keyframe's matches that must agree."""
+
+
+@dataclass(frozen=True)
+class TurningSettings:
+    """When a camera only turns."""
+
+    most_px: float = 2.0
+    """Error that matches have anyhow, px of a picture 640 wide."""
+    share: float = 0.8
+    """So many of the matches must be explained."""
+    least_matches: int = 20
+    """Fewest matches of a pair."""
+    focal_ratio: float = 1.6
+    """Focal lengths that are tried differ from the camera's by no more than this."""
+    rounds: int = 3
+    """Rotations fitted to a pair, each to the matches that the one before explains best."""
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How keyframes become a map. Errors in px of a picture 640 wide."""
+
+    least_matches: int = 20
+    """Fewest correspondences of two keyframes that count."""
+    matched_share: float = 1.0 / 3.0
+    """Share of what two keyframes matched by looks that must agree on their geometry. On redkitchen (every 20th and
+    30th frame) and simulated walks 99 % of the right pairs have 0.34 and more; what only chance relates 0.2 to 0.3."""
+    pair_error_px: float = 2.0
+    """Largest epipolar error of a match."""
+    pose_error_px: float = 4.0
+    """Largest error of a correspondence of structure and picture when a keyframe is added."""
+    point_error_px: float = 2.0
+    """Largest error of an observation that stays."""
+    first_angle_deg: float = 6.0
+    """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
+    told_angle_deg: float = 3.0
+    """... where they are told, or the camera is to be found as well."""
+    told_steps: tuple[int, int] = (4, 7)
+    """Keyframes from the first to the second that are told, at least and at most."""
+    same_error: float = 1.005
+    """Two maps whose errors are that near are the same, and no third is grown: right ones of one chunk differ by 0.1 to
+    0.7 %, bent ones are 9 to 12 % off (simulated walks 101 to 104)."""
+    growth: float = 1.4
+    """The whole map is adjusted each time it has grown by this factor."""
+    alike: float = 0.95
+    """Maps with at least this share of the keyframes of the largest are compared by their error."""
+    point_angle_deg: float = 1.0
+    """Least angle between the rays to a point."""
+    least_points: int = 40
+    """Fewest points of a map that is believed."""
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class FramePoseSettings:
+    """How the frames between keyframes are posed."""
+
+    bridge: int = 4
+    """Frames without corners in a row, between two that are posed, that are looked for by the structure known there."""
+    bridge_window_px: int = 31
+    """Window by which its points are looked for."""
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+
+
+@dataclass(frozen=True)
+class CameraCalibrationSettings:
+    """Which frames are looked at, and what is believed."""
+
+    windows: int = 5
+    """Stretches of the video that are looked at."""
+    frames: int = 100
+    """Frames in each."""
+    least_frames: int = 60
+    """... and in each of a video too short for so many: the windows of a short one overlap by half, so that where it
+    stands still, shows a wall or jumps in the middle there is one without that. One window of four clips of 160 frames
+    of redkitchen tells focal lengths 8, 12, 6 and (a guess) 38 % off, three of 80 frames 11, 0, 3 and 1 %."""
+    least_windows: int = 3
+    """Windows of such a video."""
+    most_window_ratio: float = 1.3
+    """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
+    zoom_ratio: float = 1.5
+    """Windows whose focal length is farther off than this are told of: more than four deviations of one window. Windows
+    shorter than `frames` say too little for that."""
+    zoom_distortion: float = 0.2
+    """... unless their k1 is farther off than this, see below."""
+    most_error_px: float = 2.0
+    """Observations farther from their point's image than this are left out."""
+    rounds: int = 3
+    """Joint adjustments, each without what the one before contradicts."""
+    focal_range: tuple[float, float] = (0.4, 3.0)
+    """Focal lengths believed, by the longer side of the picture."""
+    distortion_range: tuple[float, float] = (-0.5, 0.2)
+    """k1 believed. With little parallax a map bends a focal length that is too long straight by a large positive k1,
+    as no lens of a camera has it: of 19 windows of redkitchen three say 887, 971 and 2947 px of 524, with 0.26, 0.32
+    and 5.3."""
+    least_shift_px: float = 0.3
+    """Distortion that shifts the corners of the picture by less is none."""
+    window_sigma: float = 0.09
+    """Standard deviation of the logarithm of one window's focal length (redkitchen, 60 to 100 frames: 0.087)."""
+    window_weight: float = 4.0
+    """So many windows' worth is that belief when the windows of a video tell their own spread."""
+    doubted_sigmas: float = 2.5
+    """A given focal length farther off than this is doubted aloud."""
+    tracks: CornerSettings = field(default_factory=CornerSettings)
+    links: LinkSettings = field(default_factory=LinkSettings)
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """How a chunk of RGB frames is reconstructed."""
+
+    tracks: CornerSettings = field(default_factory=CornerSettings)
+    links: LinkSettings = field(default_factory=LinkSettings)
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+    fill: FramePoseSettings = field(default_factory=FramePoseSettings)
+    dense: MvsSettings = field(default_factory=MvsSettings)
+    least_flow: float = 0.01
+    """A camera whose picture moves less than this through a whole chunk, by the longer side, stands still."""
+    least_side_px: int = 128
+    """In pictures whose longer side is shorter than this nothing can be followed because of that."""
+    least_segment: int = 8
+    """Frames of a part of a chunk, besides the largest, that is worth keeping."""
