@@ -18,7 +18,7 @@ from list3r.reconstruction.registry import MODELS, ModelOptions, make_reconstruc
 from list3r.reconstruction.sfm.calibration import calibrate
 from list3r.reconstruction.sfm.mapping import SparseMap, best_of
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
-from list3r.reconstruction.sfm.settings import CameraCalibrationSettings
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, SfmSettings
 from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import CAMERA, render
 
@@ -168,7 +168,7 @@ def test_corners_do_not_creep():
 
 
 def test_the_camera_is_found_and_a_wrong_one_is_doubted():
-    settings = CameraCalibrationSettings(windows=1, frames=FRAMES)
+    settings = SfmSettings(calibration=CameraCalibrationSettings(windows=1, frames=FRAMES))
     found = calibrate(Held(walk(), None), settings)
     assert abs(found.camera.fx / CAMERA.fx - 1) < 0.08 and found.windows == 1
     wrong = calibrate(Held(walk(), replace(CAMERA, fx=450.0, fy=450.0)), settings)

@@ -41,7 +41,7 @@ def build_library(
         proposals = [discoverer(frames, reconstruction, position) for position in anchors]
         prompts = [select_prompts(p, settings) for p in proposals]
         library = tracker(frames, reconstruction, prompts, discoverer.feature_space)
-        return with_movers(library, frames, reconstruction)
+        return with_movers(library, frames, reconstruction, settings.movers)
     finally:
         forget_views()
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from list3r.memory.errors import OptionError
+from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 
 FEATURE_SPACE = "geometric-color@1/64"
 """Colour and metric shape, see `features`."""
@@ -80,6 +81,22 @@ class MaskTrackSettings:
 
 
 @dataclass(frozen=True)
+class MoverInstanceSettings:
+    """What is kept of a thing that moves."""
+
+    whole: float = 0.5
+    """Share of its largest mask that a view must have to show where it was last."""
+    beside: int = 2
+    """Frames on either side of that view whose points are added, moved to where it was then."""
+    rest_m: float = 0.05
+    """Places this near to the last one are one place of rest."""
+    support_points: int = 3000
+    cannot_link_frames: int = 3
+    """Frames in which a pair must be seen side by side to be two things."""
+    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+
+
+@dataclass(frozen=True)
 class InstanceSettings:
     """The local instance library of a chunk."""
 
@@ -90,6 +107,7 @@ class InstanceSettings:
     view: AnchorViewSettings = field(default_factory=AnchorViewSettings)
     segment: SegmentSettings = field(default_factory=SegmentSettings)
     track: MaskTrackSettings = field(default_factory=MaskTrackSettings)
+    movers: MoverInstanceSettings = field(default_factory=MoverInstanceSettings)
 
     @property
     def feature_space(self) -> str:

@@ -13,6 +13,15 @@ from list3r.frames.base import Camera, Frame
 
 
 @dataclass(frozen=True)
+class KeyframeSpacing:
+    """How far a camera moves from one keyframe to the next; either is enough."""
+
+    turn_deg: float = 12.0
+    shift: float = 0.12
+    """Translation as a share of the median depth."""
+
+
+@dataclass(frozen=True)
 class SensorNoise:
     """Standard deviation of depth, a + b (z - c)^2, the law of structured light.
 

@@ -19,6 +19,7 @@ from list3r.memory.errors import DegenerateError, OptionError, TrackingError
 from list3r.memory.geometry import Sim3
 from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.networks.output import WindowOutput, to_reconstruction, with_given_poses
+from list3r.reconstruction.networks.settings import NetworkSettings
 from list3r.reconstruction.networks.windows import between, regauged
 from list3r.reconstruction.precomputed_files import Manifest, read_frames, read_manifest, read_piece
 from list3r.reconstruction.registry import ModelOptions
@@ -28,7 +29,7 @@ def make(options: ModelOptions) -> PrecomputedReconstructor:
     """The reader of the folder that the options name as weights. Raises `OptionError` where there is none."""
     if options.weights is None:
         raise OptionError("--reconstruction precomputed needs a folder: --weights DIR (see docs/precomputed.md)")
-    return PrecomputedReconstructor(Path(options.weights).expanduser(), options.poses)
+    return PrecomputedReconstructor(Path(options.weights).expanduser(), options.poses, options.settings.networks)
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,9 @@ def open_folder(path: Path) -> Folder:
 class PrecomputedReconstructor:
     """A `Reconstructor` that looks frames up by their numbers."""
 
-    def __init__(self, path: Path, poses: str = "estimate") -> None:
+    def __init__(self, path: Path, poses: str = "estimate", settings: NetworkSettings | None = None) -> None:
         self._path, self._folder, self._poses = path, open_folder(path), poses
+        self._settings = settings or NetworkSettings()
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
         """What is known of the frames; those that no file holds are not posed.
@@ -74,7 +76,7 @@ class PrecomputedReconstructor:
         wanted = np.array([f.index for f in frames], np.int64)
         output, principal, noise = self._gather(wanted)
         try:
-            made = to_reconstruction(frames, camera, output, noise)
+            made = to_reconstruction(frames, camera, output, noise, self._settings)
         except TrackingError:
             raise TrackingError(f"{self._path} holds too little of frames {wanted[0]} to {wanted[-1]}") from None
         sy, sx = (full / small for full, small in zip(made.depth.shape[1:], output.depth.shape[1:], strict=True))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 
 from list3r.memory.errors import OptionError
 from list3r.reconstruction.base import Reconstructor
+from list3r.reconstruction.settings import ReconstructionSettings
 
 __all__ = ["MODELS", "ModelOptions", "make_reconstructor"]
 
@@ -27,6 +28,8 @@ class ModelOptions:
     """Local features by which `sfm` ties pictures between which nothing can be followed: sift or aliked."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
+    settings: ReconstructionSettings = field(default_factory=ReconstructionSettings)
+    """Settings of all models; each takes its own."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class ModelEntry:
     needs_camera: bool = False
     """Must be told the intrinsics; the others find the focal length themselves."""
     calibration: str = ""
-    """Module that estimates an unknown camera before the chunks, which has `calibrate(source) -> Calibration`."""
+    """Module that estimates an unknown camera before the chunks, by `calibrate(source, settings)`."""
     thins: bool = False
     """Computes depth, so that frames which show the same from nearly the same place need not all have it."""
 

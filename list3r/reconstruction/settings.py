@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
+from list3r.reconstruction.networks.settings import NetworkSettings
+from list3r.reconstruction.rgbd.settings import RgbdSettings
+from list3r.reconstruction.sfm.settings import SfmSettings
 
 
 @dataclass(frozen=True)
@@ -40,3 +43,14 @@ class SampleSettings:
     """Share of the picture up to which a mask counts as a small thing's."""
     resolution_bits: int = 15
     """Points are rounded to 2^-bits of their extent (0.2 mm in 6 m), so that they compress."""
+
+
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """Settings of all reconstruction models, of which one runs, and of what every chunk keeps."""
+
+    rgbd: RgbdSettings = field(default_factory=RgbdSettings)
+    sfm: SfmSettings = field(default_factory=SfmSettings)
+    networks: NetworkSettings = field(default_factory=NetworkSettings)
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    samples: SampleSettings = field(default_factory=SampleSettings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from list3r.frames.base import Frame
 from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.fusion import small_color
 from list3r.instances.geometric.support import thin
-from list3r.instances.settings import FEATURE_SPACE
+from list3r.instances.settings import FEATURE_SPACE, MoverInstanceSettings
 from list3r.instances.tracking.reprojection import encode_labels
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, MotionTrack, Support
 from list3r.reconstruction.base import Reconstruction, backproject
@@ -22,21 +22,6 @@ from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class MoverInstanceSettings:
-    """What is kept of a thing that moves."""
-
-    whole: float = 0.5
-    """Share of its largest mask that a view must have to show where it was last."""
-    beside: int = 2
-    """Frames on either side of that view whose points are added, moved to where it was then."""
-    rest_m: float = 0.05
-    """Places this near to the last one are one place of rest."""
-    support_points: int = 3000
-    cannot_link_frames: int = 3
-    """Frames in which a pair must be seen side by side to be two things."""
 
 
 def with_movers(
@@ -133,7 +118,7 @@ def _support(
     stride = max(1, round(reconstruction.camera.width / 320))
     points, rgb, confidence = [], [], []
     for n in chosen:
-        seen, color, sure = _points(blobs[n], frames[blobs[n].position], reconstruction, small, stride)
+        seen, color, sure = _points(blobs[n], frames[blobs[n].position], reconstruction, small, stride, s.confidence)
         points.append(seen + (places[last] - places[n]).astype(np.float32))
         rgb.append(color)
         confidence.append(sure)
@@ -141,7 +126,12 @@ def _support(
 
 
 def _points(
-    blob: Blob, frame: Frame, reconstruction: Reconstruction, small: SmallFrames, stride: int
+    blob: Blob,
+    frame: Frame,
+    reconstruction: Reconstruction,
+    small: SmallFrames,
+    stride: int,
+    settings: ConfidenceSettings,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
     """Points in the chunk, colours and confidence of a blob's pixels, every `stride`-th of the frame."""
     assert frame.depth is not None
@@ -152,7 +142,7 @@ def _points(
     inside = mask[::stride, ::stride]
     T = reconstruction.T_chunk_cam[blob.position]
     points = backproject(frame.depth, camera)[::stride, ::stride][inside] @ T[:3, :3].T.astype(np.float32)
-    confidence = depth_confidence(frame.depth, camera, ConfidenceSettings())[::stride, ::stride][inside]
+    confidence = depth_confidence(frame.depth, camera, settings)[::stride, ::stride][inside]
     color = small_color(frame.color, stride)[inside]
     return points + T[:3, 3].astype(np.float32), color, confidence.astype(np.float32)
 

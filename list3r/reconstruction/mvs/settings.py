@@ -123,6 +123,8 @@ class MatchTrustSettings:
     """Variance of the window over that of noise below which there is nothing to match."""
     half_sigma: float = 0.02
     """Deviation, share of depth, at which confidence is one half."""
+    noise_frames: int = 12
+    """Frames of a chunk by which the roughness of depth is measured."""
 
 
 @dataclass(frozen=True)

@@ -112,15 +112,16 @@ def _one_thread() -> Iterator[None]:
 
 
 def stereo_noise(
-    depth: NDArray[np.float32], confidence: NDArray[np.float16], most_frames: int = 12
+    depth: NDArray[np.float32], confidence: NDArray[np.float16], settings: MatchTrustSettings | None = None
 ) -> DepthNoise | None:
     """How rough stereo depth (F, H, W) is: what small windows deviate from a plane, growing with depth squared.
 
     None where too little is known to measure it. Structure looks like roughness, so the smoother windows decide.
     """
+    chosen = settings or MatchTrustSettings()
     used = np.flatnonzero((depth > 0).any(axis=(1, 2)))
     rates = []
-    for position in used[:: max(1, len(used) // most_frames)].tolist():
+    for position in used[:: max(1, len(used) // chosen.noise_frames)].tolist():
         stride = max(1, depth.shape[2] // 320)
         d, c = depth[position][::stride, ::stride], confidence[position][::stride, ::stride]
         inverse = np.where(c > 0.3, 1.0 / np.maximum(d, 1e-9), 0.0)
@@ -128,7 +129,7 @@ def stereo_noise(
     found = np.concatenate(rates) if rates else np.zeros(0)
     found = found[np.isfinite(found)]
     rough = float(np.quantile(found, 0.4)) if len(found) >= 200 else 0.0
-    return DepthNoise(0.0, rough, MatchTrustSettings().half_sigma) if rough > 0 else None
+    return DepthNoise(0.0, rough, chosen.half_sigma) if rough > 0 else None
 
 
 def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.float64]:

@@ -120,7 +120,9 @@ class FeedforwardReconstructor:
             return self._pass(shrink([f.color for f in frames[start:stop]], height, width), K)
 
         try:
-            made = to_reconstruction(frames, camera, run_windows(len(frames), self._budget, run))
+            made = to_reconstruction(
+                frames, camera, run_windows(len(frames), self._budget, run), settings=self._options.settings.networks
+            )
         except DegenerateError as error:
             raise TrackingError(f"frames {frames[0].index} to {frames[-1].index}: {error}") from error
         return with_given_poses(made, frames) if self._options.poses == "given" else made

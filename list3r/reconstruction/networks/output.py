@@ -13,16 +13,12 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import TrackingError
 from list3r.reconstruction.base import DepthNoise, Reconstruction
+from list3r.reconstruction.networks.settings import NetworkSettings
+from list3r.reconstruction.poses import select_keyframes
 from list3r.reconstruction.rgbd.confidence import beside_edge
-from list3r.reconstruction.rgbd.reconstructor import select_keyframes
-from list3r.reconstruction.rgbd.settings import OdometrySettings
 
 LEAST_CONFIDENCE = 0.05
 """Depth that the network believes in less than this is unknown (what the authors of pi3 keep in their odometry)."""
-EDGE_STEP = 0.03
-"""Depth step between neighbours that makes an edge, as a share of depth (the same authors' examples)."""
-EDGE_CONFIDENCE = 0.1
-"""Factor of the confidence beside an edge, where a network smears one surface into the next."""
 LEAST_FOCAL, MOST_FOCAL = 0.2, 10.0
 """Focal lengths by the picture's longer side that a lens can have; what lies outside is no camera."""
 
@@ -84,7 +80,11 @@ def focal_from_points(points_cam: NDArray[np.float32], weights: NDArray[np.float
 
 
 def to_reconstruction(
-    frames: Sequence[Frame], camera: Camera, output: WindowOutput, noise: DepthNoise | None = None
+    frames: Sequence[Frame],
+    camera: Camera,
+    output: WindowOutput,
+    noise: DepthNoise | None = None,
+    settings: NetworkSettings | None = None,
 ) -> Reconstruction:
     """A chunk's reconstruction at the frames' own size, in the frame of its first posed camera; scale is relative.
 
@@ -92,6 +92,7 @@ def to_reconstruction(
     focal lengths are replaced by the network's, for its points and poses are true to those alone. Raises
     `TrackingError` when the network has an answer for fewer than two frames.
     """
+    chosen = settings or NetworkSettings()
     posed = output.valid()
     if posed.sum() < min(2, len(frames)):
         raise TrackingError(
@@ -106,9 +107,9 @@ def to_reconstruction(
     depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float16)
     for position in np.flatnonzero(posed).tolist():
         depth[position], confidence[position] = _enlarged(
-            output.part(slice(position, position + 1)), camera, noise is None
+            output.part(slice(position, position + 1)), camera, chosen if noise is None else None
         )
-    keyframes = select_keyframes(T, posed, list(depth), OdometrySettings())
+    keyframes = select_keyframes(T, posed, list(depth), chosen.keyframes)
     return Reconstruction(
         frame_indices=np.array([f.index for f in frames], np.int64),
         posed=posed,
@@ -130,14 +131,19 @@ def network_camera(camera: Camera, output: WindowOutput, posed: NDArray[np.bool_
     return Camera(camera.width, camera.height, fx * camera.width / width, fy * camera.height / height, *middle)
 
 
-def _enlarged(one: WindowOutput, camera: Camera, smeared: bool) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
-    """Depth and confidence of one frame at the frames' size; unknown where a pixel's neighbours are not all known."""
+def _enlarged(
+    one: WindowOutput, camera: Camera, smeared: NetworkSettings | None
+) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
+    """Return depth and confidence of one frame at the frames' size; unknown where a neighbour of a pixel is.
+
+    `smeared` is given where depth runs from one surface into the next.
+    """
     size = (camera.width, camera.height)
     known = one.known()[0]
     depth = np.where(known, one.depth[0], np.float32(0))
     confidence = np.where(known, np.clip(one.confidence[0], 0.0, 1.0), np.float32(0)).astype(np.float32)
-    if smeared:
-        confidence[beside_edge(depth, known, EDGE_STEP)] *= np.float32(EDGE_CONFIDENCE)
+    if smeared is not None:
+        confidence[beside_edge(depth, known, smeared.edge_step)] *= np.float32(smeared.edge_confidence)
     large = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.999
     out = np.where(large, cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR), np.float32(0))
     sure = np.where(large, cv2.resize(confidence, size, interpolation=cv2.INTER_LINEAR), 0.0)

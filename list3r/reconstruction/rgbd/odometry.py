@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
 from list3r.reconstruction.motion.movers import Mask, MoverMemory, find_mover, fit, without
+from list3r.reconstruction.poses import angle_deg, shows_more
 from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
@@ -154,10 +155,7 @@ class CameraTracker:
         step = np.linalg.inv(segment.T_segment_cam[segment.keyframes[-1]]) @ segment.T_segment_cam[position]
         depth = self.view(position).depth
         far = float(np.median(depth[depth > 0]))
-        turn = _angle_deg(step)
-        return turn > self.settings.keyframe_turn_deg or bool(
-            np.linalg.norm(step[:3, 3]) > self.settings.keyframe_shift * far
-        )
+        return shows_more(step, far, self.settings.keyframes)
 
     def _follow(self, segment: TrackedSegment, position: int) -> Pose | None:
         """The frame's pose in the segment, or None when nothing trustworthy is found."""
@@ -237,7 +235,7 @@ class CameraTracker:
         gap_s = max(gap_s, 1.0 / 60.0)
         return bool(
             np.linalg.norm(step[:3, 3]) <= self.settings.most_speed_m_per_s * gap_s
-            and _angle_deg(step) <= self.settings.most_turn_deg_per_s * gap_s
+            and angle_deg(step) <= self.settings.most_turn_deg_per_s * gap_s
         )
 
     def _search(self, segment: TrackedSegment, position: int, nearby: bool) -> FrameRegistration | None:
@@ -271,21 +269,12 @@ class CameraTracker:
     def _join(self) -> list[TrackedSegment]:
         """Attach segments to the largest one, over and over until no more can be."""
         left = sorted(self.segments, key=lambda s: -len(s.T_segment_cam))
-        done: list[TrackedSegment] = []
-        while left:
-            base = left.pop(0)
-            attached = True
-            while attached:
-                attached = False
-                for other in list(left):
-                    T_base_other = self._connect(base, other)
-                    if T_base_other is not None:
-                        self._attach(base, other, T_base_other)
-                        left.remove(other)
-                        attached = True
-            done.append(base)
-            break
-        return done + left
+        base, attached = left[:1], bool(left)
+        left = left[1:]
+        while attached:
+            apart = [other for other in left if not self._attach(base[0], other)]
+            attached, left = len(apart) < len(left), apart
+        return base + left
 
     def _connect(self, base: TrackedSegment, other: TrackedSegment) -> Pose | None:
         for position in other.keyframes[:4]:
@@ -294,12 +283,17 @@ class CameraTracker:
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
         return None
 
-    def _attach(self, base: TrackedSegment, other: TrackedSegment, T_base_other: Pose) -> None:
+    def _attach(self, base: TrackedSegment, other: TrackedSegment) -> bool:
+        """Add a segment to another where the two can be related; whether that was done."""
+        T_base_other = self._connect(base, other)
+        if T_base_other is None:
+            return False
         for position, T in other.T_segment_cam.items():
             base.T_segment_cam[position] = T_base_other @ T
         for position in other.keyframes:
             base.model.fuse(self.view(position), base.T_segment_cam[position])
         base.keyframes = sorted([*base.keyframes, *other.keyframes])
+        return True
 
 
 def _starts(far_m: float) -> list[Pose]:
@@ -314,7 +308,3 @@ def _starts(far_m: float) -> list[Pose]:
             orbit[:3, 3] = far_m * (np.eye(3) - orbit[:3, :3])[:, 2]
             out += [shift, orbit]
     return out
-
-
-def _angle_deg(T: Pose) -> float:
-    return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))

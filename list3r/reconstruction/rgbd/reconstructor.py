@@ -18,15 +18,16 @@ from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion.follow import follow_movers
 from list3r.reconstruction.motion.moving import SmallFrames, find_moving
+from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker
-from list3r.reconstruction.rgbd.settings import OdometrySettings, RgbdSettings
+from list3r.reconstruction.rgbd.settings import RgbdSettings
 
 
 def make(options: ModelOptions) -> RgbdReconstructor:
-    """The model with its default settings; it runs on the CPU whatever device is named."""
-    return RgbdReconstructor(poses=options.poses)
+    """Return the model; it runs on the CPU whatever device is named."""
+    return RgbdReconstructor(options.settings.rgbd, options.poses)
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class RgbdReconstructor:
         shape = (camera.height, camera.width)
         depth = np.stack([np.zeros(shape, np.float32) if f.depth is None else f.depth for f in frames])
         if self.poses == "given":
-            T, posed, keyframes = self._given(frames, camera)
+            T, posed = given_poses(frames)
+            keyframes = select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry.keyframes)
             moving = self._moving(frames, T, posed, camera, {})
         else:
             T, posed, keyframes, left_out = self._estimate(frames, camera)
@@ -112,19 +114,6 @@ class RgbdReconstructor:
         T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
         return T, posed, segments[0].keyframes, tracker.moving
 
-    def _given(
-        self, frames: Sequence[Frame], camera: Camera
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int]]:
-        T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
-        for position, frame in enumerate(frames):
-            if frame.T_source_cam is not None and is_rigid(frame.T_source_cam):
-                T[position], posed[position] = frame.T_source_cam, True
-        if not posed.any():
-            raise TrackingError(
-                f"none of the frames {frames[0].index} to {frames[-1].index} has a valid pose; use --poses estimate"
-            )
-        return T, posed, select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry)
-
 
 def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
@@ -137,34 +126,3 @@ def _take_out(depth: NDArray[np.float32], moving: NDArray[np.uint8]) -> None:
     for position in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
         full = np.kron(_rim(moving[position] > 0), np.ones((stride, stride), bool))
         depth[position][full[:height, :width]] = 0.0
-
-
-def is_rigid(T: NDArray[np.float64]) -> bool:
-    """Whether a 4x4 matrix is a finite rigid transform, to a tolerance that text files keep."""
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0)
-
-
-def select_keyframes(
-    T_chunk_cam: NDArray[np.float64],
-    posed: NDArray[np.bool_],
-    depths: Sequence[NDArray[np.float32] | None],
-    settings: OdometrySettings,
-) -> list[int]:
-    """Positions of frames that have moved enough since the last keyframe."""
-    keyframes: list[int] = []
-    for position in map(int, np.flatnonzero(posed)):
-        depth = depths[position]
-        known = depth[::8, ::8][depth[::8, ::8] > 0] if depth is not None else np.zeros(0)
-        if not len(known):
-            continue
-        if keyframes:
-            step = np.linalg.inv(T_chunk_cam[keyframes[-1]]) @ T_chunk_cam[position]
-            turn = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
-            shift = np.linalg.norm(step[:3, 3]) / float(np.median(known))
-            if turn <= settings.keyframe_turn_deg and shift <= settings.keyframe_shift:
-                continue
-        keyframes.append(position)
-    return keyframes or [int(np.flatnonzero(posed)[0])]

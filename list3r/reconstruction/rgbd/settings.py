@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.base import KeyframeSpacing, SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.motion.settings import FollowSettings, MoverSettings, MovingSurfaceSettings
 
@@ -106,9 +106,7 @@ class OdometrySettings:
         )
     )
     """Those coarse registrations: a wide gate that closes slowly."""
-    keyframe_turn_deg: float = 12.0
-    keyframe_shift: float = 0.12
-    """Translation between keyframes as a share of the median depth."""
+    keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     fusion: SurfelSettings = field(default_factory=SurfelSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)

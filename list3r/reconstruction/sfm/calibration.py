@@ -17,7 +17,7 @@ from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
 from list3r.reconstruction.sfm.colmap import pycolmap
 from list3r.reconstruction.sfm.links import keyframe_problem
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, Poses, SparseMap, build_maps
-from list3r.reconstruction.sfm.settings import CameraCalibrationSettings
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, follow_corners
 
 
@@ -39,7 +39,7 @@ class CameraCalibration:
 
 def calibrate(
     source: FrameSource,
-    settings: CameraCalibrationSettings | None = None,
+    settings: SfmSettings | None = None,
     progress: Progress | None = None,
     stored_px: float = 1.0,
 ) -> CameraCalibration:
@@ -47,13 +47,14 @@ def calibrate(
 
     `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes speak of those.
     """
-    chosen = settings or CameraCalibrationSettings()
+    sfm = settings or SfmSettings()
+    chosen = sfm.calibration
     info = source.info
     known = info.camera is not None
     start = info.camera or guessed_camera(info)
-    found = _estimated(source, start, chosen, progress)
+    found = _estimated(source, start, sfm, progress)
     if found is None and known:
-        found = _estimated(source, guessed_camera(info), chosen, progress)
+        found = _estimated(source, guessed_camera(info), sfm, progress)
     if found is None:
         return _nothing(start, known, stored_px)
     windows, free, k1 = found.windows, found.camera, found.k1
@@ -93,13 +94,12 @@ class _Estimate:
     """Length of a window."""
 
 
-def _estimated(
-    source: FrameSource, start: Camera, settings: CameraCalibrationSettings, progress: Progress | None
-) -> _Estimate | None:
+def _estimated(source: FrameSource, start: Camera, sfm: SfmSettings, progress: Progress | None) -> _Estimate | None:
     """What is said by the windows that could be mapped and can be believed; None where they make no sense."""
+    settings = sfm.calibration
     windows, begins, spans = [], [], _spans(source.info.frame_count, settings)
     for done, (a, b) in enumerate(spans, start=1):
-        window = _window(source, a, b, start, settings)
+        window = _window(source, a, b, start, sfm)
         if window is not None and _believable(window[1].camera, window[1].k1, settings):
             windows.append(window)
             begins.append(_index_at(source, a))
@@ -181,7 +181,7 @@ def _spans(count: int, settings: CameraCalibrationSettings) -> list[tuple[int, i
 
 
 def _window(
-    source: FrameSource, start: int, stop: int, camera: Camera, settings: CameraCalibrationSettings
+    source: FrameSource, start: int, stop: int, camera: Camera, settings: SfmSettings
 ) -> tuple[MapProblem, SparseMap] | None:
     """The largest map of a window with a camera of its own."""
     frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]

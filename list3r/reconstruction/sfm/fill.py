@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.mapping import Poses, SparseMap
-from list3r.reconstruction.sfm.settings import FramePoseSettings, MappingSettings
+from list3r.reconstruction.sfm.settings import FramePoseSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 Floats = NDArray[np.float32]
@@ -70,7 +70,7 @@ def _fill(
         start = segment.T_map_cam.get(position - 1)
         if position in found.T_map_cam or start is None:
             start = found.T_map_cam[min(registered, key=lambda k: (abs(k - position), k))]
-        posed = pose_of(xy, points, found.camera, start, settings.mapping)
+        posed = pose_of(xy, points, found.camera, start, settings)
         if posed is not None:
             segment.T_map_cam[position] = posed[0]
             segment.seen[position] = xy[posed[1]], points[posed[1]]
@@ -94,7 +94,7 @@ def _with_features(
 
 
 def pose_of(
-    xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: MappingSettings
+    xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: FramePoseSettings
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
     """T_map_cam from points (N, 3) and where they are seen (N, 2), and which agree; None when too few do.
 
@@ -163,7 +163,7 @@ def _look_for(
     segment: PosedSegment, grays: Sequence[Gray], near: int, position: int, settings: FramePoseSettings
 ) -> None:
     xy, points = segment.seen[near]
-    if len(xy) < settings.mapping.least_matches:
+    if len(xy) < settings.least_matches:
         return
     size = (settings.bridge_window_px, settings.bridge_window_px)
     a, b = grays[near], grays[position]
@@ -171,7 +171,7 @@ def _look_for(
     back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, place, np.zeros_like(xy), winSize=size, maxLevel=5)
     place = np.asarray(place, np.float32)
     good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(np.asarray(back) - xy, axis=1) < 2.0)
-    made = pose_of(place[good], points[good], segment.found.camera, segment.T_map_cam[near], settings.mapping)
+    made = pose_of(place[good], points[good], segment.found.camera, segment.T_map_cam[near], settings)
     if made is not None and made[1].mean() > 0.5:
         segment.T_map_cam[position] = made[0]
         segment.seen[position] = place[good][made[1]], points[good][made[1]]

@@ -99,7 +99,7 @@ def build_maps(
     for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen))):
         maps = _grown(cache, problem, camera, free_camera, pair, chosen)
         grown.append(_without_beside(maps, problem))
-        if agreed(grown, chosen) or (not maps and pair is None and _turns(problem, problem.views, camera)):
+        if agreed(grown, chosen) or (not maps and pair is None and _turns(problem, problem.views, camera, chosen)):
             break
     best = best_of(grown, chosen.alike)
     held = {key for found in best for key in found.T_map_cam}
@@ -139,14 +139,15 @@ def _grown(
     pycolmap.IncrementalPipeline(options, cache, manager).run()
     maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
     if problem.matched:
-        maps = [_borne_out(m, problem, cache, camera) for m in maps]
+        maps = [_borne_out(m, problem, cache, camera, settings) for m in maps]
     maps = [m for m in maps if len(m.points) >= settings.least_points and len(m.T_map_cam) >= 2]
-    return [m for m in maps if not _turns(problem, m.T_map_cam, camera)]
+    return [m for m in maps if not _turns(problem, m.T_map_cam, camera, settings)]
 
 
-def _turns(problem: MapProblem, keys: Collection[int], camera: Camera) -> bool:
+def _turns(problem: MapProblem, keys: Collection[int], camera: Camera, settings: MappingSettings) -> bool:
     """Whether the camera only turns in some of the views."""
-    return only_turns({key: view.xy for key, view in problem.views.items()}, problem.pairs, keys, camera)
+    places = {key: view.xy for key, view in problem.views.items()}
+    return only_turns(places, problem.pairs, keys, camera, settings.turning)
 
 
 def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[SparseMap]:
@@ -176,7 +177,9 @@ def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
     return min(large, key=lambda maps: maps[0].error_px, default=[])
 
 
-def _borne_out(found: SparseMap, problem: MapProblem, cache: Any, camera: Camera) -> SparseMap:
+def _borne_out(
+    found: SparseMap, problem: MapProblem, cache: Any, camera: Camera, settings: MappingSettings
+) -> SparseMap:
     """The map without keyframes that their matches contradict."""
     seen = {}
     for a, b in sorted(problem.pairs):
@@ -184,7 +187,7 @@ def _borne_out(found: SparseMap, problem: MapProblem, cache: Any, camera: Camera
             rows = cache.correspondence_graph.extract_matches_between_images(a + 1, b + 1)
             rows = np.asarray(rows, np.int64).reshape(-1, 2)
             seen[a, b] = problem.views[a].xy[rows[:, 0]], problem.views[b].xy[rows[:, 1]]
-    out = contradicted(found.T_map_cam, seen, camera)
+    out = contradicted(found.T_map_cam, seen, camera, settings.consistency)
     if not out:
         return found
     poses = {k: T for k, T in found.T_map_cam.items() if k not in out}

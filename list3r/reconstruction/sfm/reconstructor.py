@@ -22,9 +22,8 @@ from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.mvs.stereo import dense_depth, stereo_noise
+from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
-from list3r.reconstruction.rgbd.reconstructor import is_rigid, select_keyframes
-from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
 from list3r.reconstruction.sfm.keyframe_features import make_finder
 from list3r.reconstruction.sfm.links import keyframe_problem, step_beside, with_neighbours
@@ -41,7 +40,7 @@ MIDDLE_DEPTH = 2.0
 
 
 def make(options: ModelOptions) -> SfmReconstructor:
-    """The model with its default settings; dense depth runs on the GPU where there is one."""
+    """Return the model; dense depth runs on the GPU where there is one."""
     device = options.device
     if device == "auto":
         device = "cpu" if find_gpu() is None else "cuda"
@@ -49,7 +48,7 @@ def make(options: ModelOptions) -> SfmReconstructor:
     if options.local_features != "sift":
         where = "cpu" if options.device == "auto" else options.device
         detector = make_detector(options.local_features, Path(options.feature_weights or ""), where)
-    return SfmReconstructor(poses=options.poses, device=device, camera_known=options.camera_known, detector=detector)
+    return SfmReconstructor(options.settings.sfm, options.poses, device, options.camera_known, detector)
 
 
 @dataclass(frozen=True)
@@ -138,11 +137,8 @@ class SfmReconstructor:
     def _given(
         self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera
     ) -> PosedSegment:
-        poses = {
-            k: f.T_source_cam for k, f in enumerate(frames) if f.T_source_cam is not None and is_rigid(f.T_source_cam)
-        }
-        if not poses:
-            raise TrackingError(f"{_span(frames)}: none has a valid pose; use --poses estimate")
+        T, posed = given_poses(frames)
+        poses = {k: T[k] for k in np.flatnonzero(posed).tolist()}
         found = triangulate(problem, camera, poses, self.settings.mapping)
         return _with_given_poses(found or SparseMap({}, {}, camera), poses, tracks)
 
@@ -168,7 +164,7 @@ class SfmReconstructor:
             frames, sparse = [frames[k] for k in kept], [sparse[k] for k in kept]
             indices, posed, T = indices[used], posed[used], T[used]
         depth, confidence = dense_depth(frames, posed, T, camera, sparse, self.settings.dense, self.device)
-        keyframes = select_keyframes(T, posed, list(depth), OdometrySettings())
+        keyframes = select_keyframes(T, posed, list(depth), self.settings.keyframes)
         return Reconstruction(
             frame_indices=indices,
             posed=posed,
@@ -178,7 +174,7 @@ class SfmReconstructor:
             confidence=confidence,
             scale_kind="metric" if self.poses == "given" else "relative",
             keyframes=np.array(keyframes, np.int64),
-            depth_noise=stereo_noise(depth, confidence),
+            depth_noise=stereo_noise(depth, confidence, self.settings.dense.trust),
             between=between,
         )
 

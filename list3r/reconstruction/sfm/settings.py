@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from list3r.reconstruction.base import KeyframeSpacing
 from list3r.reconstruction.mvs.settings import MvsSettings
 
 
@@ -141,6 +142,8 @@ class MappingSettings:
     least_points: int = 40
     """Fewest points of a map that is believed."""
     seed: int = 1
+    consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
+    turning: TurningSettings = field(default_factory=TurningSettings)
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,11 @@ class FramePoseSettings:
     """Frames without corners in a row, between two that are posed, that are looked for by the structure known there."""
     bridge_window_px: int = 31
     """Window by which its points are looked for."""
-    mapping: MappingSettings = field(default_factory=MappingSettings)
+    least_matches: int = 20
+    """Fewest points of the map that a frame must see."""
+    pose_error_px: float = 4.0
+    """Largest error of a point that agrees with a pose, px of a picture 640 wide."""
+    seed: int = 1
 
 
 @dataclass(frozen=True)
@@ -193,9 +200,6 @@ class CameraCalibrationSettings:
     """So many windows' worth is that belief when the windows of a video tell their own spread."""
     doubted_sigmas: float = 2.5
     """A given focal length farther off than this is doubted aloud."""
-    tracks: CornerSettings = field(default_factory=CornerSettings)
-    links: LinkSettings = field(default_factory=LinkSettings)
-    mapping: MappingSettings = field(default_factory=MappingSettings)
 
 
 @dataclass(frozen=True)
@@ -206,6 +210,8 @@ class SfmSettings:
     links: LinkSettings = field(default_factory=LinkSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
     fill: FramePoseSettings = field(default_factory=FramePoseSettings)
+    calibration: CameraCalibrationSettings = field(default_factory=CameraCalibrationSettings)
+    keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)
     dense: MvsSettings = field(default_factory=MvsSettings)
     least_flow: float = 0.01
     """A camera whose picture moves less than this through a whole chunk, by the longer side, stands still."""
