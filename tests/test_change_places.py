@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.change.free_space import FreeSpaceCarving
+from list3r.memory.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.merging.edges import pair_scores
 from list3r.memory.overlap.summaries import chunk_summaries
-from list3r.memory.overlap.visibility import View, VisibilitySettings, seen_through_share, tally
+from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, seen_through_share, tally
 from list3r.memory.store.store import Store
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
 
@@ -20,9 +20,9 @@ TABLE = (0.0, 0.0, 0.75)
 S = VisibilitySettings()
 
 
-def _view(depth: float, frame: int = 0) -> View:
+def _view(depth: float, frame: int = 0) -> DepthView:
     picture = np.full((120, 160), depth, np.float32)
-    return View(1, frame, Sim3.identity(), 1.0, picture, (130.0, 130.0, 79.5, 59.5))
+    return DepthView(1, frame, Sim3.identity(), 1.0, picture, (130.0, 130.0, 79.5, 59.5))
 
 
 def _patch(z: float = 2.0) -> np.ndarray:

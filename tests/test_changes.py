@@ -12,7 +12,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.maintenance.history import world_at
-from list3r.memory.overlap.visibility import View, look
+from list3r.memory.overlap.visibility import DepthView, look
 from list3r.memory.records import ChangeEvent
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
@@ -20,10 +20,10 @@ from list3r.queries.changes import changes
 CAMERA = (130.0, 130.0, 79.5, 59.5)
 
 
-def _view(depth: Array | float, frame: int = 0, x: float = 0.0) -> View:
+def _view(depth: Array | float, frame: int = 0, x: float = 0.0) -> DepthView:
     """A camera at (x, 0, 0) that looks along z at a wall, or at what `depth` says."""
     picture = np.full((120, 160), depth, np.float32) if np.isscalar(depth) else np.asarray(depth, np.float32)
-    return View(1, frame, Sim3(1.0, np.eye(3), np.array([-x, 0.0, 0.0])), 1.0, picture, CAMERA)
+    return DepthView(1, frame, Sim3(1.0, np.eye(3), np.array([-x, 0.0, 0.0])), 1.0, picture, CAMERA)
 
 
 def _patch(z: float = 2.0, half: float = 0.06, count: int = 12) -> Array:

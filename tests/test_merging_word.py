@@ -25,7 +25,7 @@ def edit(entry: int, kind: str, *parts: list[Key], through: int = 9, target: int
 def grouped(edits: list[Edit], order: list[int] | None = None) -> list[list[Key]]:
     word = Constraints.of(edits)
     chunks = [WALK.chunks[n] for n in order or range(3)]
-    groups, _ = merge_nodes(chunks, WALK.S_world_chunk, [], word=word)
+    groups, _ = merge_nodes(chunks, WALK.S_world_chunk, [], constraints=word)
     return word.joined(groups, dict.fromkeys(range(1, 4), 1), {})[0]
 
 
@@ -75,10 +75,10 @@ def test_the_last_word_holds_wholly_and_the_order_of_chunks_does_not_matter(
 
 def test_what_was_deleted_takes_nothing_with_it_and_attracts_what_is_seen_of_it_later() -> None:
     word = Constraints.of([edit(1, "delete", [k for k in of("mug") if k[0] < 3], through=2)])
-    groups, _ = merge_nodes(WALK.chunks, WALK.S_world_chunk, [], word=word)
+    groups, _ = merge_nodes(WALK.chunks, WALK.S_world_chunk, [], constraints=word)
     assert [word.deleted(g) for g in groups] == [g == of("mug") for g in groups]
     alone = Constraints.of([edit(1, "delete", of("mug")[:1], through=9)])
-    groups, decisions = merge_nodes(WALK.chunks, WALK.S_world_chunk, [], word=alone)
+    groups, decisions = merge_nodes(WALK.chunks, WALK.S_world_chunk, [], constraints=alone)
     assert of("mug")[:1] in groups and of("mug")[1:] in groups
     assert any("operator deleted" in d.reason for d in decisions)
 

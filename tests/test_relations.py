@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from list3r.memory.geometry import rotation_exp
-from list3r.memory.relations.bodies import Body, fit_box
+from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box
 from list3r.memory.relations.predicates import INVERSE, relations
 from list3r.memory.relations.symmetry import round_axis
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, WALL, Piece, surface
@@ -19,25 +19,29 @@ BACK = Piece("back", (0, 1.22, 0.75), (0.45, 0.03, 0.5), points=700)
 CHAIR_LEGS = [Piece("leg", (x, 1 + y, 0.22), (0.03, 0.03, 0.44), points=60) for x in (-0.2, 0.2) for y in (-0.2, 0.2)]
 
 
-def body(id: int, *pieces: Piece, structure: str | None = None, seed: int = 0, view: float | None = 0.6) -> Body:
+def body(
+    id: int, *pieces: Piece, structure: str | None = None, seed: int = 0, view: float | None = 0.6
+) -> InstanceGeometry:
     points = np.concatenate([surface(p, seed + 31 * id + n, view) for n, p in enumerate(pieces)]).astype(float)
     rgb = np.tile(np.uint8([200, 200, 200]), (len(points), 1))
     box = fit_box(points, upright=True)
-    return Body(id, points, rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, structure)
+    return InstanceGeometry(id, points, rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, structure)
 
 
-def moved(b: Body, offset: tuple[float, float, float]) -> Body:
+def moved(b: InstanceGeometry, offset: tuple[float, float, float]) -> InstanceGeometry:
     points = b.points + np.asarray(offset)
     box = fit_box(points, upright=True)
-    return Body(b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure)
+    return InstanceGeometry(
+        b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure
+    )
 
 
-def facts(bodies: list[Body], **more: object) -> set[tuple[int, str, int]]:
+def facts(bodies: list[InstanceGeometry], **more: object) -> set[tuple[int, str, int]]:
     found = relations(bodies, gravity_known=True, **more)  # type: ignore[arg-type]
     return {(r.subject, r.predicate, r.object) for r in found}
 
 
-def kitchen(seed: int = 0) -> list[Body]:
+def kitchen(seed: int = 0) -> list[InstanceGeometry]:
     return [
         body(1, FLOOR, structure="floor", seed=seed),
         body(2, TABLE, *LEGS, seed=seed),
@@ -163,7 +167,9 @@ def test_relations_do_not_change_when_the_world_is_turned_about_the_vertical_and
         points = b.points @ rotation.T + np.asarray(offset)
         box = fit_box(points, upright=True)
         turned.append(
-            Body(b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure)
+            InstanceGeometry(
+                b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure
+            )
         )
     assert facts(turned) == facts(kitchen())
 
@@ -175,14 +181,16 @@ def test_relations_scale_with_the_unit_of_a_relative_memory(scale: float) -> Non
         points = b.points * scale
         box = fit_box(points, upright=True)
         scaled.append(
-            Body(b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure)
+            InstanceGeometry(
+                b.id, points, b.rgb, box, np.stack([points.min(axis=0), points.max(axis=0)]), None, b.structure
+            )
         )
     assert facts(scaled, unit=scale) == facts(kitchen())
 
 
 def test_parts_of_different_frames_of_reference_have_no_relations() -> None:
     a, b = body(2, CHAIR), moved(body(3, CHAIR), (0.6, 0, 0))
-    apart = Body(3, b.points, b.rgb, b.box, b.aabb, None, None, component=5)
+    apart = InstanceGeometry(3, b.points, b.rgb, b.box, b.aabb, None, None, component=5)
     assert relations([a, apart], gravity_known=True) == []
 
 
@@ -190,7 +198,7 @@ def test_no_bodies_no_relations() -> None:
     assert relations([], gravity_known=True) == []
 
 
-def shell(id: int, radius: float, height: float, arc: tuple[float, float], noise: float = 0.003) -> Body:
+def shell(id: int, radius: float, height: float, arc: tuple[float, float], noise: float = 0.003) -> InstanceGeometry:
     """The wall of an open basket between two azimuths, as it is seen from one side, and its bottom."""
     rng = np.random.default_rng(id)
     angle, z = rng.uniform(*arc, 600), rng.uniform(0, height, 600)
@@ -199,7 +207,7 @@ def shell(id: int, radius: float, height: float, arc: tuple[float, float], noise
     points = np.concatenate([wall, np.column_stack([flat, np.zeros(200)])]) + rng.normal(0, noise, (800, 3))
     box = fit_box(points, upright=True)
     aabb = np.stack([points.min(axis=0), points.max(axis=0)])
-    return Body(id, points, np.full((800, 3), 180, np.uint8), box, aabb, None)
+    return InstanceGeometry(id, points, np.full((800, 3), 180, np.uint8), box, aabb, None)
 
 
 @pytest.mark.parametrize("arc", [(0.0, 2 * np.pi), (0.2, 3.3)])
@@ -270,7 +278,7 @@ def test_a_ball_of_which_only_the_top_looks_out_of_a_bowl_is_in_it() -> None:
     for id, points in ((2, bowl), (3, ball)):
         rgb = np.tile(np.uint8([90, 90, 200]), (len(points), 1))
         corners = np.stack([points.min(axis=0), points.max(axis=0)])
-        parts.append(Body(id, points, rgb, fit_box(points, upright=True), corners, None, None))
+        parts.append(InstanceGeometry(id, points, rgb, fit_box(points, upright=True), corners, None, None))
     assert (3, "in", 2) in facts(parts)
 
 
@@ -305,7 +313,7 @@ def test_a_bowl_beside_a_box_that_was_taken_for_part_of_the_cabinet_is_on_the_ca
     assert (3, "on", 2) in found and (3, "in", 2) not in found
 
 
-def gap_of(*bodies: Body) -> float:
+def gap_of(*bodies: InstanceGeometry) -> float:
     """The gap that `near` was said with."""
     limit = float(np.clip(0.25 * (bodies[0].size + bodies[1].size), 0.15, 0.4))
     return limit - next(r.margin for r in relations(list(bodies), gravity_known=True) if r.predicate == "near")
@@ -324,7 +332,7 @@ def test_readings_amidst_the_edge_between_two_things_do_not_bring_them_nearer() 
     stray = np.column_stack([np.linspace(0.12, 0.2, 4), np.zeros(4), np.linspace(0.05, 0.2, 4)])
     points = np.concatenate([left.points, stray])
     rgb = np.tile(np.uint8([200, 200, 200]), (len(points), 1))
-    frayed = Body(2, points, rgb, left.box, left.aabb, None)
+    frayed = InstanceGeometry(2, points, rgb, left.box, left.aabb, None)
     assert gap_of(frayed, right) == pytest.approx(gap_of(left, right), abs=0.005)
 
 
@@ -340,10 +348,10 @@ def front(radius: float, height: float, view: float, *, ball: bool, seed: int = 
     return points
 
 
-def made_of(id: int, points: np.ndarray) -> Body:
+def made_of(id: int, points: np.ndarray) -> InstanceGeometry:
     rgb = np.tile(np.uint8([90, 90, 200]), (len(points), 1))
     corners = np.stack([points.min(axis=0), points.max(axis=0)])
-    return Body(id, points, rgb, fit_box(points, upright=True), corners, None)
+    return InstanceGeometry(id, points, rgb, fit_box(points, upright=True), corners, None)
 
 
 @pytest.mark.parametrize("view", [0.3, 2.0, 4.5])
@@ -364,7 +372,7 @@ def test_only_what_is_round_has_an_axis() -> None:
 
 
 def test_what_is_measured_at_the_bound_is_not_said() -> None:
-    def at(gap: float) -> list[Body]:
+    def at(gap: float) -> list[InstanceGeometry]:
         return [
             body(2, Piece("left", (0, 0, 0.2), (0.4, 0.4, 0.4), points=3000)),
             body(3, Piece("right", (0.4 + gap, 0, 0.2), (0.4, 0.4, 0.4), points=3000)),

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 
 from list3r.memory.geometry import upright_box
-from list3r.memory.relations.bodies import Body
+from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.structure import StructureSettings, classify_structure
 
 COMPUTED = StructureSettings(floor_band_m=StructureSettings().computed_floor_band_m)
 
 
-def level(height: float, thickness: float, size: float = 3.0) -> Body:
+def level(height: float, thickness: float, size: float = 3.0) -> InstanceGeometry:
     """A level surface whose middle four fifths of points are so thick."""
     rng = np.random.default_rng(5)
     points = rng.uniform((-size / 2, -size / 2, -1.0), (size / 2, size / 2, 1.0), (3000, 3))
     points[:, 2] = height + points[:, 2] * thickness / 1.6
     aabb = np.stack([points.min(axis=0), points.max(axis=0)])
-    return Body(1, points, np.zeros((len(points), 3), np.uint8), upright_box(points), aabb, np.array([0.0, 0.0, 1.0]))
+    return InstanceGeometry(
+        1, points, np.zeros((len(points), 3), np.uint8), upright_box(points), aabb, np.array([0.0, 0.0, 1.0])
+    )
 
 
 @pytest.mark.parametrize(

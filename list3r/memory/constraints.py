@@ -1,14 +1,18 @@
-"""What an operator said of local instances: what belongs together, what does not, what is gone, what it is called.
+"""Constraints from operators' edits: what belongs together, what does not, what is gone, what it is called.
 
-Edits speak of local instances (chunk:local), which never change, so they hold however the groups are formed later. The
-last word wins: edits are taken newest first, and what an older one says against a newer one is left out.
+Edits name local instances (chunk:local), which never change, so they hold however the groups are formed later. The
+last edit wins: edits are taken newest first, and what an older one says against a newer one is left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
+from itertools import product
 from typing import TypeVar
+
+from scipy.cluster.hierarchy import DisjointSet
 
 Key = tuple[int, int]
 """(chunk id, local id)."""
@@ -54,57 +58,55 @@ def standing(edits: Sequence[Edit]) -> list[Edit]:
     return kept[::-1]
 
 
-class Bonds:
-    """Sets of local instances that belong together, and which sets must never come together. Grows by `join`."""
+class LinkConstraints:
+    """Sets of local instances that must be linked, and which of these sets must not."""
 
     def __init__(self) -> None:
-        self._root: dict[Key, Key] = {}
-        self._members: dict[Key, set[Key]] = {}
-        self._foes: dict[Key, set[Key]] = {}
+        self._sets: DisjointSet = DisjointSet()
+        self._apart: dict[Key, set[Key]] = {}
 
-    def copy(self) -> Bonds:
-        """Bonds that can grow without changing these."""
-        other = Bonds()
-        other._root = dict(self._root)
-        other._members = {k: set(v) for k, v in self._members.items()}
-        other._foes = {k: set(v) for k, v in self._foes.items()}
-        return other
+    def copy(self) -> LinkConstraints:
+        """Return constraints that can grow without changing these."""
+        return deepcopy(self)
+
+    def _root(self, key: Key) -> Key:
+        return self._sets[key] if key in self._sets else key
 
     def members(self, key: Key) -> set[Key]:
-        """All that belongs together with a local instance, itself too."""
-        return self._members.get(self._root.get(key, key), {key})
+        """Return all that must be linked with a local instance, itself too."""
+        return set(self._sets.subset(key)) if key in self._sets else {key}
 
     def sets(self) -> list[list[Key]]:
-        """All sets of two and more, in order."""
-        return sorted(sorted(m) for m in self._members.values() if len(m) > 1)
+        """Return all sets of two and more, in order."""
+        return sorted(sorted(m) for m in self._sets.subsets() if len(m) > 1)
 
-    def part(self, a: Key, b: Key) -> None:
-        """The two never come together, unless they belong together already."""
-        root_a, root_b = self._root.get(a, a), self._root.get(b, b)
-        if root_a != root_b:
-            self._foes.setdefault(root_a, set()).add(root_b)
-            self._foes.setdefault(root_b, set()).add(root_a)
+    def cannot_link(self, a: Key, b: Key) -> None:
+        """Keep two apart, and all that is linked with them, unless they are linked with each other."""
+        a, b = self._root(a), self._root(b)
+        if a != b:
+            self._apart.setdefault(a, set()).add(b)
+            self._apart.setdefault(b, set()).add(a)
 
-    def parted(self, a: Key, b: Key) -> bool:
-        """Whether the two must not come together."""
-        return self._root.get(b, b) in self._foes.get(self._root.get(a, a), ())
+    def forbids(self, a: Key, b: Key) -> bool:
+        """Return whether two must not be linked."""
+        return self._root(b) in self._apart.get(self._root(a), ())
 
-    def join(self, a: Key, b: Key) -> None:
-        """The two belong together, and all that belongs to them."""
-        keep, gone = self._root.get(a, a), self._root.get(b, b)
-        if keep == gone:
-            return
-        moved = self._members.pop(gone, {gone})
-        self._members.setdefault(keep, {keep}).update(moved)
-        self._root.update(dict.fromkeys(moved | {keep}, keep))
-        for foe in self._foes.pop(gone, set()):
-            self._foes[foe].discard(gone)
-            self._foes[foe].add(keep)
-            self._foes.setdefault(keep, set()).add(foe)
+    def must_link(self, a: Key, b: Key) -> None:
+        """Link two, and all that is linked with them."""
+        self._sets.add(a)
+        self._sets.add(b)
+        roots = {self._sets[a], self._sets[b]}
+        self._sets.merge(a, b)
+        keep = self._sets[a]
+        for gone in roots - {keep}:
+            for other in self._apart.pop(gone, set()):
+                self._apart[other].discard(gone)
+                self._apart[other].add(keep)
+                self._apart.setdefault(keep, set()).add(other)
 
-    def partings(self) -> list[tuple[Key, Key]]:
-        """One pair of names for every two sets that must not come together; see `members`."""
-        return sorted((a, b) for a, foes in self._foes.items() for b in foes if a < b)
+    def cannot_links(self) -> list[tuple[Key, Key]]:
+        """Return one local instance of each for every two sets that must not be linked; see `members`."""
+        return sorted((a, b) for a, others in self._apart.items() for b in others if a < b)
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,8 @@ class Deletion:
 class Constraints:
     """All that the standing edits say."""
 
-    bonds: Bonds = field(default_factory=Bonds)
-    """What belongs together and what does not."""
+    links: LinkConstraints = field(default_factory=LinkConstraints)
+    """What must be linked and what must not."""
     deletions: tuple[Deletion, ...] = ()
     labels: tuple[tuple[frozenset[Key], str | None], ...] = ()
     """Newest first; None takes a label away."""
@@ -138,75 +140,69 @@ class Constraints:
     @staticmethod
     def of(edits: Sequence[Edit]) -> Constraints:
         """What edits (undone ones among them) come to."""
-        bonds, deletions, labels, touched = Bonds(), [], [], set()
+        links, deletions, labels, touched = LinkConstraints(), [], [], set()
         for edit in reversed(standing(edits)):
             keys = [k for part in edit.parts for k in part]
             if edit.kind in ("merge", "split"):
-                _bind(bonds, [keys] if edit.kind == "merge" else edit.parts)
+                _must_link(links, [keys] if edit.kind == "merge" else edit.parts)
                 touched.update(keys)
             if edit.kind == "split":
-                for a in edit.parts[0]:
-                    for b in edit.parts[1]:
-                        bonds.part(a, b)
+                for a, b in product(*edit.parts[:2]):
+                    links.cannot_link(a, b)
             elif edit.kind == "label":
                 labels.append((frozenset(keys), edit.text))
                 touched.update(keys)
             elif edit.kind == "delete":
-                _bind(bonds, [keys])
+                _must_link(links, [keys])
                 deletions.append(Deletion(frozenset(keys), edit.through))
-        return Constraints(bonds, tuple(deletions), tuple(labels), frozenset(touched))
+        return Constraints(links, tuple(deletions), tuple(labels), frozenset(touched))
 
-    def growing(self) -> Growing:
-        """To ask while groups are formed."""
-        return Growing(self)
+    def check(self) -> ConstraintCheck:
+        """Return what to ask while groups are formed."""
+        return ConstraintCheck(self)
 
     def forbids(self, a: Collection[Key], b: Collection[Key]) -> str:
         """Why two whole groups must not be made one thing, or nothing."""
         if not self:
             return ""
-        growing = self.growing()
+        check = self.check()
         for group in (a, b):
             first, *rest = sorted(group)
             for key in rest:
-                growing.join(first, key)
-        return growing.objection(min(a), min(b))
+                check.join(first, key)
+        return check.objection(min(a), min(b))
 
     def pairs_apart(self, among: Collection[Key]) -> list[tuple[Key, Key]]:
-        """Pairs that must not come together, of which one is among these."""
+        """Return pairs that must not come together, of which one is among these."""
         wanted = set(among)
         out = []
-        for a, b in self.bonds.partings():
-            left, right = sorted(self.bonds.members(a)), sorted(self.bonds.members(b))
-            out += [(x, y) for x in left for y in right if x in wanted or y in wanted]
+        for a, b in self.links.cannot_links():
+            pairs = product(sorted(self.links.members(a)), sorted(self.links.members(b)))
+            out += [(x, y) for x, y in pairs if x in wanted or y in wanted]
         return out
 
     def joined(
         self, groups: Sequence[Sequence[Key]], components: Mapping[int, int], of_first: Mapping[Key, T]
     ) -> tuple[list[list[Key]], dict[Key, T]]:
-        """The groups with those joined that belong together, and what is known of them by their first member.
+        """Return the groups with those joined that must be linked, and what is known of them by their first member.
 
-        `components` by chunk id: what lies in two frames of reference cannot be one thing yet. Of several groups that
-        come together the last one of which anything is known tells.
+        `components` by chunk id: what lies in two connected components cannot be one instance yet. Of several groups
+        that come together the last one of which anything is known tells.
         """
         home = {key: n for n, group in enumerate(groups) for key in group}
-        parts = {n: [n] for n in range(len(groups))}
-        now = list(range(len(groups)))
-        for together in self.bonds.sets():
-            present = [k for k in together if k in home]
-            for component in sorted({components[k[0]] for k in present}):
-                ns = sorted({now[home[k]] for k in present if components[k[0]] == component})
-                for n in ns[1:]:
-                    parts[ns[0]] += parts.pop(n)
-                    for m in parts[ns[0]]:
-                        now[m] = ns[0]
+        sets = DisjointSet(range(len(groups)))
+        for together in self.links.sets():
+            first: dict[int, int] = {}
+            for k in (k for k in together if k in home):
+                sets.merge(first.setdefault(components[k[0]], home[k]), home[k])
         out: list[list[Key]] = []
         known: dict[Key, T] = {}
-        for members in parts.values():
+        for members in map(sorted, sets.subsets()):
             keys = sorted(k for n in members for k in groups[n])
             out.append(keys)
-            for n in sorted(members):
-                if groups[n][0] in of_first:
-                    known[keys[0]] = of_first[groups[n][0]]
+            found = [of_first[groups[n][0]] for n in members if groups[n][0] in of_first]
+            if found:
+                known[keys[0]] = found[-1]
         return sorted(out), known
 
     def deleted(self, group: Collection[Key]) -> bool:
@@ -239,32 +235,31 @@ class Constraints:
         return out
 
 
-class Growing:
-    """Whether groups may join, while they are formed: an operator's word speaks for all that belongs together."""
+class ConstraintCheck:
+    """Whether groups may join, while they are formed: a constraint holds for all that is linked."""
 
     def __init__(self, constraints: Constraints) -> None:
-        self._bonds = constraints.bonds.copy()
+        self._links = constraints.links.copy()
         self._deletions = constraints.deletions
 
     def objection(self, a: Key, b: Key) -> str:
-        """Why the groups of two local instances must stay apart, or nothing."""
-        if self._bonds.parted(a, b):
+        """Return why the groups of two local instances must stay apart, or nothing."""
+        if self._links.forbids(a, b):
             return "an operator parted them"
-        if self._deletions:
-            left, right = self._bonds.members(a), self._bonds.members(b)
-            for d in self._deletions:
-                for one, other in ((left, right), (right, left)):
-                    if not d.keys.isdisjoint(one) and d.outside(other):
-                        return "an operator deleted one of them, and not the other"
-        return ""
+        if not self._deletions:
+            return ""
+        left, right = self._links.members(a), self._links.members(b)
+        sides = ((left, right), (right, left))
+        parted = (not d.keys.isdisjoint(x) and d.outside(y) for d in self._deletions for x, y in sides)
+        return "an operator deleted one of them, and not the other" if any(parted) else ""
 
     def join(self, a: Key, b: Key) -> None:
-        """Two groups, named by any member, have joined."""
-        self._bonds.join(a, b)
+        """Take in that two groups, named by any member, have joined."""
+        self._links.must_link(a, b)
 
 
-def _bind(bonds: Bonds, sets: Iterable[Sequence[Key]]) -> None:
+def _must_link(links: LinkConstraints, sets: Iterable[Sequence[Key]]) -> None:
     for keys in sets:
         for key in sorted(keys)[1:]:
-            if not bonds.parted(min(keys), key):
-                bonds.join(min(keys), key)
+            if not links.forbids(min(keys), key):
+                links.must_link(min(keys), key)

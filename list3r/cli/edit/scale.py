@@ -65,7 +65,7 @@ def scale(
 
 
 def anchor_scale(memory: Path, anchor: str, author: str | None = None) -> EditReport:
-    """Anchor the scale of a memory file; the `EditReport`."""
+    """ScaleAnchor the scale of a memory file; the `EditReport`."""
     from list3r.api import open as open_scene
 
     with open_scene(memory, writable=True) as scene:

@@ -32,7 +32,7 @@ from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.masks import encode_mask
-from list3r.memory.overlap.visibility import View, views_of
+from list3r.memory.overlap.visibility import DepthView, views_of
 from list3r.memory.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.chunks import LocalNode
@@ -54,7 +54,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         return 0
     keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
     upright = store.get_value("gravity", "unknown") != "unknown"
-    asked: list[tuple[ChunkRow, list[View], float, CarvedSurfaces]] = []
+    asked: list[tuple[ChunkRow, list[DepthView], float, CarvedSurfaces]] = []
     for chunk in near:
         others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
         if others and store.feature_space(chunk.chunk_id) == FEATURE_SPACE:
@@ -188,7 +188,7 @@ class _Maker:
         self,
         chunk: ChunkRow,
         keyframes: Sequence[Keyframe],
-        views: Sequence[View],
+        views: Sequence[DepthView],
         frames: Sequence[FrameRow],
         unit: float,
         upright: bool,

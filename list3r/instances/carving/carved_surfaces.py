@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import pack
 from list3r.memory.geometry import Array
-from list3r.memory.overlap.visibility import FREE, MET, View, VisibilitySettings, tell
+from list3r.memory.overlap.visibility import FREE, MET, DepthView, VisibilitySettings, tell
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -72,7 +72,7 @@ class CarvedSurfaces:
     """Whether their own session is sure of them. Shape (N,)."""
 
 
-def lift(view: View) -> tuple[Array, Ints, Ints]:
+def lift(view: DepthView) -> tuple[Array, Ints, Ints]:
     """Points of a keyframe's depth in the world (N, 3), with their rows and columns."""
     fx, fy, cx, cy = view.camera
     row, column = np.nonzero(view.depth > 0)
@@ -81,7 +81,7 @@ def lift(view: View) -> tuple[Array, Ints, Ints]:
     return view.S_cam_world.inverse().apply(p), row, column
 
 
-def ask(own: Sequence[View], others: Sequence[View], unit: float, s: ChangedPlaceSettings) -> CarvedSurfaces:
+def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: ChangedPlaceSettings) -> CarvedSurfaces:
     """The surfaces that a chunk's keyframes see, and what the frames of the other sessions tell of them."""
     points = _cells([lift(v) for v in own], own, unit, s)
     blocks = _SurfaceBlocks(points, s.block_m * unit)
@@ -110,7 +110,7 @@ class _SurfaceBlocks:
         self._centers = (block[first] + 0.5) * edge
         self._radius = edge * np.sqrt(3.0) / 2
 
-    def seen_by(self, view: View, most_depth_m: float) -> Ints:
+    def seen_by(self, view: DepthView, most_depth_m: float) -> Ints:
         """Rows of the points in blocks that reach into the frustum of a frame."""
         p = view.S_cam_world.apply(self._centers)
         fx, fy, cx, cy = view.camera
@@ -126,7 +126,7 @@ class _SurfaceBlocks:
 
 
 def _cells(
-    lifted: Sequence[tuple[Array, Ints, Ints]], views: Sequence[View], unit: float, s: ChangedPlaceSettings
+    lifted: Sequence[tuple[Array, Ints, Ints]], views: Sequence[DepthView], unit: float, s: ChangedPlaceSettings
 ) -> Array:
     """One mean point for each occupied cell, of what lies within reach. Shape (N, 3)."""
     parts = []

@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from list3r.memory.change.free_space import FreeSpaceCarving
-from list3r.memory.change.matching import Story
+from list3r.memory.change.free_space_carving import FreeSpaceCarving
+from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.change.places import Places
 from list3r.memory.change.records import Change, Changes, ChangeSettings
 from list3r.memory.geometry import Sim3
@@ -72,17 +72,17 @@ def find_changes(
     """Go through the sessions in order and say what each has changed.
 
     `groups` are the things by overlap, `shown` those that count, `fixed` the first members of those that were seen
-    moving and have a story of their own. Nothing is done for a memory of one session.
+    moving and have a matching of their own. Nothing is done for a memory of one session.
     """
     plain = [list(g) for g in groups]
     sessions = sorted({c.session_id for c in chunks})
     if len(sessions) < 2:
         return Changes(plain, {}, {}, (), [])
     places = Places(store, plain, chunks, summaries, settings)
-    story = Story(places, shown, fixed, store.constraints(), settings)
+    matching = ChangeMatching(places, shown, fixed, store.constraints(), settings)
     for session in sessions[1:]:
-        story.tell(session)
-    return story.result()
+        matching.match(session)
+    return matching.result()
 
 
 def as_events(changes: Changes, ids: Mapping[Key, int | None]) -> list[ChangeEvent]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from scipy.cluster.hierarchy import DisjointSet
+
 from list3r.memory.change.records import Changes
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.records import ChunkRow
@@ -19,7 +21,7 @@ Group = tuple[Key, ...]
 
 
 @dataclass(frozen=True)
-class Moved:
+class MovedInstance:
     """A thing that was at several places."""
 
     places: tuple[Group, ...]
@@ -30,12 +32,12 @@ class Moved:
 
 @dataclass(frozen=True)
 class ChangeLedger:
-    """The story of the sessions that have ended."""
+    """The matching of the sessions that have ended."""
 
     session: int
     """The last session that it tells of."""
-    moved: tuple[Moved, ...] = ()
-    told: frozenset[Key] = frozenset()
+    moved: tuple[MovedInstance, ...] = ()
+    with_events: frozenset[Key] = frozenset()
     """A local instance of every thing that has an event."""
 
     @staticmethod
@@ -46,12 +48,12 @@ class ChangeLedger:
         for group in changes.groups:
             if group[0] in changes.current:
                 parts = sorted({home[key] for key in group})
-                moved.append(Moved(tuple(parts), parts.index(home[changes.current[group[0]][0]])))
+                moved.append(MovedInstance(tuple(parts), parts.index(home[changes.current[group[0]][0]])))
         return ChangeLedger(session, tuple(moved), frozenset(e.first for e in changes.events))
 
     def shows(self, group: Collection[Key]) -> bool:
         """Whether a group has an event, so that it is shown however little was seen of it."""
-        return not self.told.isdisjoint(group)
+        return not self.with_events.isdisjoint(group)
 
     def current(self, group: Sequence[Key]) -> tuple[Key, ...]:
         """The members of a thing that show it where it is now; all, but for what has moved."""
@@ -63,35 +65,35 @@ class ChangeLedger:
 
     def keys(self) -> set[Key]:
         """All local instances that it speaks of."""
-        return {k for m in self.moved for place in m.places for k in place} | self.told
+        return {k for m in self.moved for place in m.places for k in place} | self.with_events
 
     def joined(
         self, groups: Sequence[Sequence[Key]], components: Mapping[int, int]
     ) -> tuple[list[list[Key]], ChangeLedger]:
-        """Groups by overlap with those joined that are the places of one thing, and the tale with the places as they
+        """Groups by overlap with those joined that are the places of one thing, and the ledger with the places as they
         have become; what it says of things that are not among the groups stands. `components` by chunk id.
         """
         home = {key: n for n, group in enumerate(groups) for key in group}
-        root = list(range(len(groups)))
-        owner: dict[int, Moved] = {}
+        sets = DisjointSet(range(len(groups)))
+        owners: list[tuple[int, MovedInstance]] = []
         absent = []
         for m in self.moved:
-            found = sorted({root[home[k]] for place in m.places for k in place if k in home})
+            found = sorted({home[k] for place in m.places for k in place if k in home})
             here = sorted({home[k] for k in m.places[m.now] if k in home})
             if not found or not here:
                 absent += [m] if not found else []
                 continue
             component = components[groups[here[0]][0][0]]
             same = [n for n in found if components[groups[n][0][0]] == component]
-            root = [same[0] if n in same else n for n in root]
-            owner[same[0]] = m
-        parts: dict[int, list[int]] = {}
-        for n, first in enumerate(root):
-            parts.setdefault(first, []).append(n)
+            for n in same[1:]:
+                sets.merge(same[0], n)
+            owners.append((same[0], m))
+        owner = {sets[n]: m for n, m in owners}
+        parts = {sets[ns[0]]: ns for ns in map(sorted, sets.subsets())}
         renewed = [_renewed([groups[n] for n in ns], owner.get(first)) for first, ns in parts.items()]
         out = sorted(sorted(k for n in ns for k in groups[n]) for ns in parts.values())
         moved = sorted([*absent, *(m for m in renewed if m is not None)], key=lambda m: min(m.places))
-        return out, ChangeLedger(self.session, tuple(moved), self.told)
+        return out, ChangeLedger(self.session, tuple(moved), self.with_events)
 
     def state(self, before: str | None, group: Sequence[Key], rows: Mapping[int, ChunkRow]) -> str:
         """The state of a thing: the one that was told, until a later session sees it."""
@@ -99,7 +101,7 @@ class ChangeLedger:
         return "present" if before is None or later else before
 
 
-def _renewed(groups: Sequence[Sequence[Key]], before: Moved | None) -> Moved | None:
+def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> MovedInstance | None:
     """The places of one thing as groups have become; nothing where they are one by overlap."""
     if before is None or len(groups) < 2:
         return None
@@ -108,24 +110,24 @@ def _renewed(groups: Sequence[Sequence[Key]], before: Moved | None) -> Moved | N
     rest = [tuple(sorted(g)) for g in groups if there.isdisjoint(g)]
     now = tuple(sorted(k for g in here for k in g))
     places = sorted([now, *rest])
-    return Moved(tuple(places), places.index(now)) if here and rest else None
+    return MovedInstance(tuple(places), places.index(now)) if here and rest else None
 
 
 def read_ledger(store: Store, chunks: Sequence[ChunkRow]) -> ChangeLedger | None:
     """What stands of changes; None where several sessions have ended and nothing is written down of them."""
     told = store.get_value(_NAME)
     if told is not None:
-        moved = (Moved(tuple(_keys(p) for p in m["places"]), int(m["now"])) for m in told["moved"])
+        moved = (MovedInstance(tuple(_keys(p) for p in m["places"]), int(m["now"])) for m in told["moved"])
         return ChangeLedger(int(told["session"]), tuple(moved), frozenset(_keys(told["told"])))
     complete = {s.session_id for s in store.sessions() if s.state == "complete"}
     ended = sorted({c.session_id for c in chunks} & complete)
     return ChangeLedger(ended[0] if ended else 0) if len(ended) < 2 else None
 
 
-def write_ledger(store: Store, tale: ChangeLedger) -> None:
+def write_ledger(store: Store, ledger: ChangeLedger) -> None:
     """Keep it; call inside `transaction()`."""
-    moved = [{"places": [list(map(list, p)) for p in m.places], "now": m.now} for m in tale.moved]
-    store.set_value(_NAME, {"session": tale.session, "moved": moved, "told": sorted(map(list, tale.told))})
+    moved = [{"places": [list(map(list, p)) for p in m.places], "now": m.now} for m in ledger.moved]
+    store.set_value(_NAME, {"session": ledger.session, "moved": moved, "told": sorted(map(list, ledger.with_events))})
 
 
 def _keys(pairs: Sequence[Sequence[int]]) -> Group:

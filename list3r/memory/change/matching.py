@@ -20,7 +20,7 @@ _NEVER = 1e6
 
 
 @dataclass
-class _Thing:
+class _PlacedInstance:
     """One thing and the places it had: groups by overlap, of which one is where it is now."""
 
     places: list[int]
@@ -32,7 +32,7 @@ class _Thing:
 class _Move:
     """A thing that is gone from one place and found at another."""
 
-    thing: _Thing
+    thing: _PlacedInstance
     place: int
     deviations: float
     """Sum of squared deviations between what is gone and what is found."""
@@ -40,25 +40,30 @@ class _Move:
     """Of being the same thing rather than one of the other candidates or none, in [0, 1]."""
 
 
-class Story:
+class ChangeMatching:
     """Tells what each session has changed; the result stands when all are told, in order."""
 
     def __init__(
-        self, places: Places, shown: Sequence[bool], fixed: frozenset[Key], word: Constraints, settings: ChangeSettings
+        self,
+        places: Places,
+        shown: Sequence[bool],
+        fixed: frozenset[Key],
+        constraints: Constraints,
+        settings: ChangeSettings,
     ) -> None:
-        self._p, self._s, self._word = places, settings, word
+        self._p, self._s, self._constraints = places, settings, constraints
         groups = places.groups
         self._movable = [
             g[0] not in fixed and places.flagged(n) < settings.most_structure for n, g in enumerate(groups)
         ]
         self._counts = [bool(show) and loose for show, loose in zip(shown, self._movable, strict=True)]
-        self._thing = {n: _Thing([n], n) for n in range(len(groups))}
+        self._thing = {n: _PlacedInstance([n], n) for n in range(len(groups))}
         self._instead: set[int] = set()
         """New things that stand where others stood."""
         self._events: list[tuple[int, Change]] = []
         self._decisions: list[MergeDecision] = []
 
-    def tell(self, session: int) -> None:
+    def match(self, session: int) -> None:
         """What one session has changed."""
         p = self._p
         components = {c.component for c in p.rows.values() if c.session_id == session}
@@ -97,10 +102,10 @@ class Story:
             for place, box in left.items()
         )
 
-    def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_Thing, Look]]:
+    def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_PlacedInstance, Look]]:
         """The things that are gone from where they were; all others that were known are given their state."""
         p = self._p
-        gone: list[tuple[_Thing, Look]] = []
+        gone: list[tuple[_PlacedInstance, Look]] = []
         for thing in self._things():
             if p.sessions[thing.now][0] >= session or p.component[thing.now] not in components:
                 continue
@@ -142,7 +147,7 @@ class Story:
                     return m
         return None
 
-    def _things(self) -> list[_Thing]:
+    def _things(self) -> list[_PlacedInstance]:
         return [thing for n, thing in sorted(self._thing.items()) if thing.places[0] == n]
 
     def _scrap(self, n: int, boxes: dict[int, OrientedBox], session: int, *, before: bool) -> bool:
@@ -155,7 +160,7 @@ class Story:
             if m != n and self._p.component[m] == self._p.component[n]
         )
 
-    def _seen(self, thing: _Thing, places: list[int], session: int) -> None:
+    def _seen(self, thing: _PlacedInstance, places: list[int], session: int) -> None:
         p = self._p
         place = thing.now if thing.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
         kind = "seen_again" if place == thing.now else "moved"
@@ -166,19 +171,19 @@ class Story:
             frames = p.frames_in(place, session)
             reason = f"its surface was found at its place in {frames} frames"
             sure = frames / (frames + 4.0)
-            self._tell(thing, session, kind, before, after, p.evidence(place, session), sure, reason)
+            self._record(thing, session, kind, before, after, p.evidence(place, session), sure, reason)
 
-    def _still_there(self, thing: _Thing, session: int, found: Look) -> None:
+    def _still_there(self, thing: _PlacedInstance, session: int, found: Look) -> None:
         thing.state = "present"
         box = self._p.box(thing.now, session, before=True, stayed=True)
         reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
-        self._tell(thing, session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason)
+        self._record(thing, session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason)
 
-    def _remove(self, thing: _Thing, session: int, found: Look) -> None:
+    def _remove(self, thing: _PlacedInstance, session: int, found: Look) -> None:
         thing.state = "removed"
         box = self._p.box(thing.now, session, before=True)
         reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
-        self._tell(thing, session, "removed", box, None, found.frames, _sure(found), reason)
+        self._record(thing, session, "removed", box, None, found.frames, _sure(found), reason)
 
     def _add(self, place: int, session: int, found: Look) -> None:
         thing = self._thing[place]
@@ -188,7 +193,7 @@ class Story:
         known = found.verdict == "gone"
         reason = seen if known else "it stands where something else stood that is gone"
         sure = _sure(found) if known else 0.5
-        self._tell(thing, session, "added", None, box, self._p.evidence(place, session), sure, reason)
+        self._record(thing, session, "added", None, box, self._p.evidence(place, session), sure, reason)
 
     def _move(self, move: _Move, session: int, found: Look) -> None:
         p, thing, place = self._p, move.thing, move.place
@@ -199,14 +204,14 @@ class Story:
         scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
         self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
         sure = _sure(found) * move.chance
-        self._tell(thing, session, "moved", old, new, p.evidence(place, session), sure, reason)
+        self._record(thing, session, "moved", old, new, p.evidence(place, session), sure, reason)
         thing.places.append(place)
         thing.now, thing.state = place, "moved"
         del self._thing[place]
 
-    def _tell(
+    def _record(
         self,
-        thing: _Thing,
+        thing: _PlacedInstance,
         session: int,
         kind: str,
         before: OrientedBox | None,
@@ -219,7 +224,7 @@ class Story:
         change = Change(first, session, kind, before, after, frames[:8], round(confidence, 3), reason)
         self._events.append((thing.places[0], change))
 
-    def _moves(self, gone: Sequence[tuple[_Thing, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
+    def _moves(self, gone: Sequence[tuple[_PlacedInstance, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
         """Pairs of what is gone and what is new, one to one, of least difference in all."""
         if not gone or not fresh:
             return []
@@ -234,7 +239,7 @@ class Story:
                 if (
                     p.component[n] == p.component[thing.now]
                     and not taken.intersection(p.sessions[n])
-                    and not self._word.forbids(own, list(p.groups[n]))
+                    and not self._constraints.forbids(own, list(p.groups[n]))
                 ):
                     cost[i, j] = min(difference(old, new[j], self._s, p.unit), _NEVER)
         # For every thing that is gone there is one more column: that it was not found, at the price of the limit.
@@ -248,7 +253,7 @@ class Story:
         ]
 
     def result(self) -> Changes:
-        """The groups as the story leaves them."""
+        """The groups as the matching leaves them."""
         groups, current, states = [], {}, {}
         names: dict[int, Key] = {}
         for thing in self._things():

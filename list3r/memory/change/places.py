@@ -13,10 +13,10 @@ from list3r.memory.change.records import ChangeSettings
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
 from list3r.memory.overlap.summaries import ChunkSummary, world_unit
-from list3r.memory.overlap.visibility import Look, View, changed_points, look, seen_through_share, tally, views_of
+from list3r.memory.overlap.visibility import DepthView, Look, changed_points, look, seen_through_share, tally, views_of
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChunkRow
-from list3r.memory.relations.bodies import fit_box
+from list3r.memory.relations.instance_geometry import fit_box
 from list3r.memory.store.store import Store
 
 _SPREAD = 0.02
@@ -60,7 +60,7 @@ class Places:
         self._upright = store.get_value("gravity", "unknown") != "unknown"
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
-        self._views: dict[tuple[int, int], list[View]] = {}
+        self._views: dict[tuple[int, int], list[DepthView]] = {}
         self._share: dict[tuple[Key, int, bool], float] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
@@ -154,7 +154,7 @@ class Places:
         shares = (seen_through_share(points, views, self._s.visibility) for views in lists)
         return next((share for share in shares if share is not None), 0.0)
 
-    def _views_before(self, n: int, session: int) -> Iterator[list[View]]:
+    def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
         """The views of the sessions before, in the world of a thing, the last session first."""
         component = self.component[n]
         earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
@@ -176,7 +176,7 @@ class Places:
         views = self._views_across(n, session, before=before)
         return Looks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
 
-    def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[View]) -> Array:
+    def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[DepthView]) -> Array:
         """Weighted median over its whole views, so that what one view took from its surroundings does not count."""
         whole = [self.shapes[k].truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
         sizes, weights = [], []
@@ -190,11 +190,11 @@ class Places:
             return np.ones(3)
         return np.array([_weighted_median(np.array(sizes)[:, d], np.array(weights)) for d in range(3)])
 
-    def _views_across(self, n: int, session: int, *, before: bool) -> list[View]:
+    def _views_across(self, n: int, session: int, *, before: bool) -> list[DepthView]:
         """The views that tell what of a thing has changed: of this session where it was there before, else before."""
         return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
 
-    def _without_what_stayed(self, points: Array, views: Sequence[View]) -> Array:
+    def _without_what_stayed(self, points: Array, views: Sequence[DepthView]) -> Array:
         """The points that have changed, where that is enough of them."""
         changed = points[changed_points(points, views, self._s.visibility)]
         return changed if len(changed) >= self._s.least_changed * len(points) else points
@@ -231,7 +231,7 @@ class Places:
                 out += [(int(a), int(f)) for a, f in zip(shape.areas_px[at], shape.frames[at], strict=True)]
         return out
 
-    def _views_of(self, session: int, component: int) -> list[View]:
+    def _views_of(self, session: int, component: int) -> list[DepthView]:
         if (session, component) not in self._views:
             rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
             keyframes = {c.chunk_id: self._store.keyframes(c.chunk_id) for c in rows}

@@ -1,4 +1,4 @@
-"""What the story of changes works with: its settings, and what comes out."""
+"""What the matching of changes works with: its settings, and what comes out."""
 
 from __future__ import annotations
 

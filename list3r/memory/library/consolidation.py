@@ -69,9 +69,9 @@ def consolidate(
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
     summaries, before = chunk_summaries(store), store.settled()
     ledger, world = read_ledger(store, chunks), _standing_world(store, summaries, s, ended=ended)
-    moved = settle(store, summaries, s.settling, None if ended or world is None else _replaced(store, before))
+    moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))
     if ledger is None or world is None or _most_moved(store, moved, len(before), world, s):
-        moved |= settle(store, summaries, s.settling)
+        moved |= settle(store, summaries, s.hysteresis)
         world = look_at_world(store, settled_chunks(store), summaries, s)
         dirty = DirtySet(frozenset(c.chunk_id for c in chunks), moved, before, frozenset(), whole=True)
     else:

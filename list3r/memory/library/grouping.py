@@ -113,9 +113,8 @@ class Grouping:
         others = region.keys_of(chunks) - set(inside)
         if moving.keys().isdisjoint(keys):
             others &= moving.keys()
-        shapes, placed = {k: region.shapes(k) for k in chunks}, {k: region.pose(k) for k in chunks}
-        moving_settings = region.settings.moving
-        return tied_movers(sorted(keys), sorted(others), shapes, placed, region.tracks(chunks), moving_settings)
+        placed, tracks = region.placed(chunks), region.tracks(chunks)
+        return tied_movers(sorted(keys), sorted(others), placed, tracks, region.settings.moving)
 
     def _form(self, keys: Collection[Key]) -> tuple[list[Group], list[MergeDecision]]:
         """The groups of some local instances alone, and the decisions."""
@@ -130,11 +129,8 @@ class Grouping:
         movers: dict[Key, Mover] = {}
         motions = region.motions(chunks) if region.has_motion else {}
         if motions:
-            shapes, placed = {k: region.shapes(k) for k in chunks}, {k: region.pose(k) for k in chunks}
             apart, tracks = apart + self.constraints.pairs_apart(motions), region.tracks(chunks)
-            groups, movers, joins = join_movers(
-                groups, shapes, placed, components, apart, tracks, region.settings.moving
-            )
+            groups, movers, joins = join_movers(groups, region.placed(chunks), apart, tracks, region.settings.moving)
             decisions = decisions + joins
         joined, movers = self.constraints.joined(groups, components, movers)
         self._movers |= {tuple(g): movers[g[0]] for g in joined if g[0] in movers}

@@ -16,7 +16,7 @@ from list3r.memory.merging.moving import Mover
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import BestView
-from list3r.memory.relations.bodies import Body, fit_box, without_strays
+from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box, without_strays
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
@@ -71,7 +71,7 @@ class Member:
 class DerivedInstance:
     """A global instance before it is written."""
 
-    body: Body
+    geometry: InstanceGeometry
     feature: NDArray[np.float32]
     """Unit length. Shape (D,)."""
     frames: tuple[tuple[int, int], ...]
@@ -86,7 +86,7 @@ class DerivedInstance:
     swatches: tuple[Swatch, ...]
     """Its colours, the commonest first."""
     dynamic: bool = False
-    """Whether it was seen moving; its body is then where it was last."""
+    """Whether it was seen moving; its geometry is then where it was last."""
     resting: bool = True
     """Whether it stands still there, so that it has relations."""
 
@@ -136,8 +136,10 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
     if m.mover is not None:
         last = m.of([k for k in m.group if k in m.mover.last])
         now = derive_instance(instance_id, last, m.component, upright=m.upright, settings=settings)
-        found = replace(found, body=now.body, anchor=now.anchor, shape=now.shape, dynamic=True, resting=m.mover.resting)
-    return cache.put(key, replace(found, body=replace(found.body, stamp=next(cache.stamps))))
+        found = replace(
+            found, geometry=now.geometry, anchor=now.anchor, shape=now.shape, dynamic=True, resting=m.mover.resting
+        )
+    return cache.put(key, replace(found, geometry=replace(found.geometry, stamp=next(cache.stamps))))
 
 
 def derive_instance(
@@ -167,7 +169,7 @@ def derive_instance(
     stability = float(np.average([m.shapes.stability[m.at] for m in members], weights=np.maximum(counts, 1)))
     feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
     box = fit_box(points, upright=upright, trim=s.trim)
-    body = Body(
+    geometry = InstanceGeometry(
         id=instance_id,
         points=points,
         rgb=rgb,
@@ -183,7 +185,7 @@ def derive_instance(
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(body, unit_feature, tuple(frames), view, certainty, anchor, shape, colors)
+    return DerivedInstance(geometry, unit_feature, tuple(frames), view, certainty, anchor, shape, colors)
 
 
 def _metre(members: Sequence[Member]) -> float:
@@ -239,7 +241,7 @@ def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Arra
 
 def with_agreement(found: DerivedInstance, agreement: float) -> DerivedInstance:
     """The thing with its confidence; `agreement` is the share of the chunks that saw its place and found it."""
-    return replace(found, body=replace(found.body, confidence=round(found.certainty * agreement, 4)))
+    return replace(found, geometry=replace(found.geometry, confidence=round(found.certainty * agreement, 4)))
 
 
 def _certainty(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import takewhile
 
 import numpy as np
 
 from list3r.memory.change.detection import across_sessions
-from list3r.memory.change.free_space import FreeSpaceCarving
+from list3r.memory.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.rows import pack_scores, unpack_scores
 from list3r.memory.library.rules import ConsolidationSettings, World
 from list3r.memory.library.settled_poses import neighbours
 from list3r.memory.merging.edges import Links, links_of
-from list3r.memory.merging.moving import Tracks, without_moving
+from list3r.memory.merging.moving import PlacedChunks, Tracks, without_moving
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, pair_scores
 from list3r.memory.overlap.summaries import ChunkSummary, Summaries
@@ -212,27 +214,28 @@ class Region:
         chunks = sorted(set(chunk_ids))
         return Tracks(self.motions(chunks), {f: t for k in chunks for f, t in self.times_of(k).items()})
 
+    def placed(self, chunk_ids: Iterable[int]) -> PlacedChunks:
+        """Return what is asked of chunks about what moves."""
+        ids = list(chunk_ids)
+        component = {k: self.rows[k].component for k in ids}
+        return PlacedChunks({k: self.shapes(k) for k in ids}, {k: self.pose(k) for k in ids}, component)
+
     def near_in_time(self, chunk_ids: Collection[int]) -> set[int]:
         """Return the chunks seen so shortly before or after one of these that what moves may be the same."""
-        rows = sorted((self.store.chunk(k) for k in self.rows), key=lambda c: (c.session_id, c.first_frame))
-        at = {c.chunk_id: n for n, c in enumerate(rows)}
+        order = sorted(self.rows, key=lambda k: (self.store.chunk(k).session_id, self.store.chunk(k).first_frame))
+        at = {k: n for n, k in enumerate(order)}
         out = set(chunk_ids)
         for k in chunk_ids:
-            for way in (rows[: at[k]][::-1], rows[at[k] + 1 :]):
-                for other in way:
-                    if other.session_id != rows[at[k]].session_id or self._gap_s(k, other.chunk_id) > self._most_gap_s:
-                        break
-                    out.add(other.chunk_id)
+            meets = partial(self._meet_in_time, k)
+            out.update(takewhile(meets, order[: at[k]][::-1]), takewhile(meets, order[at[k] + 1 :]))
         return {k for k in out if any(self.rows[k].component == self.rows[j].component for j in chunk_ids)}
 
-    @property
-    def _most_gap_s(self) -> float:
-        return self.settings.moving.most_gap_s
-
-    def _gap_s(self, a: int, b: int) -> float:
-        """Seconds between the spans of two chunks, negative where they overlap."""
+    def _meet_in_time(self, a: int, b: int) -> bool:
+        """Whether two chunks of one session lie so near in time that what moves may be the same."""
+        if self.store.chunk(a).session_id != self.store.chunk(b).session_id:
+            return False
         one, two = (list(self.times_of(k).values()) or [0.0] for k in (a, b))
-        return max(min(two) - max(one), min(one) - max(two))
+        return max(min(two) - max(one), min(one) - max(two)) <= self.settings.moving.most_gap_s
 
     # ------------------------------------------------------------------ places
 

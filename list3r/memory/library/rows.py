@@ -16,7 +16,7 @@ from list3r.memory.library.instances import DerivedInstance
 from list3r.memory.library.rules import World
 from list3r.memory.overlap.pair_scores import Key, PairScores
 from list3r.memory.records import Instance, MergeDecision
-from list3r.memory.relations.bodies import Body
+from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.store.store import Store
 
 _SCORES = np.dtype(
@@ -43,28 +43,28 @@ def record_of(
     found: DerivedInstance, label: str | None, times: Mapping[tuple[int, int], float], world: World, *, metric: bool
 ) -> Instance:
     """Return the record of an instance, where its chunks are settled."""
-    body: Body = found.body
+    geometry: InstanceGeometry = found.geometry
     seen = [times[f] for f in found.frames if f in times] or [0.0]
     name, rgb = main_color(found.swatches, world.light)
     color = color_words(found.swatches, world.light)
-    words = describe(found.shape, color, body.box.size, world.unit, metric=metric, structure=body.structure)
+    words = describe(found.shape, color, geometry.box.size, world.unit, metric=metric, structure=geometry.structure)
     words = words if found.resting else f"moving {words}"
     return Instance(
-        id=body.id,
+        id=geometry.id,
         label=label,
         description=words,
-        center=body.box.center,
-        aabb=body.aabb,
-        box=body.box,
-        confidence=body.confidence,
+        center=geometry.box.center,
+        aabb=geometry.aabb,
+        box=geometry.box,
+        confidence=geometry.confidence,
         observations=len(found.frames),
         first_seen_s=min(seen),
         last_seen_s=max(seen),
         state="present",
-        structure=body.structure,
+        structure=geometry.structure,
         color_rgb=rgb,
         color_name=name,
-        component=body.component,
+        component=geometry.component,
         best_view=found.best_view,
         dynamic=found.dynamic,
     )

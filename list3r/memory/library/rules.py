@@ -12,7 +12,7 @@ from list3r.memory.constraints import Key
 from list3r.memory.description.colors import Reference
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.instances import DeriveSettings
-from list3r.memory.library.settled_poses import SettlingSettings
+from list3r.memory.library.settled_poses import HysteresisSettings
 from list3r.memory.merging.moving import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
 from list3r.memory.overlap.planes import place_planes
@@ -37,7 +37,7 @@ class ConsolidationSettings:
     structure: StructureSettings = field(default_factory=StructureSettings)
     relations: RelationSettings = field(default_factory=RelationSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-    settling: SettlingSettings = field(default_factory=SettlingSettings)
+    hysteresis: HysteresisSettings = field(default_factory=HysteresisSettings)
     changes: ChangeSettings = field(default_factory=ChangeSettings)
     whole_chunks: int = 6
     """Up to so many chunks the library is derived as a whole; then only what a chunk touches."""

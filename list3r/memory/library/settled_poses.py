@@ -20,7 +20,7 @@ _FAR_M = 0.5
 
 
 @dataclass(frozen=True)
-class SettlingSettings:
+class HysteresisSettings:
     """How far a chunk may move before what was derived from it is derived anew."""
 
     move_m: float = 0.004
@@ -33,7 +33,7 @@ class SettlingSettings:
 def settle(
     store: Store,
     summaries: Mapping[int, ChunkSummary],
-    settings: SettlingSettings | None = None,
+    settings: HysteresisSettings | None = None,
     among: Iterable[int] | None = None,
 ) -> frozenset[int]:
     """Settle all chunks, or those `among` them, and return those that were settled anew: a chunk keeps its settled pose
@@ -41,7 +41,7 @@ def settle(
 
     Writes to the table `settled`, so that a build that goes on takes up the same poses.
     """
-    s = settings or SettlingSettings()
+    s = settings or HysteresisSettings()
     chunks = store.chunks() if among is None else [store.chunk(k) for k in sorted(among)]
     T_graph_world = _world_of_graph(store).inverse()
     before = store.settled()
@@ -67,7 +67,7 @@ def _world_of_graph(store: Store) -> Sim3:
     return Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
 
 
-def _near(a: Sim3, b: Sim3, unit: float, s: SettlingSettings) -> bool:
+def _near(a: Sim3, b: Sim3, unit: float, s: HysteresisSettings) -> bool:
     turn = np.arccos(np.clip((np.trace(a.rotation.T @ b.rotation) - 1.0) / 2.0, -1.0, 1.0))
     moved = float(np.linalg.norm(a.translation - b.translation))
     grown = abs(float(a.scale) / float(b.scale) - 1.0)

@@ -17,9 +17,9 @@ from list3r.memory.library.uncertainty import position_sigma
 from list3r.memory.library.weighing import Named, Weighed, Weighing
 from list3r.memory.overlap.summaries import cameras_of
 from list3r.memory.records import Observation
-from list3r.memory.relations.bodies import Body
+from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.predicates import relations
-from list3r.memory.relations.scene import Measured
+from list3r.memory.relations.scene import PairMeasures
 from list3r.memory.relations.structure import classify_structure, flagged_only
 from list3r.memory.store.tables.library import Anchor
 
@@ -69,15 +69,17 @@ class Writer:
         for n in order:
             found = self._derive(n, fresh[n], was[n].structure if n in was else None)
             seen = weighed.evidence.get(fresh[n])
-            body = replace(found.body, confidence=was[n].confidence if n in was else 1.0)
-            self._derived[n] = replace(found, body=body) if seen is None else with_agreement(found, seen.agreement)
+            geometry = replace(found.geometry, confidence=was[n].confidence if n in was else 1.0)
+            self._derived[n] = (
+                replace(found, geometry=geometry) if seen is None else with_agreement(found, seen.agreement)
+            )
         self._put(order, fresh, labels)
         again = sorted(self._classify(order, boxes))
         if again:
             self._put(again, {n: self._group_of(n) for n in again}, {i.id: i.label for i in store.instances_of(again)})
         store.set_value("last_id", max(ids.last_id, int(store.get_value("last_id", 0))))
         self.written.update(order, again)
-        touched = {n: self._derived[n].body.aabb for n in (*order, *again)}
+        touched = {n: self._derived[n].geometry.aabb for n in (*order, *again)}
         return {n: around(touched.get(n), boxes.get(n)) for n in {*touched, *gone}}
 
     def set_states(self, states: Mapping[int, str]) -> None:
@@ -94,18 +96,18 @@ class Writer:
         upright = self._world.upright and component == self._world.first
         members = Members(group, here, chunks, component, upright, mover)
         found = derived_instance(self._store, instance_id, members, self._s.derive)
-        return replace(found, body=replace(found.body, structure=structure))
+        return replace(found, geometry=replace(found.geometry, structure=structure))
 
-    def _stored(self, ids: Iterable[int]) -> list[Body]:
-        """Bodies of instances as they are in the store."""
+    def _stored(self, ids: Iterable[int]) -> list[InstanceGeometry]:
+        """Geometries of instances as they are in the store."""
         for instance in self._store.instances_of(sorted(n for n in ids if n not in self._derived)):
             group = self._group_of(instance.id)
             if group:
                 found = self._derive(instance.id, group, instance.structure)
-                body = replace(found.body, confidence=instance.confidence)
-                self._derived[instance.id] = replace(found, body=body)
+                geometry = replace(found.geometry, confidence=instance.confidence)
+                self._derived[instance.id] = replace(found, geometry=geometry)
                 self._states[instance.id] = instance.state
-        return [self._derived[n].body for n in sorted(ids) if n in self._derived]
+        return [self._derived[n].geometry for n in sorted(ids) if n in self._derived]
 
     def _put_members(self, shown: Mapping[Group, bool]) -> None:
         """Write who is grouped with whom, where that was otherwise."""
@@ -166,29 +168,29 @@ class Writer:
     def _classify(self, ids: Sequence[int], before: Mapping[int, Array]) -> list[int]:
         """Tell structure from what stands in the room near what changed; the ids that became something else."""
         reach = np.full(3, self._s.structure.near_m * self._world.unit)
-        near = {m for n in ids for m in self._near(around(self._derived[n].body.aabb, before.get(n)), reach)}
+        near = {m for n in ids for m in self._near(around(self._derived[n].geometry.aabb, before.get(n)), reach)}
         changed = []
-        for body in self._stored(near | set(ids)):
-            kind = None if self._derived[body.id].dynamic else self._kind(body, reach)
-            if kind != body.structure:
-                changed.append(body.id)
-                found = self._derived[body.id]
-                self._derived[body.id] = replace(found, body=replace(found.body, structure=kind))
+        for geometry in self._stored(near | set(ids)):
+            kind = None if self._derived[geometry.id].dynamic else self._kind(geometry, reach)
+            if kind != geometry.structure:
+                changed.append(geometry.id)
+                found = self._derived[geometry.id]
+                self._derived[geometry.id] = replace(found, geometry=replace(found.geometry, structure=kind))
         return changed
 
-    def _kind(self, body: Body, reach: Array) -> str | None:
-        if not (self._world.upright and body.component == self._world.first):
-            return flagged_only([body])[0]
-        if body.normal is None:
+    def _kind(self, geometry: InstanceGeometry, reach: Array) -> str | None:
+        if not (self._world.upright and geometry.component == self._world.first):
+            return flagged_only([geometry])[0]
+        if geometry.normal is None:
             return None
-        near = [b for b in self._stored(self._near(body.aabb, reach)) if b.component == body.component]
+        near = [b for b in self._stored(self._near(geometry.aabb, reach)) if b.component == geometry.component]
         still = [b for b in near if not self._derived[b.id].dynamic]
         world = self._world
-        return classify_structure([body], world.floor, self._eye_level, world.unit, self._s.structure, still)[0]
+        return classify_structure([geometry], world.floor, self._eye_level, world.unit, self._s.structure, still)[0]
 
-    def _eye_level(self, body: Body) -> float:
+    def _eye_level(self, geometry: InstanceGeometry) -> float:
         """Height that 90 % of the cameras that saw an instance lie below; without cameras everything is below."""
-        rows = [self._region.settled_chunk(k) for k in dict.fromkeys(k for k, _ in self._group_of(body.id))]
+        rows = [self._region.settled_chunk(k) for k in dict.fromkeys(k for k, _ in self._group_of(geometry.id))]
         heights = cameras_of(self._store, rows).translation[:, 2]
         return float(np.quantile(heights, 0.9)) if len(heights) else np.inf
 
@@ -203,7 +205,7 @@ class Writer:
             there = [b for b in self._stored(ring) if b.id in subjects or b.structure is None]
             ring = {n for b in there for n in self._near(b.aabb, reach)} - scene
             scene |= ring
-        measured = self._store.derived.of(Measured)
+        measured = self._store.derived.of(PairMeasures)
         measured.begin()
         found = []
         there = [b for b in self._stored(scene) if self._states[b.id] != "removed" and self._derived[b.id].resting]

@@ -16,7 +16,7 @@ from list3r.memory.geometry import Array
 from list3r.memory.library.rules import settings_of
 from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import Instance, Relation
-from list3r.memory.relations.bodies import Body
+from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.predicates import relations
 from list3r.memory.store.store import Store
 
@@ -100,9 +100,9 @@ def _told_anew(past: Store, then: Sequence[Instance], changed: set[int], vertica
         moved = [i for i in here if i.id in changed]
         near = [i for i in here if any(_gap(i.aabb, m.aabb) <= _REACH_M for m in moved)]
         middle = np.mean([i.center for i in here], axis=0) if here else np.zeros(3)
-        bodies = [b for i in near if (b := _body(past, i, middle)) is not None]
+        instances = [b for i in near if (b := _body(past, i, middle)) is not None]
         told = settings_of(past, None).relations
-        found = relations(bodies, gravity_known=vertical and component == first, settings=told) if moved else []
+        found = relations(instances, gravity_known=vertical and component == first, settings=told) if moved else []
         out += [r for r in found if r.subject in changed or r.object in changed]
     return out
 
@@ -111,7 +111,7 @@ def _gap(a: Array, b: Array) -> float:
     return float(np.linalg.norm(np.maximum(0.0, np.maximum(a[0] - b[1], b[0] - a[1]))))
 
 
-def _body(past: Store, instance: Instance, middle: Array) -> Body | None:
+def _body(past: Store, instance: Instance, middle: Array) -> InstanceGeometry | None:
     """A thing as relations see it, from the surface that was known then."""
     points = past.surface_points(instance.id).astype(np.float64)
     slack = 1e-3 * float(np.linalg.norm(instance.aabb[1] - instance.aabb[0]))
@@ -123,7 +123,7 @@ def _body(past: Store, instance: Instance, middle: Array) -> Body | None:
     if instance.structure is not None and len(points) > 3:
         axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
         normal = axis if (middle - points.mean(axis=0)) @ axis > 0 else -axis
-    return Body(
+    return InstanceGeometry(
         id=instance.id,
         points=points,
         rgb=np.zeros((len(points), 3), np.uint8),

@@ -17,7 +17,7 @@ from list3r.memory.constraints import Edit, Key, standing
 from list3r.memory.errors import OptionError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
-from list3r.memory.maintenance.parting import part_best
+from list3r.memory.maintenance.split_proposal import propose_split
 from list3r.memory.records import MergeDecision, Observation
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.edits import LogEntry
@@ -82,7 +82,7 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
         keys = before[0][2]
         if len(keys) < 2:
             raise OptionError(f"#{known} was seen as one piece in one chunk only; there is nothing to split")
-        leaving = _checked_part(known, keys, out) if out is not None else part_best(store, keys)
+        leaving = _checked_part(known, keys, out) if out is not None else propose_split(store, keys)
         staying = tuple(k for k in keys if k not in set(leaving))
         edit = _edit("split", (staying, tuple(sorted(leaving))), before, author)
         told = ", ".join(map(_name, edit.parts[1]))

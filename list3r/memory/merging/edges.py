@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 
-from list3r.memory.constraints import Constraints, Growing
+from list3r.memory.constraints import ConstraintCheck, Constraints
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.merging.settings import MergeSettings
@@ -82,8 +83,8 @@ class Links:
         rest = (getattr(self, name)[kept] for name in ("kind", "score", "low", "high", "cosine", "frame_iou"))
         return Links(a[kept], b[kept], *rest)
 
-    def told(self, n: int) -> dict[str, float]:
-        """The numbers of one pair, for the log."""
+    def scores_of(self, n: int) -> dict[str, float]:
+        """Return the numbers of one pair, for the log."""
         names = {"overlap": self.low, "containment": self.high, "cosine": self.cosine, "score": self.score}
         if not np.isnan(self.frame_iou[n]):
             names["frame_iou"] = self.frame_iou
@@ -96,14 +97,14 @@ def merge_nodes(
     cannot_link: Sequence[tuple[Key, Key]],
     settings: MergeSettings | None = None,
     pairs: Mapping[tuple[int, int], PairScores] | None = None,
-    word: Constraints | None = None,
+    constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     """Group local instances into things.
 
     All chunks given must share one frame of reference. `pairs` are scores already known, by chunk ids (u <= v). The
     partition is the same in whatever order chunks and pairs are given: edges are taken best first, ties by key. Two
     groups are joined unless a cannot-link pair would come together, or too many pairs across speak against it
-    (complete link), or the operator's `word` parts them. What that word holds together is joined afterwards, by
+    (complete link), or the operator's `constraints` part them. What these link is joined afterwards, by
     `Constraints.joined`, so that each half of it goes on attracting what looks like it. Returns the groups, each
     sorted, ordered by their first member, and the decisions: one `merge` for each union, one `refuse` for each strong
     edge that was not taken.
@@ -117,7 +118,7 @@ def merge_nodes(
         for (u, v), p in sorted(known.items())
         if u in tables and v in tables
     }
-    return form_groups(tables, found, None, cannot_link, s, word)
+    return form_groups(tables, found, None, cannot_link, s, constraints)
 
 
 def form_groups(
@@ -126,7 +127,7 @@ def form_groups(
     region: Collection[Key] | None,
     cannot_link: Sequence[tuple[Key, Key]],
     settings: MergeSettings,
-    word: Constraints | None = None,
+    constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
     """The same as `merge_nodes`, from links of pairs of chunks that are known; of a `region` only, where one is given.
 
@@ -141,8 +142,8 @@ def form_groups(
         inside = np.array([k in region for k in nodes.keys], bool)
         every = every.among(np.where(inside, np.cumsum(inside) - 1, -1))
         nodes = nodes.only(region)
-    growing = None if word is None or not word else word.growing()
-    return _join(nodes, every, _enemies(nodes, cannot_link), settings, growing)
+    check = constraints.check() if constraints else None
+    return _join(nodes, every, _enemies(nodes, cannot_link), settings, check)
 
 
 # ---------------------------------------------------------------------------------------------- the evidence
@@ -207,54 +208,76 @@ class _Overlaps:
         return np.asarray(np.where(self._code[at] == code, self._low[at], 0.0))
 
 
+class _Clusters:
+    """Groups of nodes that grow: members, boxes, and the nodes that must stay out."""
+
+    def __init__(self, t: Nodes, enemies: list[set[int]]) -> None:
+        count = range(len(t.keys))
+        self._sets = DisjointSet(count)
+        self.members = {n: [n] for n in count}
+        self.low, self.high = t.low.copy(), t.high.copy()
+        self.foes = {n: set(enemies[n]) for n in count}
+
+    def pair(self, x: int, y: int) -> tuple[int, int]:
+        """Return the clusters of two nodes, the one with the smallest member first."""
+        a, b = self._sets[x], self._sets[y]
+        return (a, b) if self.members[a][0] <= self.members[b][0] else (b, a)
+
+    def span(self, a: int, b: int) -> float:
+        """Return the longest edge of the box round two clusters."""
+        return float((np.maximum(self.high[a], self.high[b]) - np.minimum(self.low[a], self.low[b])).max())
+
+    def merge(self, a: int, b: int) -> None:
+        """Make two clusters one."""
+        self._sets.merge(a, b)
+        kept = self._sets[a]
+        self.low[kept], self.high[kept] = np.minimum(self.low[a], self.low[b]), np.maximum(self.high[a], self.high[b])
+        self.foes[kept] = self.foes.pop(a) | self.foes.pop(b)
+        self.members[kept] = sorted(self.members.pop(a) + self.members.pop(b))
+
+
 def _join(
-    t: Nodes, links: Links, enemies: list[set[int]], s: MergeSettings, word: Growing | None = None
+    t: Nodes, links: Links, enemies: list[set[int]], s: MergeSettings, check: ConstraintCheck | None = None
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    group = list(range(len(t.keys)))
-    members = {n: [n] for n in group}
-    low, high = t.low.copy(), t.high.copy()
-    foes = {n: set(enemies[n]) for n in group}
-    overlaps = _Overlaps(links, len(t.keys))
+    clusters, overlaps = _Clusters(t, enemies), _Overlaps(links, len(t.keys))
     decisions: list[MergeDecision] = []
     refused: set[tuple[int, int]] = set()
     edges = np.flatnonzero(links.kind != NONE)
     edges = edges[np.lexsort((links.b[edges], links.a[edges], -links.score[edges]))]
     for n, x, y in zip(edges.tolist(), links.a[edges].tolist(), links.b[edges].tolist(), strict=True):
-        if group[x] == group[y]:
+        a, b = clusters.pair(x, y)
+        if a == b or (a, b) in refused:
             continue
-        a, b = sorted((group[x], group[y]))
-        if (a, b) in refused:
-            continue
-        against = word.objection(t.keys[a], t.keys[b]) if word is not None else ""
-        span = float((np.maximum(high[a], high[b]) - np.minimum(low[a], low[b])).max())
-        if not against and span > s.most_span_m * max(t.unit[a], t.unit[b]):
-            against = f"together they would reach over {span:.0f} m"
-        against = against or _objection(t, members[a], members[b], foes[a], overlaps, s)
-        name_a, name_b = _name(t.keys[x]), _name(t.keys[y])
+        against = "" if check is None else check.objection(t.keys[x], t.keys[y])
+        against = against or _too_long(t, clusters, a, b, s) or _objection(t, clusters, a, b, overlaps, s)
+        names, scores = (_name(t.keys[x]), _name(t.keys[y])), links.scores_of(n)
         if against:
             refused.add((a, b))
-            decisions.append(MergeDecision("refuse", name_a, name_b, links.told(n), against))
+            decisions.append(MergeDecision("refuse", *names, scores, against))
             continue
-        decisions.append(MergeDecision("merge", name_a, name_b, links.told(n), _REASON[links.kind[n]]))
-        if word is not None:
-            word.join(t.keys[a], t.keys[b])
-        moved = members.pop(b)
-        members[a] = sorted(members[a] + moved)
-        low[a], high[a] = np.minimum(low[a], low[b]), np.maximum(high[a], high[b])
-        foes[a] |= foes.pop(b)
-        for m in moved:
-            group[m] = a
+        decisions.append(MergeDecision("merge", *names, scores, _REASON[links.kind[n]]))
+        if check is not None:
+            check.join(t.keys[x], t.keys[y])
+        clusters.merge(a, b)
         refused = {pair for pair in refused if a not in pair and b not in pair}
-    groups = sorted([t.keys[n] for n in ns] for ns in members.values())
+    groups = sorted([t.keys[n] for n in ns] for ns in clusters.members.values())
     return groups, decisions
 
 
-def _objection(t: Nodes, a: list[int], b: list[int], foes_of_a: set[int], overlaps: _Overlaps, s: MergeSettings) -> str:
-    """Why two groups must stay apart, or nothing."""
-    seen_apart = foes_of_a.intersection(b)
+def _too_long(t: Nodes, clusters: _Clusters, a: int, b: int, s: MergeSettings) -> str:
+    """Why two clusters would reach too far together, or nothing."""
+    span = clusters.span(a, b)
+    unit = max(t.unit[clusters.members[a][0]], t.unit[clusters.members[b][0]])
+    return f"together they would reach over {span:.0f} m" if span > s.most_span_m * unit else ""
+
+
+def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps, s: MergeSettings) -> str:
+    """Why two clusters must stay apart, or nothing."""
+    members = clusters.members[a], clusters.members[b]
+    seen_apart = clusters.foes[a].intersection(members[1])
     if seen_apart:
         return f"{_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
-    one, other = (np.array(ns)[t.truncated[ns] < s.min_truncated] for ns in (a, b))
+    one, other = (np.array(ns)[t.truncated[ns] < s.min_truncated] for ns in members)
     left, right = (x.ravel() for x in np.meshgrid(one, other, indexing="ij"))
     whole = np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
     compared = np.flatnonzero(whole & ~t.coplanar(left, right, s.max_angle_deg))

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou
@@ -44,6 +46,15 @@ class MovingSettings:
     """Places within this of the last one are one place of rest."""
     rest_s: float = 1.0
     """A thing that stayed there this long is put down."""
+
+
+@dataclass(frozen=True)
+class PlacedChunks:
+    """Chunks that may have seen one moving instance, by chunk id."""
+
+    shapes: Mapping[int, ChunkShapes]
+    S_world_chunk: Mapping[int, Sim3]
+    components: Mapping[int, int]
 
 
 @dataclass(frozen=True)
@@ -93,9 +104,7 @@ def without_moving(
 
 def join_movers(
     groups: Sequence[Sequence[Key]],
-    shapes: Mapping[int, ChunkShapes],
-    S_world_chunk: Mapping[int, Sim3],
-    components: Mapping[int, int],
+    placed: PlacedChunks,
     cannot_link: Sequence[tuple[Key, Key]],
     tracks: Tracks,
     settings: MovingSettings | None = None,
@@ -105,40 +114,27 @@ def join_movers(
     Returns all groups, in order; what is known of those that moved, by their first member; and the decisions. Edges are
     taken best first, ties by key, so the order of groups does not matter.
     """
-    s = settings or MovingSettings()
     if not tracks.motions:
         return [list(g) for g in groups], {}, []
-    scene = _Scene(shapes, S_world_chunk, tracks, s)
+    scene = _Scene(placed, tracks, settings or MovingSettings())
     nodes = [scene.node(tuple(g)) for g in sorted(map(sorted, groups))]
     enemies = {frozenset(pair) for pair in cannot_link}
-    edges = []
-    for a, x in enumerate(nodes):
-        for b in range(a + 1, len(nodes)):
-            y = nodes[b]
-            if (x.moves or y.moves) and x.session == y.session:
-                if components[x.keys[0][0]] == components[y.keys[0][0]]:
-                    found = scene.edge(x, y)
-                    if found is not None:
-                        edges.append((-found[0], a, b, found[1], found[2]))
-    home = list(range(len(nodes)))
-    parts = {n: [n] for n in home}
+    sets = DisjointSet(range(len(nodes)))
     decisions = []
-    for score, a, b, scores, reason in sorted(edges, key=lambda e: e[:3]):
-        p, q = sorted((home[a], home[b]))
-        if p == q:
+    for edge in _edges(nodes, scene):
+        if sets.connected(edge.a, edge.b):
             continue
-        names = (_name(nodes[a].keys[0]), _name(nodes[b].keys[0]))
-        against = _objection([nodes[n] for n in parts[p]], [nodes[n] for n in parts[q]], enemies, scene)
+        names = (_name(nodes[edge.a].keys[0]), _name(nodes[edge.b].keys[0]))
+        left, right = sorted(sorted(sets.subset(n)) for n in (edge.a, edge.b))
+        against = _objection([nodes[n] for n in left], [nodes[n] for n in right], enemies, scene)
         if against:
-            decisions.append(MergeDecision("refuse", *names, scores, against))
+            decisions.append(MergeDecision("refuse", *names, edge.scores, against))
             continue
-        decisions.append(MergeDecision("merge", *names, {**scores, "score": round(-score, 3)}, reason))
-        parts[p] = sorted(parts[p] + parts.pop(q))
-        for n in parts[p]:
-            home[n] = p
+        decisions.append(MergeDecision("merge", *names, {**edge.scores, "score": round(edge.score, 3)}, edge.reason))
+        sets.merge(edge.a, edge.b)
     joined: list[list[Key]] = []
     movers: dict[Key, Mover] = {}
-    for members in parts.values():
+    for members in map(sorted, sets.subsets()):
         keys = sorted(k for n in members for k in nodes[n].keys)
         joined.append(keys)
         if any(nodes[n].moves for n in members):
@@ -146,38 +142,56 @@ def join_movers(
     return sorted(joined), movers, decisions
 
 
+@dataclass(frozen=True)
+class _Edge:
+    """Two nodes that may be one instance."""
+
+    a: int
+    b: int
+    score: float
+    scores: dict[str, float]
+    reason: str
+
+
+def _edges(nodes: Sequence[_Node], scene: _Scene) -> list[_Edge]:
+    """What ties the nodes that move to others of their session and component, best first, ties by number."""
+    out = []
+    for (a, x), (b, y) in combinations(enumerate(nodes), 2):
+        if (x.moves or y.moves) and x.session == y.session and scene.component(x) == scene.component(y):
+            found = scene.edge(x, y)
+            if found is not None:
+                out.append(_Edge(a, b, *found))
+    return sorted(out, key=lambda e: (-e.score, e.a, e.b))
+
+
 def tied_movers(
     here: Collection[Key],
     there: Collection[Key],
-    shapes: Mapping[int, ChunkShapes],
-    S_world_chunk: Mapping[int, Sim3],
+    placed: PlacedChunks,
     tracks: Tracks,
     settings: MovingSettings | None = None,
 ) -> set[Key]:
-    """The local instances of `there` that `join_movers` would compare with one of `here`, of one session and frame of
-    reference all."""
-    scene = _Scene(shapes, S_world_chunk, tracks, settings or MovingSettings())
-    out = set()
-    for b in there:
-        moves = b in tracks.motions
-        for a in here:
-            if a[0] != b[0] and (moves or a in tracks.motions) and scene.edge(scene.node((a,)), scene.node((b,))):
-                out.add(b)
-                break
-    return out
+    """Return the local instances of `there` that `join_movers` would compare with one of `here`, of one session and
+    component all.
+    """
+    scene = _Scene(placed, tracks, settings or MovingSettings())
+
+    def tied(a: Key, b: Key) -> bool:
+        moves = a in tracks.motions or b in tracks.motions
+        return a[0] != b[0] and moves and scene.edge(scene.node((a,)), scene.node((b,))) is not None
+
+    return {b for b in there if any(tied(a, b) for a in here)}
 
 
 class _Scene:
     """Places and times of all local instances."""
 
-    def __init__(
-        self,
-        shapes: Mapping[int, ChunkShapes],
-        S_world_chunk: Mapping[int, Sim3],
-        tracks: Tracks,
-        settings: MovingSettings,
-    ) -> None:
-        self._shapes, self._placed, self._tracks, self._s = shapes, S_world_chunk, tracks, settings
+    def __init__(self, placed: PlacedChunks, tracks: Tracks, settings: MovingSettings) -> None:
+        self._shapes, self._placed, self._components = placed.shapes, placed.S_world_chunk, placed.components
+        self._tracks, self._s = tracks, settings
+
+    def component(self, node: _Node) -> int:
+        return self._components[node.keys[0][0]]
 
     def node(self, keys: tuple[Key, ...]) -> _Node:
         session = self._shapes[keys[0][0]].session_id
@@ -288,13 +302,11 @@ class _Scene:
 
 
 def _objection(left: Sequence[_Node], right: Sequence[_Node], enemies: set[frozenset[Key]], scene: _Scene) -> str:
-    """Why two things must stay apart, or nothing."""
-    for x in left:
-        for y in right:
-            for a in x.keys:
-                for b in y.keys:
-                    if frozenset((a, b)) in enemies or scene.seen_apart(a, b):
-                        return f"{_name(a)} and {_name(b)} were seen side by side in one frame"
+    """Why two instances must stay apart, or nothing."""
+    for x, y in product(left, right):
+        for a, b in product(x.keys, y.keys):
+            if frozenset((a, b)) in enemies or scene.seen_apart(a, b):
+                return f"{_name(a)} and {_name(b)} were seen side by side in one frame"
     return ""
 
 

@@ -43,7 +43,7 @@ class VisibilitySettings:
 
 
 @dataclass(frozen=True)
-class View:
+class DepthView:
     """One keyframe in the world."""
 
     session_id: int
@@ -70,7 +70,7 @@ class Look:
     """(session id, Frame.index) of the frames that told, the most telling first."""
 
 
-def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyframe]], unit: float) -> list[View]:
+def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyframe]], unit: float) -> list[DepthView]:
     """The keyframes of chunks that have depth, as they are placed now; `unit` is a metre in world units."""
     out = []
     for c in chunks:
@@ -79,22 +79,24 @@ def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyfra
                 S_world_cam = c.S_world_chunk @ Sim3.from_matrix(k.T_chunk_cam)
                 in_chunk = unit / float(c.S_world_chunk.scale)
                 out.append(
-                    View(c.session_id, k.frame_index, S_world_cam.inverse(), in_chunk, k.depth_small, k.camera_small)
+                    DepthView(
+                        c.session_id, k.frame_index, S_world_cam.inverse(), in_chunk, k.depth_small, k.camera_small
+                    )
                 )
     return out
 
 
-def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> list[View]:
+def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> list[DepthView]:
     """The keyframes of one chunk that have depth, with the chunk's own frame as the world; `unit` is a metre there."""
     kept = [k for k in keyframes if k.depth_small.size]
     S_cam_chunk = [Sim3.from_matrix(k.T_chunk_cam).inverse() for k in kept]
     return [
-        View(session_id, k.frame_index, S, unit, k.depth_small, k.camera_small)
+        DepthView(session_id, k.frame_index, S, unit, k.depth_small, k.camera_small)
         for k, S in zip(kept, S_cam_chunk, strict=True)
     ]
 
 
-def look(points: Array, views: Iterable[View], settings: VisibilitySettings | None = None) -> Look:
+def look(points: Array, views: Iterable[DepthView], settings: VisibilitySettings | None = None) -> Look:
     """Ask frames about surface points of one thing, world coordinates, shape (N, 3)."""
     s = settings or VisibilitySettings()
     told = []
@@ -121,7 +123,7 @@ UNTOLD, MET, FREE = 0, 1, 2
 """What a frame tells about one point: nothing, a surface where it should be, free space through it."""
 
 
-def tell(points: Array, view: View, s: VisibilitySettings) -> NDArray[np.int8]:
+def tell(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.int8]:
     """What one frame tells about each point of a surface, world coordinates. Shapes (N, 3) -> (N,)."""
     out = np.zeros(len(points), np.int8)
     p = view.S_cam_world.apply(points)
@@ -145,13 +147,13 @@ def tell(points: Array, view: View, s: VisibilitySettings) -> NDArray[np.int8]:
     return out
 
 
-def changed_points(points: Array, views: Iterable[View], s: VisibilitySettings) -> NDArray[np.bool_]:
+def changed_points(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> NDArray[np.bool_]:
     """The points of a surface of which no more frames say that they are still there than that they are not. (N,)."""
     free, met = tally(points, views, s)
     return np.asarray(free >= met)
 
 
-def tally(points: Array, views: Iterable[View], s: VisibilitySettings) -> tuple[Ints, Ints]:
+def tally(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> tuple[Ints, Ints]:
     """How many frames see through each point of a surface, and how many see it. Shapes (N,), (N,)."""
     free, met = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
@@ -161,14 +163,14 @@ def tally(points: Array, views: Iterable[View], s: VisibilitySettings) -> tuple[
     return free, met
 
 
-def seen_through_share(points: Array, views: Iterable[View], s: VisibilitySettings) -> float | None:
+def seen_through_share(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> float | None:
     """Share of a surface that more frames see through than see, of what they tell of; None where that is too little."""
     free, met = tally(points, views, s)
     known = free + met > 0
     return float(np.mean(free[known] > met[known])) if known.sum() >= s.least_points else None
 
 
-def _told(points: Array, view: View, s: VisibilitySettings) -> tuple[int, int]:
+def _told(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
     """How many points of a surface one frame sees where they should be, and through how many it sees further."""
     told = tell(points, view, s)
     return int((told == MET).sum()), int((told == FREE).sum())

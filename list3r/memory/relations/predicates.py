@@ -21,8 +21,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from list3r.memory.records import Relation
-from list3r.memory.relations.bodies import Body, neighbours_of
-from list3r.memory.relations.scene import Measured, RelationSettings, Scene, certainty, wall_touched
+from list3r.memory.relations.instance_geometry import InstanceGeometry, neighbours_of
+from list3r.memory.relations.scene import PairMeasures, RelationScene, RelationSettings, certainty, wall_touched
 from list3r.memory.relations.support import containments, on_hidden_feet, supports
 
 INVERSE = {
@@ -42,21 +42,21 @@ _SLACK_M = 0.08
 
 
 def relations(
-    bodies: Sequence[Body],
+    instances: Sequence[InstanceGeometry],
     *,
     gravity_known: bool,
     unit: float = 1.0,
     settings: RelationSettings | None = None,
-    measured: Measured | None = None,
+    measured: PairMeasures | None = None,
 ) -> list[Relation]:
-    """All relations among bodies, in the order of (subject, predicate, object).
+    """All relations among instances, in the order of (subject, predicate, object).
 
-    `unit` is what a metre is in world units (1 for a metric memory). Bodies of different components have none.
-    `measured` holds what a run before found for the same bodies, unit and settings.
+    `unit` is what a metre is in world units (1 for a metric memory). Instances of different components have none.
+    `measured` holds what a run before found for the same instances, unit and settings.
     """
     s = settings or RelationSettings()
-    bodies = sorted(bodies, key=lambda b: b.id)
-    scene = Scene(bodies, unit, s, measured or Measured(), upright=gravity_known)
+    instances = sorted(instances, key=lambda b: b.id)
+    scene = RelationScene(instances, unit, s, measured or PairMeasures(), upright=gravity_known)
     out: list[Relation] = []
     holding: set[tuple[int, int]] = set()
     if gravity_known:
@@ -66,18 +66,20 @@ def relations(
         for predicate, found in (("in", inside), ("on", supported)):
             for a, b, confidence, margin in found:
                 holding |= {(a, b), (b, a)}
-                if bodies[b].structure == "floor":
-                    scene.foot[a] = min(scene.foot[a], float(np.median(bodies[b].points[:, 2])))
+                if instances[b].structure == "floor":
+                    scene.foot[a] = min(scene.foot[a], float(np.median(instances[b].points[:, 2])))
                     scene.covering[a] = scene.high[a, 2] - scene.low[a, 2] < s.covering_m * unit
-                out += _both(bodies, a, predicate, b, confidence, margin)
+                out += _both(instances, a, predicate, b, confidence, margin)
         out += _overhead(scene, holding)
         out += _attached(scene, {a for a, _, _, _ in (*inside, *supported)})
     out += _beside(scene, holding, gravity_known)
     return sorted(out, key=lambda r: (r.subject, r.predicate, r.object))
 
 
-def _both(bodies: Sequence[Body], a: int, predicate: str, b: int, confidence: float, margin: float) -> list[Relation]:
-    x, y = bodies[a].id, bodies[b].id
+def _both(
+    instances: Sequence[InstanceGeometry], a: int, predicate: str, b: int, confidence: float, margin: float
+) -> list[Relation]:
+    x, y = instances[a].id, instances[b].id
     c, m = round(min(max(confidence, 0.0), 1.0), 4), round(margin, 5)
     return [Relation(x, predicate, y, c, m), Relation(y, INVERSE[predicate], x, c, m)]
 
@@ -85,7 +87,7 @@ def _both(bodies: Sequence[Body], a: int, predicate: str, b: int, confidence: fl
 # ---------------------------------------------------------------------------------------------- above, below, under
 
 
-def _overhead(scene: Scene, holding: set[tuple[int, int]]) -> list[Relation]:
+def _overhead(scene: RelationScene, holding: set[tuple[int, int]]) -> list[Relation]:
     """above and below for things apart in height, under for what stands beneath a surface of another."""
     s, unit = scene.s, scene.unit
     out: list[Relation] = []
@@ -103,14 +105,14 @@ def _overhead(scene: Scene, holding: set[tuple[int, int]]) -> list[Relation]:
             continue
         sure = certainty(gap - 2.0 * noise, noise) * min(1.0, 0.5 + share / 2)
         if covered >= s.overhead and low[a, 2] < high[b, 2]:
-            upper, lower = scene.bodies[a].id, scene.bodies[b].id
+            upper, lower = scene.instances[a].id, scene.instances[b].id
             out.append(Relation(lower, "under", upper, round(sure, 4), round(gap, 5)))
         elif share >= s.overhead and low[a, 2] >= low[b, 2]:
-            out += _both(scene.bodies, a, "above", b, sure, gap)
+            out += _both(scene.instances, a, "above", b, sure, gap)
     return out
 
 
-def _over(scene: Scene, a: int, b: int) -> tuple[float, float, float] | None:
+def _over(scene: RelationScene, a: int, b: int) -> tuple[float, float, float] | None:
     """How far a is over b: (share of the smaller footprint where it is, share of the lower one's points
     that it covers, clearance there), None where it is nowhere.
     """
@@ -128,22 +130,22 @@ def _over(scene: Scene, a: int, b: int) -> tuple[float, float, float] | None:
 # ---------------------------------------------------------------------------------------------- attached, beside
 
 
-def _attached(scene: Scene, held: set[int]) -> list[Relation]:
+def _attached(scene: RelationScene, held: set[int]) -> list[Relation]:
     """Things that hang on a wall: touching it, standing on nothing."""
     limit = scene.s.attached_m * scene.unit
     out = []
-    for a, body in enumerate(scene.bodies):
+    for a, body in enumerate(scene.instances):
         if a in held or body.structure is not None:
             continue
         touched = wall_touched(scene, a)
         if touched is not None:
             gap, b = touched
             c = round(certainty(limit - gap, scene.s.noise_m * scene.unit), 4)
-            out.append(Relation(body.id, "attached_to", scene.bodies[b].id, c, round(limit - gap, 5)))
+            out.append(Relation(body.id, "attached_to", scene.instances[b].id, c, round(limit - gap, 5)))
     return out
 
 
-def _beside(scene: Scene, holding: set[tuple[int, int]], gravity_known: bool) -> list[Relation]:
+def _beside(scene: RelationScene, holding: set[tuple[int, int]], gravity_known: bool) -> list[Relation]:
     """next_to and near, from the gap between surfaces relative to the sizes of the two."""
     s, unit = scene.s, scene.unit
     noise = s.noise_m * unit
@@ -162,11 +164,11 @@ def _beside(scene: Scene, holding: set[tuple[int, int]], gravity_known: bool) ->
             if confidence < s.sure:
                 break
             if predicate == "near" or not gravity_known or _side_by_side(scene, a, b):
-                out += _both(scene.bodies, a, predicate, b, confidence, bound - gap)
+                out += _both(scene.instances, a, predicate, b, confidence, bound - gap)
     return out
 
 
-def _side_by_side(scene: Scene, a: int, b: int) -> bool:
+def _side_by_side(scene: RelationScene, a: int, b: int) -> bool:
     """Whether two things share a good part of their heights, and neither is a rug."""
     if scene.covering[a] or scene.covering[b]:
         return False

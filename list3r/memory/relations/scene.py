@@ -1,4 +1,4 @@
-"""What relations are computed on: bodies with what is measured of them and between them, each once."""
+"""What relations are computed on: instances with what is measured of them and between them, each once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from list3r.memory.geometry import Array
-from list3r.memory.relations.bodies import Body, neighbours_of
+from list3r.memory.relations.instance_geometry import InstanceGeometry, neighbours_of
 from list3r.memory.relations.symmetry import round_axis, turned
 
 T = TypeVar("T")
@@ -71,8 +71,8 @@ class RelationSettings:
     attached_m: float = 0.05
 
 
-class Measured:
-    """What was measured between pairs of bodies before, by their stamps: a run computes only what is new."""
+class PairMeasures:
+    """What was measured between pairs of instances before, by their stamps: a run computes only what is new."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[object, ...], object] = {}
@@ -82,7 +82,7 @@ class Measured:
         """Begin a run: what the last one did not ask for is forgotten."""
         self._before, self._used = self._used, {}
 
-    def get(self, what: str, a: Body, b: Body, compute: Callable[[], T]) -> T:
+    def get(self, what: str, a: InstanceGeometry, b: InstanceGeometry, compute: Callable[[], T]) -> T:
         """The measure `what` of a and b, computed if it is new."""
         if not (a.stamp and b.stamp):
             return compute()
@@ -100,43 +100,49 @@ Sure = tuple[float, float]
 """Confidence, margin."""
 
 
-class Scene:
-    """Bodies with what is derived from them once."""
+class RelationScene:
+    """Instances with what is derived from them once."""
 
     def __init__(
-        self, bodies: Sequence[Body], unit: float, settings: RelationSettings, measured: Measured, *, upright: bool
+        self,
+        instances: Sequence[InstanceGeometry],
+        unit: float,
+        settings: RelationSettings,
+        measured: PairMeasures,
+        *,
+        upright: bool,
     ) -> None:
-        self.bodies = bodies
+        self.instances = instances
         self._upright = upright
         self._measured = measured
         self.unit = unit
         self.s = settings
         self._trees: dict[int, cKDTree] = {}
-        self._plans: dict[int, Plan] = {}
-        self._surfaces: dict[int, Surface] = {}
-        low = np.array([b.aabb[0] for b in bodies]).reshape(-1, 3)
-        high = np.array([b.aabb[1] for b in bodies]).reshape(-1, 3)
+        self._plans: dict[int, Footprint] = {}
+        self._surfaces: dict[int, SampledSurface] = {}
+        low = np.array([b.aabb[0] for b in instances]).reshape(-1, 3)
+        high = np.array([b.aabb[1] for b in instances]).reshape(-1, 3)
         gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
         self.box_gap = np.linalg.norm(gap, axis=2)
-        component = np.array([b.component for b in bodies])
+        component = np.array([b.component for b in instances])
         self.box_gap[component[:, None] != component[None]] = np.inf
         self.low, self.high = low, high
         self.foot = low[:, 2].copy()
         """Where each body ends below; down to the floor for what stands on it."""
-        self.covering = np.zeros(len(bodies), dtype=bool)
+        self.covering = np.zeros(len(instances), dtype=bool)
         """Whether each body is a rug."""
-        self.size = np.array([b.size for b in bodies])
-        self.thing = np.array([b.structure is None for b in bodies], dtype=bool)
+        self.size = np.array([b.size for b in instances])
+        self.thing = np.array([b.structure is None for b in instances], dtype=bool)
 
     def tree(self, n: int) -> cKDTree:
-        """KD-tree of a body's points."""
+        """KD-tree of an instance's points."""
         if n not in self._trees:
-            self._trees[n] = cKDTree(self.bodies[n].points)
+            self._trees[n] = cKDTree(self.instances[n].points)
         return self._trees[n]
 
-    def measure(self, what: str, a: int, b: int, compute: Callable[[Scene, int, int], T]) -> T:
-        """A measure of two bodies, from memory where it is known."""
-        return self._measured.get(what, self.bodies[a], self.bodies[b], lambda: compute(self, a, b))
+    def measure(self, what: str, a: int, b: int, compute: Callable[[RelationScene, int, int], T]) -> T:
+        """A measure of two instances, from memory where it is known."""
+        return self._measured.get(what, self.instances[a], self.instances[b], lambda: compute(self, a, b))
 
     def touch(self, a: int, b: int) -> float:
         """Distance of a few hundred points of the smaller body to the nearest of the other."""
@@ -146,38 +152,38 @@ class Scene:
         """Distance between surfaces."""
         return self.measure("upright gap" if self._upright else "gap", min(a, b), max(a, b), _gap)
 
-    def surface(self, n: int) -> Surface:
-        """What is known of a body's surface: its points, and for what is round its hidden sides too."""
+    def surface(self, n: int) -> SampledSurface:
+        """What is known of an instance's surface: its points, and for what is round its hidden sides too."""
         if n not in self._surfaces:
-            points = self.bodies[n].points
+            points = self.instances[n].points
             axis = self.measure("axis", n, n, _axis) if self._upright and self.thing[n] else None
             if axis is not None:
                 points = turned(points[:: -(-len(points) // _TURNED)], axis)
             tree = self.tree(n) if axis is None else cKDTree(points)
             away = neighbours_of(points[:: max(1, len(points) // 100)], tree, min(_COMPANY + 1, len(points)))[0]
             grain, company = np.median(away[:, min(1, away.shape[1] - 1)]), np.median(away[:, -1])
-            self._surfaces[n] = Surface(points, tree, float(grain), float(company))
+            self._surfaces[n] = SampledSurface(points, tree, float(grain), float(company))
         return self._surfaces[n]
 
-    def plan(self, n: int) -> Plan:
-        """A body as it is seen from above."""
+    def plan(self, n: int) -> Footprint:
+        """An instance as it is seen from above."""
         if n not in self._plans:
-            points = self.bodies[n].points
+            points = self.instances[n].points
             sample = points[:: -(-len(points) // _SAMPLE)]
-            self._plans[n] = Plan(sample, cKDTree(sample[:, :2]), spacing_of(sample))
+            self._plans[n] = Footprint(sample, cKDTree(sample[:, :2]), spacing_of(sample))
         return self._plans[n]
 
 
-def _touch(scene: Scene, a: int, b: int) -> float:
-    small, large = sorted((a, b), key=lambda n: (len(scene.bodies[n].points), n))
+def _touch(scene: RelationScene, a: int, b: int) -> float:
+    small, large = sorted((a, b), key=lambda n: (len(scene.instances[n].points), n))
     return float(neighbours_of(scene.plan(small).points, scene.tree(large))[0].min())
 
 
-def _axis(scene: Scene, a: int, _: int) -> Array | None:
-    return round_axis(scene.bodies[a].points, scene.s.noise_m * scene.unit)
+def _axis(scene: RelationScene, a: int, _: int) -> Array | None:
+    return round_axis(scene.instances[a].points, scene.s.noise_m * scene.unit)
 
 
-def _gap(scene: Scene, a: int, b: int) -> float:
+def _gap(scene: RelationScene, a: int, b: int) -> float:
     """Of the nearest points that keep company; a reading amidst the edge between two things is no surface."""
     small, large = sorted((scene.surface(a), scene.surface(b)), key=lambda s: len(s.points))
     near = _nearest(small.points, large.tree)
@@ -197,7 +203,7 @@ def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
     return np.asarray(asked[np.argsort(found, kind="stable")[:_NEAR]])
 
 
-def _in_company(surface: Surface, at: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _in_company(surface: SampledSurface, at: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether points of a surface have others about them as is usual for it."""
     away = neighbours_of(surface.points[at], surface.tree, min(_COMPANY + 1, surface.tree.n))[0][:, -1]
     return np.asarray(away <= 2.0 * surface.company)
@@ -205,11 +211,11 @@ def _in_company(surface: Surface, at: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 _COMPANY, _NEAR, _TURNED = 4, 32, 250
 _SAMPLE = 200
-"""Points that stand for a body where its outline matters, not its detail."""
+"""Points that stand for an instance where its outline matters, not its detail."""
 
 
 @dataclass(frozen=True)
-class Surface:
+class SampledSurface:
     """Points of a surface."""
 
     points: Array
@@ -221,7 +227,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Footprint:
     points: Array
     tree: cKDTree
     spacing: float
@@ -232,19 +238,19 @@ def certainty(margin: float, noise: float) -> float:
     return 1.0 / (1.0 + math.exp(-min(1.7 * margin / max(noise, 1e-12), 700.0)))
 
 
-def wall_touched(scene: Scene, a: int) -> tuple[float, int] | None:
+def wall_touched(scene: RelationScene, a: int) -> tuple[float, int] | None:
     """The wall that a thing touches: (gap, position), the nearest one."""
     limit = scene.s.attached_m * scene.unit
     walls = [
         (scene.touch(a, b), b)
-        for b, other in enumerate(scene.bodies)
+        for b, other in enumerate(scene.instances)
         if other.structure in ("wall", "plane") and scene.box_gap[a, b] < limit
     ]
     return min(walls) if walls and min(walls)[0] < limit else None
 
 
-def contact_of(scene: Scene, a: int) -> float:
-    height = float(scene.bodies[a].box.size[2])
+def contact_of(scene: RelationScene, a: int) -> float:
+    height = float(scene.instances[a].box.size[2])
     return scene.s.contact_m * scene.unit + scene.s.contact_per_height * min(height, scene.unit)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from list3r.memory.geometry import Array
-from list3r.memory.relations.bodies import Body
+from list3r.memory.relations.instance_geometry import InstanceGeometry
 
 
 @dataclass(frozen=True)
@@ -39,28 +39,28 @@ class StructureSettings:
 
 
 def classify_structure(
-    bodies: Sequence[Body],
+    instances: Sequence[InstanceGeometry],
     floor_height: float | None,
-    eye_level: Callable[[Body], float],
+    eye_level: Callable[[InstanceGeometry], float],
     unit: float,
     settings: StructureSettings | None = None,
-    around: Sequence[Body] | None = None,
+    around: Sequence[InstanceGeometry] | None = None,
 ) -> list[str | None]:
     """floor, ceiling, wall, plane or None for each body; z must be up.
 
     `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
-    saw a body (90 % of them are below); `unit` is what a metre is in world units. A floor is level and lies at the
+    saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level and lies at the
     floor; a ceiling is level, above the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing
     lies behind it. A smaller surface that the chunks flagged and that has nothing behind it is `plane`. A table top or
-    a cabinet front stands in the room and is none of these. What lies near a body decides, so `around` may be all
-    bodies (the default: those given) or those within `near_m`.
+    a cabinet front stands in the room and is none of these. What lies near an instance decides, so `around` may be all
+    instances (the default: those given) or those within `near_m`.
     """
     s = settings or StructureSettings()
-    known = bodies if around is None else around
+    known = instances if around is None else around
     cloud = [b.points[:: max(1, len(b.points) // 100)] for b in known]
     box = np.array([b.aabb for b in known]).reshape(-1, 2, 3)
     out: list[str | None] = []
-    for b in bodies:
+    for b in instances:
         if b.normal is None:
             out.append(None)
             continue
@@ -70,15 +70,15 @@ def classify_structure(
     return out
 
 
-def flagged_only(bodies: Sequence[Body]) -> list[str | None]:
+def flagged_only(instances: Sequence[InstanceGeometry]) -> list[str | None]:
     """Without gravity: `plane` for what the chunks took for structure in the main, else None."""
-    return ["plane" if b.flagged > 0.5 else None for b in bodies]
+    return ["plane" if b.flagged > 0.5 else None for b in instances]
 
 
 def _classify(
-    body: Body,
+    body: InstanceGeometry,
     floor_height: float | None,
-    eye_level: Callable[[Body], float],
+    eye_level: Callable[[InstanceGeometry], float],
     cloud: Array,
     unit: float,
     s: StructureSettings,
@@ -111,7 +111,7 @@ def _classify(
     return "plane" if body.flagged > 0.5 else None
 
 
-def _bounds(body: Body, cloud: Array, unit: float, s: StructureSettings) -> bool:
+def _bounds(body: InstanceGeometry, cloud: Array, unit: float, s: StructureSettings) -> bool:
     """Whether (nearly) nothing stands just behind the surface; what lies further back may be another room."""
     assert body.normal is not None
     depth = float(np.median(body.points @ body.normal)) - cloud @ body.normal

@@ -8,11 +8,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from list3r.memory.geometry import Array
-from list3r.memory.relations.bodies import Body, neighbours_of
+from list3r.memory.relations.instance_geometry import InstanceGeometry, neighbours_of
 from list3r.memory.relations.scene import (
     Found,
     Held,
-    Scene,
+    RelationScene,
     Sure,
     certainty,
     contact_of,
@@ -24,11 +24,11 @@ from list3r.memory.relations.scene import (
 # ---------------------------------------------------------------------------------------------- on
 
 
-def supports(scene: Scene, taken: set[int]) -> list[Found]:
+def supports(scene: RelationScene, taken: set[int]) -> list[Found]:
     """Each thing on at most one other: the one whose surface it touches best."""
     out = []
-    holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.bodies], dtype=bool)
-    for a, body in enumerate(scene.bodies):
+    holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.instances], dtype=bool)
+    for a, body in enumerate(scene.instances):
         if a in taken or body.structure is not None:
             continue
         best: Held | None = None
@@ -45,18 +45,18 @@ def supports(scene: Scene, taken: set[int]) -> list[Found]:
         if best is not None:
             out.append((a, *best))
     on = {a: b for a, b, _, _ in out}
-    base = [float(np.prod(b.box.size[:2])) for b in scene.bodies]
+    base = [float(np.prod(b.box.size[:2])) for b in scene.instances]
     return [f for f in out if not (on.get(f[1]) == f[0] and (base[f[0]], f[0]) > (base[f[1]], f[1]))]
 
 
-def on_hidden_feet(scene: Scene, held: set[int]) -> list[Found]:
+def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
     """Things that must stand on the floor or on the thing under them, for nothing else holds them, though their feet
     were not seen.
     """
     s = scene.s
     out = []
-    floors = [n for n, b in enumerate(scene.bodies) if b.structure == "floor"]
-    for a, body in enumerate(scene.bodies):
+    floors = [n for n, b in enumerate(scene.instances) if b.structure == "floor"]
+    for a, body in enumerate(scene.instances):
         if a in held or body.structure is not None or wall_touched(scene, a) is not None:
             continue
         z = body.points[:, 2]
@@ -76,19 +76,19 @@ def on_hidden_feet(scene: Scene, held: set[int]) -> list[Found]:
     return out
 
 
-def _beneath(scene: Scene, a: int) -> list[tuple[float, int]]:
+def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
     """(clearance, position) of the things wholly below a that have a surface under its middle and are wide enough to
     bear it.
     """
-    middle, bottom = scene.bodies[a].box.center[:2], float(np.quantile(scene.bodies[a].points[:, 2], 0.01))
+    middle, bottom = scene.instances[a].box.center[:2], float(np.quantile(scene.instances[a].points[:, 2], 0.01))
     below = scene.thing & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
     slack = 0.25 * scene.unit
     below &= np.all((scene.low[:, :2] - slack <= middle) & (scene.high[:, :2] + slack >= middle), axis=1)
-    base = float(np.prod(scene.bodies[a].box.size[:2]))
+    base = float(np.prod(scene.instances[a].box.size[:2]))
     out = []
     for b in np.flatnonzero(below).tolist():
         plan = scene.plan(b)
-        if float(np.prod(scene.bodies[b].box.size[:2])) < 0.5 * base:
+        if float(np.prod(scene.instances[b].box.size[:2])) < 0.5 * base:
             continue
         distance, at = neighbours_of(middle[None], plan.tree, min(6, len(plan.points)))
         if distance[0, 0] < max(0.05 * scene.unit, 3.0 * plan.spacing):
@@ -96,9 +96,9 @@ def _beneath(scene: Scene, a: int) -> list[tuple[float, int]]:
     return out
 
 
-def _stands_on(scene: Scene, a: int, b: int) -> Sure | None:
+def _stands_on(scene: RelationScene, a: int, b: int) -> Sure | None:
     """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
-    subject, other = scene.bodies[a], scene.bodies[b]
+    subject, other = scene.instances[a], scene.instances[b]
     z = subject.points[:, 2]
     bottom, tolerance = float(np.quantile(z, 0.01)), contact_of(scene, a)
     sink = scene.s.contact_m * scene.unit + 0.5 * scene.s.contact_per_height * min(float(np.ptp(z)), scene.unit)
@@ -133,7 +133,7 @@ def _stands_on(scene: Scene, a: int, b: int) -> Sure | None:
     return confidence, margin
 
 
-def _steady(subject: Body, around: Array) -> float:
+def _steady(subject: InstanceGeometry, around: Array) -> float:
     """1 where the surface is seen all round the thing's middle, less where only on one side of it: what lies beside
     a thing on a table is as high as the table, to the noise, but does not go round it.
     """
@@ -145,17 +145,17 @@ def _steady(subject: Body, around: Array) -> float:
 # ---------------------------------------------------------------------------------------------- in
 
 
-def containments(scene: Scene) -> list[Found]:
+def containments(scene: RelationScene) -> list[Found]:
     """Each thing in at most one container, the smallest that encloses it."""
     out = []
-    for a, body in enumerate(scene.bodies):
+    for a, body in enumerate(scene.instances):
         if body.structure is not None:
             continue
         volume = float(np.prod(body.box.size))
         holders = [
-            (float(np.prod(scene.bodies[b].box.size)), b)
+            (float(np.prod(scene.instances[b].box.size)), b)
             for b in np.flatnonzero(scene.thing & (scene.box_gap[a] == 0.0)).tolist()
-            if a != b and volume <= 0.7 * float(np.prod(scene.bodies[b].box.size))
+            if a != b and volume <= 0.7 * float(np.prod(scene.instances[b].box.size))
         ]
         for _, b in sorted(holders):
             found = scene.measure("in", a, b, _held_inside)
@@ -165,11 +165,11 @@ def containments(scene: Scene) -> list[Found]:
     return out
 
 
-def _held_inside(scene: Scene, a: int, b: int) -> Sure | None:
+def _held_inside(scene: RelationScene, a: int, b: int) -> Sure | None:
     """Whether a is in b: inside its box, with b's sides round it or b's boards under and over it, or down in an open
     container whose sides go round it as far as they are seen. A seat or a table top holds nothing so.
     """
-    subject, holder = scene.bodies[a], scene.bodies[b]
+    subject, holder = scene.instances[a], scene.instances[b]
     local = (subject.points - holder.box.center) @ holder.box.rotation
     inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
     sides = _sides_round(scene, a, b)
@@ -200,13 +200,13 @@ class _Sides:
     """The widest angle without any. One flat side leaves at least a half circle."""
 
 
-def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> _Sides:
+def _sides_round(scene: RelationScene, a: int, b: int, *, sunk: bool = False) -> _Sides:
     """b's surfaces round a at a's height, above a's lowest part.
 
     Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too, of which
     the farthest are the rim.
     """
-    subject, holder = scene.bodies[a], scene.bodies[b]
+    subject, holder = scene.instances[a], scene.instances[b]
     low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
     noise = 2.5 * scene.s.noise_m * scene.unit
     brim = low - noise if sunk else low + max(0.3 * (high - low), noise)
@@ -225,37 +225,37 @@ def _sides_round(scene: Scene, a: int, b: int, *, sunk: bool = False) -> _Sides:
     return _Sides(len(reach) / 12, float(reach.std() / reach.mean()), opening)
 
 
-def _is_hollow(scene: Scene, b: int) -> bool:
+def _is_hollow(scene: RelationScene, b: int) -> bool:
     """Whether b is seen to be open above: over its middle most of its surface lies below its rim."""
     seen = _within(scene, b)
     return seen is not None and seen >= scene.s.hollow
 
 
-def _within(scene: Scene, b: int) -> float | None:
+def _within(scene: RelationScene, b: int) -> float | None:
     """Share of the surface over the middle of b that lies well below its rim; None where hardly any is seen."""
-    holder = scene.bodies[b]
+    holder = scene.instances[b]
     aside = np.abs((holder.points - holder.box.center) @ holder.box.rotation)[:, :2]
     z = holder.points[np.all(aside < 0.3 * holder.box.size[:2], axis=1), 2]
     depth = max(2.0 * scene.s.noise_m * scene.unit, 0.25 * float(holder.box.size[2]))
     return float((z < _rim(scene, b) - depth).mean()) if len(z) >= 10 else None
 
 
-def _rim(scene: Scene, b: int) -> float:
-    return float(np.quantile(scene.bodies[b].points[:, 2], 0.97))
+def _rim(scene: RelationScene, b: int) -> float:
+    return float(np.quantile(scene.instances[b].points[:, 2], 0.97))
 
 
-def _rests_on(scene: Scene, a: int, b: int) -> bool:
-    low, high = np.quantile(scene.bodies[a].points[:, 2], [0.03, 0.97])
-    return int((scene.bodies[b].points[:, 2] < low + 0.3 * (high - low)).sum()) >= 3
+def _rests_on(scene: RelationScene, a: int, b: int) -> bool:
+    low, high = np.quantile(scene.instances[a].points[:, 2], [0.03, 0.97])
+    return int((scene.instances[b].points[:, 2] < low + 0.3 * (high - low)).sum()) >= 3
 
 
-def _between_boards(scene: Scene, a: int, b: int, *, walled: bool) -> float | None:
+def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> float | None:
     """How far the board over a is above it, where b has surfaces both under a and over it: a shelf.
 
     Where b is not round a on more than one side (`walled`), what is over a's border alone is no board: a headboard
     rises behind a pillow.
     """
-    subject, holder = scene.bodies[a], scene.bodies[b]
+    subject, holder = scene.instances[a], scene.instances[b]
     low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
     noise = 2.0 * scene.s.noise_m * scene.unit
     aside = np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2]
@@ -268,9 +268,9 @@ def _between_boards(scene: Scene, a: int, b: int, *, walled: bool) -> float | No
     return float(over.min() - high - noise) if len(under) >= 2 and len(over) >= 2 else None
 
 
-def _down_in(scene: Scene, a: int, b: int) -> bool:
+def _down_in(scene: RelationScene, a: int, b: int) -> bool:
     """Whether a sits below the rim of an open container not much wider than it, over the container's middle."""
-    subject, holder = scene.bodies[a], scene.bodies[b]
+    subject, holder = scene.instances[a], scene.instances[b]
     width, noise = float(np.max(subject.box.size[:2])), scene.s.noise_m * scene.unit
     footprints = float(np.prod(subject.box.size[:2])) / max(float(np.prod(holder.box.size[:2])), 1e-12)
     wide = float(np.max(holder.box.size[:2])) > scene.s.most_wider * width

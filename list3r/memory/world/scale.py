@@ -28,7 +28,7 @@ _SHORTEST_M, _LONGEST_M = 0.002, 1000.0
 
 
 @dataclass(frozen=True)
-class Anchor:
+class ScaleAnchor:
     """A length that somebody knows."""
 
     text: str
@@ -54,7 +54,7 @@ class WorldScale:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredAnchor:
     """What an anchor comes to."""
 
     length: float
@@ -66,7 +66,7 @@ class Measured:
     """The local instances that were measured."""
 
 
-def parse_anchor(text: str) -> Anchor:
+def parse_anchor(text: str) -> ScaleAnchor:
     """An anchor from the user's words; a number without a unit is metres. Raises `OptionError`."""
     what, equals, length = text.replace(" ", "").rpartition("=")
     number = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?)(m|cm|mm|)", length)
@@ -79,17 +79,17 @@ def parse_anchor(text: str) -> Anchor:
     if not _SHORTEST_M <= metres <= _LONGEST_M:
         raise OptionError(f"anchor {text!r}: a length between {_SHORTEST_M:g} and {_LONGEST_M:g} m is needed")
     if what == "camera_height":
-        return Anchor(text, metres, "camera")
+        return ScaleAnchor(text, metres, "camera")
     named = re.fullmatch(r"#?([0-9]{1,18})(\.height)?", what)
     if named:
-        return Anchor(text, metres, "height" if named[2] else "size", int(named[1]))
+        return ScaleAnchor(text, metres, "height" if named[2] else "size", int(named[1]))
     points = [_numbers(part) for part in what.split(":")]
     if len(points) != 2 or any(p is None for p in points):
         raise OptionError(f"anchor {text!r}: {_WANTED}")
-    return Anchor(text, metres, "points", points_world=np.array(points, np.float64))
+    return ScaleAnchor(text, metres, "points", points_world=np.array(points, np.float64))
 
 
-def measure(store: Store, anchor: Anchor) -> Measured:
+def measure(store: Store, anchor: ScaleAnchor) -> MeasuredAnchor:
     """How long the anchor is now. Raises `OptionError` and `UnknownIdError` where it cannot be measured."""
     chunks = _main_part(store.chunks())
     if not chunks:
@@ -101,7 +101,7 @@ def measure(store: Store, anchor: Anchor) -> Measured:
         raise OptionError(f"anchor {anchor.text!r} has no length in {store.path}; choose another one")
     inside = {c.chunk_id: c for c in chunks}
     chunk = inside.get(min((k for k, _ in keys), default=-1), chunks[0])
-    return Measured(length, chunk.chunk_id, anchor.metres / length * float(chunk.S_world_chunk.scale), keys)
+    return MeasuredAnchor(length, chunk.chunk_id, anchor.metres / length * float(chunk.S_world_chunk.scale), keys)
 
 
 def settle_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int, Sim3]) -> Sim3:
@@ -164,7 +164,7 @@ def _main_part(chunks: list[ChunkRow]) -> list[ChunkRow]:
     return [c for c in chunks if c.component == first]
 
 
-def _length(store: Store, anchor: Anchor, chunks: list[ChunkRow]) -> tuple[float, tuple[Key, ...]]:
+def _length(store: Store, anchor: ScaleAnchor, chunks: list[ChunkRow]) -> tuple[float, tuple[Key, ...]]:
     upright = store.get_value("gravity", "unknown") != "unknown"
     if anchor.kind == "points":
         assert anchor.points_world is not None

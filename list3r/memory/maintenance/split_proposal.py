@@ -18,7 +18,7 @@ _SEEN_APART = 4.0
 """Distance of two that were seen side by side in one frame; two that share no surface and lie side by side have 2."""
 
 
-def part_best(store: Store, keys: Sequence[Key]) -> tuple[Key, ...]:
+def propose_split(store: Store, keys: Sequence[Key]) -> tuple[Key, ...]:
     """The smaller of the two parts, by average linkage over how little two local instances cover each other, how far
     apart they lie for their size, how unlike they look, and whether they were seen side by side.
     """

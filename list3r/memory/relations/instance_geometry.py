@@ -12,12 +12,12 @@ from list3r.memory.geometry import Array, OrientedBox, upright_box
 
 
 @dataclass(frozen=True)
-class Body:
+class InstanceGeometry:
     """One thing in the world."""
 
     id: int
     points: Array
-    """Surface points without strays, world. Shape (N, 3), N >= 1."""
+    """SampledSurface points without strays, world. Shape (N, 3), N >= 1."""
     rgb: NDArray[np.uint8]
     """Shape (N, 3)."""
     box: OrientedBox
@@ -34,7 +34,7 @@ class Body:
     """Frame of reference."""
     confidence: float = 1.0
     stamp: int = 0
-    """Two bodies of one stamp have the same points; 0 where nothing is promised."""
+    """Two instances of one stamp have the same points; 0 where nothing is promised."""
 
     @property
     def size(self) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.merging.edges import PairScores
-from list3r.memory.overlap.visibility import View, VisibilitySettings, chunk_views, seen_through_share
+from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, chunk_views, seen_through_share
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.store.store import Store
 
@@ -25,7 +25,7 @@ class FreeSpaceCarving:
 
     def __init__(self, store: Store, settings: VisibilitySettings, least_overlap: float = 0.2) -> None:
         self._store, self._s, self._least = store, settings, least_overlap
-        self._views: OrderedDict[int, list[View]] = OrderedDict()
+        self._views: OrderedDict[int, list[DepthView]] = OrderedDict()
 
     def shares(self, u: ChunkShapes, v: ChunkShapes, p: PairScores, S_v_u: Sim3) -> tuple[Array, Array]:
         """For each pair of instances of two chunks the share of either that the other chunk sees through.
@@ -45,7 +45,7 @@ class FreeSpaceCarving:
                 out[meet & (at == n)] = seen_through_share(points, self._views_of(other), self._s) or 0.0
         return out
 
-    def _views_of(self, shapes: ChunkShapes) -> list[View]:
+    def _views_of(self, shapes: ChunkShapes) -> list[DepthView]:
         """The keyframes of a chunk, in its own coordinates."""
         k = shapes.chunk_id
         if k not in self._views:
