@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,10 +55,17 @@ def voxel_truth(cloud: Cloud, ids: tuple[NDArray[np.int32], ...]) -> NDArray[np.
     return out
 
 
-def sample_of(film: Film, seed: int) -> Sample:
-    """Return the chunk of a film as discovery would see it."""
+def chunk_settings(every: int = 1) -> InstanceSettings:
+    """Return the usual settings of a chunk of which only every n-th frame is there: they look at the same frames."""
+    usual = InstanceSettings()
+    near = replace(usual.view, reach=usual.view.reach // every, step=max(1, usual.view.step // every))
+    return replace(usual, anchor_step=max(1, usual.anchor_step // every), view=near)
+
+
+def sample_of(film: Film, seed: int, every: int = 1) -> Sample:
+    """Return the chunk of a film, of which every n-th frame was filmed, as discovery would see it."""
     reconstruction = reconstruction_of(film, seed=seed)
-    views = ChunkViews(frames_of(film), reconstruction, InstanceSettings())
+    views = ChunkViews(frames_of(film), reconstruction, chunk_settings(every))
     shown = tuple(views.view(p) for p in views.anchors)
     ids = tuple(film.ids[p][:: views.stride, :: views.stride].astype(np.int32) for p in views.anchors)
     poses = reconstruction.T_chunk_cam
@@ -70,7 +77,8 @@ def make_sample(seed: int, folder: Path, *, held_out: bool = False, sensor: str 
     """Make the chunk of a seed and write it, unless it is there already; return its file."""
     path = folder / f"{'test' if held_out else 'train'}-{seed:06d}.npz"
     if not path.exists():
-        sample = sample_of(make_film(FilmSettings(seed, held_out=held_out, sensor=sensor)), seed)
+        settings = FilmSettings(seed, held_out=held_out, sensor=sensor)
+        sample = sample_of(make_film(settings), seed, settings.every)
         write_sample(path, sample)
     return path
 

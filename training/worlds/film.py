@@ -55,7 +55,9 @@ class FilmSettings:
     seed: int = 0
     held_out: bool = False
     """Families, textures and sensors that training never shows appear too."""
-    frames: int = 48
+    frames: int = 30
+    every: int = 2
+    """Only every n-th frame of the walk is filmed, which is all that fusion looks at."""
     size: tuple[int, int] = (320, 240)
     sensor: str | None = None
     """None draws one."""
@@ -70,8 +72,9 @@ def make_film(settings: FilmSettings) -> Film:
     focal = settings.size[0] * rng.uniform(0.72, 0.9)
     w, h = settings.size
     camera = Camera(w, h, focal, focal, (w - 1) / 2, (h - 1) / 2)
-    speed = PathSettings(fps=float(rng.uniform(9, 15)), speed_m_s=float(rng.uniform(0.35, 0.7)))
-    time_s, poses = camera_path(_stops(world, rng, settings.frames), settings.frames, speed, settings.seed)
+    speed = PathSettings(fps=float(rng.uniform(9, 15)) / settings.every, speed_m_s=float(rng.uniform(0.35, 0.7)))
+    stops = _stops(world, rng, settings.frames, settings.every)
+    time_s, poses = camera_path(stops, settings.frames, speed, settings.seed)
     renderer = world_renderer(world.things, world.size, camera, settings.seed)
     color, depth, ids = [], [], []
     drift = drift_field((h, w), rng)
@@ -90,14 +93,14 @@ def _truth(thing: Placed) -> Truth:
     return Truth(thing.id, thing.kind, thing.label, thing.family, thing.structure)
 
 
-def _stops(world: World, rng: np.random.Generator, frames: int) -> tuple[Stop, ...]:
+def _stops(world: World, rng: np.random.Generator, frames: int, every: int) -> tuple[Stop, ...]:
     """Return places to look from and at: furniture round the room, from a metre or two, some of it close."""
     room: Room = world.room
     w, deep, _ = world.size
     eyes = [(x, y) for x, y in rng.uniform(0.25, np.array([w, deep]) - 0.25, (300, 2)).tolist() if room.free_eye(x, y)]
     eyes = eyes or [(w / 2, deep / 2)]
     targets = [t for t in world.things if not t.structure]
-    count = max(3, frames // 14)
+    count = max(3, frames * every // 14)
     start = np.array(eyes[int(rng.integers(len(eyes)))])
     bearing, stops = rng.uniform(0, 2 * np.pi), []
     heading = rng.choice([-1, 1])

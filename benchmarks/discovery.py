@@ -1,0 +1,230 @@
+"""What discovery calls one thing, against the truth of worlds that nothing was tuned on.
+
+python benchmarks/discovery.py --seeds 6001-6010 --methods geometric,learned --json benchmarks/results/discovery.json
+python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
+
+Worlds come from `training/worlds` with families, textures and a sensor that training never shows; the house is one that
+others furnished (MIT-0), given by its folder. Each walk is one chunk with poses that drift by some millimetres. A thing
+counts from 150 pixels in a view; its true box is that of its visible surface.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, write_json
+from numpy.typing import NDArray
+
+from list3r.evaluation.instances import evaluate_instances
+from list3r.instances.base import Discoverer, Proposals
+from list3r.instances.geometric.discovery import GeometricDiscoverer
+from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
+from list3r.instances.library import select_prompts
+from list3r.instances.settings import InstanceSettings
+from list3r.memory.geometry import OrientedBox, upright_box
+from training.samples import chunk_settings
+from training.worlds.film import Film, FilmSettings, frames_of, make_film, reconstruction_of
+
+MIN_PX = 150
+"""Pixels of its largest view from which a true thing counts."""
+SMALL_M = 0.3
+"""Longest edge up to which a thing is small."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="6001-6010", help="such as 6001-6010 or 3,5,8")
+    parser.add_argument("--methods", default="geometric,learned,true", help="of geometric, learned, true")
+    parser.add_argument("--sensor", help="structured, tof, lidar or computed; without it each world draws one")
+    parser.add_argument("--house", type=Path, help="folder of aws-robomaker-small-house-world; walks there, not worlds")
+    parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for seed in seeds_of(words.seeds):
+        film = film_of(seed, words.sensor, words.house)
+        for method in words.methods.split(","):
+            rows.append(
+                {"method": method, "seed": seed, "sensor": film[0].sensor, **judge(film, seed, method, words.weights)}
+            )
+            print(json.dumps(rows[-1]), flush=True)
+    table = {m: summary([r for r in rows if r["method"] == m]) for m in words.methods.split(",")}
+    print(machine())
+    for method, entry in table.items():
+        print(method, json.dumps(entry))
+    source = "house" if words.house else "worlds"
+    write_json(words.json, {"source": source, "least_px": MIN_PX, "mean": table, "walks": rows})
+
+
+def seeds_of(text: str) -> list[int]:
+    """The numbers of a list such as 1-3,7."""
+    out: list[int] = []
+    for word in text.split(","):
+        low, _, high = word.partition("-")
+        out += range(int(low), int(high or low) + 1)
+    return out
+
+
+def film_of(seed: int, sensor: str | None, house: Path | None) -> tuple[Film, int]:
+    """A walk, and of how many frames one is filmed."""
+    if house is not None:
+        from training.worlds.house import film_house
+
+        return film_house(house, seed, sensor or ("structured", "lidar", "tof")[seed % 3]), 2
+    settings = FilmSettings(seed, held_out=True, sensor=sensor)
+    return make_film(settings), settings.every
+
+
+def judge(film: tuple[Film, int], seed: int, method: str, weights: Path | None) -> dict[str, Any]:
+    """The figures of one method on one walk."""
+    shown, every = film
+    settings, frames = chunk_settings(every), frames_of(shown)
+    reconstruction = reconstruction_of(shown, seed=seed)
+    views = chunk_views(frames, reconstruction, settings)
+    discoverer = make(method, settings, shown, weights)
+    started = time.process_time()
+    found = [select_prompts(discoverer(frames, reconstruction, p), settings) for p in views.anchors]
+    spent = time.process_time() - started
+    forget_views()
+    up = reconstruction.T_chunk_cam[0, :3, :3] @ shown.T_world_cam[0, :3, :3].T @ np.array([0.0, 0.0, 1.0])
+    return {**figures(shown, views, found, up), "cpu_s": round(spent, 2), "frames": len(shown.time_s) * every}
+
+
+def make(method: str, settings: InstanceSettings, film: Film, weights: Path | None) -> Discoverer:
+    """The discoverer of a name."""
+    if method == "geometric":
+        return GeometricDiscoverer(settings)
+    if method == "true":
+        return TrueDiscoverer(film)
+    from list3r.instances.learned.discovery import LearnedDiscoverer
+
+    return LearnedDiscoverer(settings, weights)
+
+
+class TrueDiscoverer:
+    """Proposes the true masks: the ceiling of what discovery can tell from these views."""
+
+    feature_space = "true@1/1"
+
+    def __init__(self, film: Film) -> None:
+        self._film = film
+        self._structure = {t.id: t.structure for t in film.things}
+
+    def __call__(self, frames: Any, reconstruction: Any, position: int) -> Proposals:
+        """The true masks of a frame."""
+        ids = np.unique(self._film.ids[position])
+        ids = ids[ids > 0].astype(np.int64)
+        table = np.zeros(int(self._film.ids[position].max()) + 1, np.int32)
+        table[ids] = np.arange(1, len(ids) + 1)
+        count = len(ids)
+        structure = np.array([self._structure[i] for i in ids.tolist()], bool)
+        plane = np.full((count, 4), np.nan)
+        ones = np.ones((count, 1), np.float32)
+        return Proposals(position, table[self._film.ids[position]], ones[:, 0], ones, plane, ids, structure)
+
+
+def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArray[np.float64]) -> dict[str, Any]:
+    """Instances by boxes at IoU 0.25 and 0.5, and structure by pixels."""
+    frame = _upright(up)
+    stride, structural = views.stride, {t.id for t in film.things if t.structure}
+    true, told = _Gathered(), _Gathered()
+    right = claimed = there = 0
+    for proposals in found:
+        view = views.view(proposals.position)
+        ids = film.ids[proposals.position][::stride, ::stride].astype(np.int64)
+        labels = proposals.labels[::stride, ::stride]
+        identity = np.append(-1, proposals.identity if proposals.identity is not None else [])[labels]
+        flat = np.append(False, proposals.structure if proposals.structure is not None else [])[labels].astype(bool)
+        bound = np.isin(ids, list(structural)) & view.confirmed
+        there, claimed, right = (
+            there + bound.sum(),
+            claimed + (flat & view.confirmed).sum(),
+            right + (bound & flat).sum(),
+        )
+        points = view.points @ frame.T
+        true.add(points, np.where(np.isin(ids, list(structural)), -1, ids - 1), view.confirmed)
+        told.add(points, np.where(flat, -1, identity), view.confirmed)
+    wanted, faint = true.boxes(MIN_PX)
+    boxes, _ = told.boxes(1)
+    out: dict[str, Any] = {"true": len(wanted), "structure": [int(right), int(claimed), int(there)]}
+    for threshold in (0.25, 0.5):
+        kept = _without_faint(wanted, faint, boxes, threshold)
+        errors = evaluate_instances(wanted, kept, threshold)
+        tag = f"{threshold:g}"
+        out |= {f"found_{tag}": errors.matched, f"listed_{tag}": errors.estimated_count}
+        if threshold == 0.25:
+            small = [k for k, b in enumerate(wanted) if max(b.size) < SMALL_M]
+            hit = {t for t, _, _ in errors.matches}
+            out |= {"duplicates": errors.duplicates, "merged": errors.merged_pairs}
+            out |= {"small": len(small), "small_found": sum(k in hit for k in small)}
+    return out
+
+
+class _Gathered:
+    """Points of things over the views."""
+
+    def __init__(self) -> None:
+        self._points: dict[int, list[NDArray[np.float32]]] = {}
+        self._most: dict[int, int] = {}
+
+    def add(self, points: NDArray[np.float32], labels: NDArray[np.int64], confirmed: NDArray[np.bool_]) -> None:
+        rows = np.flatnonzero(labels.ravel() >= 0)
+        order = rows[np.argsort(labels.ravel()[rows], kind="stable")]
+        values, start = np.unique(labels.ravel()[order], return_index=True)
+        for value, mine in zip(values.tolist(), np.split(order, start[1:]), strict=True):
+            self._most[value] = max(self._most.get(value, 0), len(mine))
+            sure = mine[confirmed.ravel()[mine]]
+            self._points.setdefault(value, []).append(points.reshape(-1, 3)[sure])
+
+    def boxes(self, least_px: int) -> tuple[list[OrientedBox], list[OrientedBox]]:
+        """Boxes of what is large enough in a view, and of the rest."""
+        large: list[OrientedBox] = []
+        rest: list[OrientedBox] = []
+        for value in sorted(self._points):
+            points = np.concatenate(self._points[value])
+            if len(points) >= 10:
+                box = upright_box(points[:: max(1, len(points) // 4000)], trim=0.005)
+                (large if self._most[value] >= least_px else rest).append(replace(box, size=np.maximum(box.size, 0.01)))
+        return large, rest
+
+
+def _without_faint(
+    wanted: list[OrientedBox], faint: list[OrientedBox], boxes: list[OrientedBox], threshold: float
+) -> list[OrientedBox]:
+    """Estimates without those that match a true thing which was hardly in view."""
+    matches = evaluate_instances([*wanted, *faint], boxes, threshold).matches
+    ignored = {e for t, e, _ in matches if t >= len(wanted)}
+    return [b for k, b in enumerate(boxes) if k not in ignored]
+
+
+def _upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    from list3r.instances.learned.graph import upright_frame
+
+    return upright_frame(up / np.linalg.norm(up))
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Figures over all walks, each thing counting the same."""
+    total: Callable[[str], int] = lambda key: sum(int(r[key]) for r in rows)  # noqa: E731
+    out: dict[str, Any] = {"walks": len(rows), "things": total("true")}
+    for tag in ("0.25", "0.5"):
+        out[f"recall_{tag}"] = round(total(f"found_{tag}") / max(total("true"), 1), 3)
+        out[f"precision_{tag}"] = round(total(f"found_{tag}") / max(total(f"listed_{tag}"), 1), 3)
+    out["duplicates_per_thing"] = round(total("duplicates") / max(total("true"), 1), 3)
+    out["merged_pairs_per_thing"] = round(total("merged") / max(total("true"), 1), 3)
+    out["small_recall_0.25"] = round(total("small_found") / max(total("small"), 1), 3)
+    right, claimed, there = (sum(r["structure"][k] for r in rows) for k in range(3))
+    out["structure_f1"] = round(2 * right / max(claimed + there, 1), 3)
+    out["cpu_ms_per_frame"] = round(1000 * sum(r["cpu_s"] for r in rows) / max(total("frames"), 1), 1)
+    return out
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Pieces joined to things by the affinity of their borders."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+
+STRONGEST = 6.0
+"""Log odds are cut at this, so that no single border decides."""
+
+
+def agglomerate(
+    count: int,
+    left: NDArray[np.int64],
+    right: NDArray[np.int64],
+    affinity: Float,
+    weight: Float,
+    threshold: float,
+) -> NDArray[np.int64]:
+    """Return the cluster of each of `count` pieces, numbered from 0 in order of their first piece.
+
+    Clusters whose mean affinity (log odds, weighted by the length of their borders) is above the threshold are joined,
+    the most alike first: average linkage. Pairs that are each other's most alike are joined side by side, which gives
+    the same as one after the other, since a join never brings what is joined nearer to a third.
+    """
+    own = np.arange(count)
+    score = np.clip(affinity.astype(np.float64), -STRONGEST, STRONGEST)
+    mass = weight.astype(np.float64)
+    total = score * mass
+    a, b = left.astype(np.int64), right.astype(np.int64)
+    while len(a):
+        mean = total / mass
+        best = np.full(count, -np.inf)
+        np.maximum.at(best, a, mean)
+        np.maximum.at(best, b, mean)
+        mutual = (mean > threshold) & (mean >= best[a]) & (mean >= best[b])
+        if not mutual.any():
+            break
+        parent = _joined(count, a[mutual], b[mutual])
+        own = parent[own]
+        a, b = parent[a], parent[b]
+        apart = a != b
+        low, high = np.minimum(a, b)[apart], np.maximum(a, b)[apart]
+        code, at = np.unique(low * count + high, return_inverse=True)
+        total = np.bincount(at, total[apart], minlength=len(code))
+        mass = np.bincount(at, mass[apart], minlength=len(code))
+        a, b = code // count, code % count
+    _, first, number = np.unique(own, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    return np.asarray(rank[number], np.int64)
+
+
+def _joined(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The least piece of each connected group. Shape (count,)."""
+    from list3r.instances.geometric.cloud import component_numbers
+
+    number, _ = component_numbers(a, b, count)
+    least = np.full(int(number.max(initial=-1)) + 1, count)
+    np.minimum.at(least, number, np.arange(count))
+    return np.asarray(least[number])

@@ -1,0 +1,84 @@
+"""The discoverer whose weights are our own: trained networks over pieces of the chunk's cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.geometric.cloud import Cloud, build_cloud
+from list3r.instances.geometric.discovery import GeometricDiscoverer
+from list3r.instances.geometric.features import object_feature
+from list3r.instances.geometric.planes import find_planes
+from list3r.instances.geometric.segments import Segment, Segmentation
+from list3r.instances.geometric.surfaces import estimate_up
+from list3r.instances.geometric.views import ChunkViews
+from list3r.instances.learned.cut import CloudCut, cut_cloud
+from list3r.instances.learned.graph import Surroundings
+from list3r.instances.learned.network import Weights
+from list3r.instances.learned.weights import load_weights
+from list3r.instances.settings import InstanceSettings
+
+FLAT = 0.85
+"""Share of a thing's voxels near its plane from which it is a flat surface."""
+
+
+class LearnedDiscoverer(GeometricDiscoverer):
+    """Proposes the things of the chunk's fused cloud as masks on an anchor, cut by the trained networks."""
+
+    def __init__(self, settings: InstanceSettings | None = None, weights: Path | None = None) -> None:
+        super().__init__(settings)
+        self._weights: Weights = load_weights(weights)
+
+    def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
+        settings = self.settings.segment
+        shown = [views.view(p) for p in views.anchors]
+        cloud = build_cloud(shown, settings.voxel_m * views.unit)
+        poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
+        up = estimate_up(find_planes(cloud, settings.plane_area_m2 * views.unit**2, views.unit), poses)
+        height = float(np.median(poses[:, :3, 3] @ up))
+        around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
+        cut = cut_cloud(cloud, shown, around, self._weights)
+        labels, segments, features = _described(cloud, cut, confidence(cut, self._weights), up, views.unit)
+        return cloud, Segmentation(labels, tuple(segments), up), features
+
+
+def confidence(cut: CloudCut, weights: Weights) -> NDArray[np.float32]:
+    """Return the probability that each thing is one whole, by a logistic regression fitted in training. Shape (T,)."""
+    x = (cut.features - weights["confidence.mean"]) / weights["confidence.std"]
+    full = np.concatenate([x, x**2, np.ones((len(x), 1), np.float32)], axis=1)
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(full @ weights["confidence.weight"], -20, 20))), np.float32)
+
+
+def _described(
+    cloud: Cloud, cut: CloudCut, sure: NDArray[np.float32], up: NDArray[np.float64], unit: float
+) -> tuple[NDArray[np.int32], list[Segment], NDArray[np.float32]]:
+    """Labels from 1 (0 for none), what each segment is, and its feature."""
+    rgb = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8)
+    order = np.argsort(cut.labels, kind="stable")
+    bounds = np.searchsorted(cut.labels[order], np.arange(len(cut.structure) + 1))
+    segments, features = [], np.zeros((len(cut.structure), 64), np.float32)
+    for number in range(len(cut.structure)):
+        mine = order[bounds[number] : bounds[number + 1]]
+        structure = bool(cut.structure[number] > 0.5)
+        features[number] = object_feature(cloud.points[mine], rgb[mine], up, unit)
+        plane = _plane_of(cloud, mine, unit)
+        kind = "surface" if structure and plane is not None else "thing"
+        segments.append(Segment(kind, plane, structure, float(sure[number]) if not structure else 0.95))
+    return np.asarray(cut.labels + 1, np.int32), segments, features
+
+
+def _plane_of(cloud: Cloud, mine: NDArray[np.int64], unit: float) -> NDArray[np.float64] | None:
+    """Plane through the voxels of a flat thing, its normal towards the cameras, else None. Shape (4,)."""
+    if len(mine) < 30:
+        return None
+    points = cloud.points[mine].astype(np.float64)
+    mean = points.mean(axis=0)
+    values, axes = np.linalg.eigh(np.cov((points - mean).T))
+    n = axes[:, 0]
+    near = np.abs((points - mean) @ n) < 2.5 * cloud.sigma[mine] + 0.012 * unit
+    if near.mean() < FLAT or values[1] < 9.0 * values[0]:
+        return None
+    n = n if float(n @ cloud.normals[mine].astype(np.float64).sum(axis=0)) > 0 else -n
+    return np.append(n, -n @ mean)

@@ -1,0 +1,308 @@
+"""The graph of a cloud's pieces: what each is like, and what lies between neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.geometric.cloud import Cloud, key_shift, pack, unpack
+from list3r.instances.geometric.features import lab_of
+from list3r.instances.geometric.fusion import View
+
+Float = NDArray[np.float32]
+
+NODE_FEATURES = 26
+EDGE_FEATURES = 24
+REACH_PX = 3
+"""Pixels between the two sides of a border that are looked at in a view; depth is least sure right at it."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What features are measured against."""
+
+    up: NDArray[np.float64]
+    """Upward direction, chunk frame. Shape (3,)."""
+    unit: float
+    """Chunk units per metre."""
+    camera_height: float
+    """Median of the cameras along `up`, chunk units."""
+    computed: bool
+    """True where depth was computed, not read by a sensor."""
+
+
+@dataclass(frozen=True)
+class PieceGraph:
+    """P pieces and E undirected borders between them."""
+
+    nodes: Float
+    """Features of the pieces. Shape (P, NODE_FEATURES)."""
+    left: NDArray[np.int64]
+    """Piece on one side of each border, less than `right`. Shape (E,)."""
+    right: NDArray[np.int64]
+    edges: Float
+    """Features of the borders, seen from the left. Shape (E, EDGE_FEATURES)."""
+    weight: Float
+    """Length of the borders, neighbouring voxels. Shape (E,)."""
+
+    def reversed_edges(self) -> Float:
+        """Return the features of the borders as seen from the right. Shape (E, EDGE_FEATURES)."""
+        out = self.edges.copy()
+        for a, b in _SWAPPED:
+            out[:, [a, b]] = out[:, [b, a]]
+        out[:, _TURNED] *= -1.0
+        return out
+
+
+_SWAPPED = ((4, 5), (12, 13), (18, 19))
+"""Columns that trade places when a border is seen from its other side."""
+_TURNED = [14, 15, 16]
+"""Columns that change their sign then."""
+
+
+def piece_graph(
+    cloud: Cloud,
+    views: Sequence[View],
+    labels: NDArray[np.int32],
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
+    around: Surroundings,
+) -> PieceGraph:
+    """Return the graph of pieces; `labels` (N,) is each voxel's piece, -1 for none, `pairs` neighbouring voxels."""
+    count = int(labels.max(initial=-1)) + 1
+    stats = _Pieces(cloud, labels, count, around)
+    touching = _touching(labels, pairs, count)
+    codes = np.union1d(np.unique(touching.code), _near_codes(cloud, labels, count))
+    left, right = codes // count, codes % count
+    contact = _contact(cloud, labels, pairs, touching, codes, around)
+    seen = _seen(cloud, views, labels, codes, count)
+    edges = np.column_stack([contact, _between(stats, left, right), seen, _contrast(stats, left, right)])
+    weight = np.expm1(contact[:, 0]) + 1.0
+    front = np.bincount(left, seen[:, 0] * seen[:, 1], count) + np.bincount(right, seen[:, 0] * seen[:, 2], count)
+    behind = np.bincount(left, seen[:, 0] * seen[:, 2], count) + np.bincount(right, seen[:, 0] * seen[:, 1], count)
+    total = np.maximum(np.bincount(left, seen[:, 0], count) + np.bincount(right, seen[:, 0], count), 0.1)
+    nodes = np.column_stack([stats.features(), front / total, behind / total])
+    return PieceGraph(nodes.astype(np.float32), left, right, edges.astype(np.float32), weight.astype(np.float32))
+
+
+class _Pieces:
+    """Means and moments of the pieces of a cloud, in metres and upright."""
+
+    def __init__(self, cloud: Cloud, labels: NDArray[np.int32], count: int, around: Surroundings) -> None:
+        known = labels >= 0
+        self._own = labels[known]
+        self.count, self._around = count, around
+        frame = upright_frame(around.up)
+        points = (cloud.points[known] @ frame.T) / around.unit
+        self._floor = float(np.quantile(points[:, 2], 0.01)) if len(points) else 0.0
+        self.size = np.maximum(np.bincount(self._own, minlength=count), 1).astype(np.float64)
+        self.center = self._mean(points)
+        self.normal = self._mean(cloud.normals[known] @ frame.T)
+        length = np.linalg.norm(self.normal, axis=1, keepdims=True)
+        self.coherence = length[:, 0]
+        self.normal = self.normal / np.maximum(length, 1e-6)
+        self.lab = self._mean(lab_of(cloud.rgb[known]))
+        away = lab_of(cloud.rgb[known]) - self.lab[self._own]
+        self.lab_spread = np.sqrt(self._mean(away**2))
+        self.sigma = self._mean(cloud.sigma[known][:, None])[:, 0] / around.unit
+        offset = points - self.center[self._own]
+        self._cov = np.stack([self._mean(offset * offset[:, k : k + 1]) for k in range(3)], axis=1)
+        self.low, self.high = self._extremes(points[:, 2])
+        self.voxel = cloud.voxel / around.unit
+
+    def _mean(self, values: NDArray[np.generic]) -> NDArray[np.float64]:
+        sums = [np.bincount(self._own, values[:, k], minlength=self.count) for k in range(values.shape[1])]
+        return np.stack(sums, axis=1) / self.size[:, None]
+
+    def _extremes(self, z: NDArray[np.generic]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        low, high = np.full(self.count, np.inf), np.full(self.count, -np.inf)
+        np.minimum.at(low, self._own, z)
+        np.maximum.at(high, self._own, z)
+        return np.minimum(low, high), np.maximum(low, high)
+
+    def features(self) -> NDArray[np.float64]:
+        """What each piece is like by itself. Shape (P, NODE_FEATURES - 2)."""
+        spread = np.sqrt(np.maximum(np.linalg.eigvalsh(self._cov), 0.0))
+        eye = self._around.camera_height / self._around.unit
+        wide = np.sqrt(np.maximum(self._cov[:, 0, 0] + self._cov[:, 1, 1], 0.0))
+        area = self.size * self.voxel**2
+        tall = self.high - self.low
+        return np.column_stack(
+            [
+                np.log(self.size) / 4.0,
+                np.log(area + 1e-4) / 4.0,
+                self.normal[:, 2],
+                np.abs(self.normal[:, 2]),
+                self.coherence,
+                np.clip(spread * 5.0, 0, 4),
+                np.log(spread[:, 0] * 100 + 0.1),
+                np.log(spread[:, 1] * 20 + 0.1),
+                np.log(spread[:, 2] * 10 + 0.1),
+                np.clip(wide * 3.0, 0, 4),
+                np.clip(tall * 2.0, 0, 5),
+                self.low - self._floor,
+                self.high - self._floor,
+                self.center[:, 2] - eye,
+                self.lab / 40.0,
+                np.clip(self.lab_spread / 15.0, 0, 3),
+                np.clip(self.sigma * 100.0, 0, 5),
+                np.full(self.count, float(self._around.computed)),
+            ]
+        )
+
+
+def upright_frame(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation into a frame whose third axis is `up`. Shape (3, 3)."""
+    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])
+
+
+@dataclass(frozen=True)
+class _Touching:
+    """Pairs of neighbouring voxels of different pieces."""
+
+    row: NDArray[np.int64]
+    """Rows of the voxel pairs. Shape (T,)."""
+    code: NDArray[np.int64]
+    """Lesser piece times the number of pieces plus the greater. Shape (T,)."""
+    flipped: NDArray[np.bool_]
+    """True where the pair's left voxel is of the greater piece. Shape (T,)."""
+
+
+def _touching(labels: NDArray[np.int32], pairs: tuple[NDArray[np.int64], NDArray[np.int64]], count: int) -> _Touching:
+    a, b = labels[pairs[0]].astype(np.int64), labels[pairs[1]].astype(np.int64)
+    row = np.flatnonzero((a != b) & (a >= 0) & (b >= 0))
+    a, b = a[row], b[row]
+    return _Touching(row, np.minimum(a, b) * count + np.maximum(a, b), a > b)
+
+
+def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int) -> NDArray[np.int64]:
+    """Codes of pieces that come within two cells of twice the voxel: over gaps that depth edges leave."""
+    known = np.flatnonzero(labels >= 0)
+    cell = pack(unpack(cloud.keys[known]) >> 1)
+    order = np.lexsort((labels[known], cell))
+    key, own = cell[order], labels[known][order].astype(np.int64)
+    fresh = np.flatnonzero((np.diff(key, prepend=-1) != 0) | (np.diff(own, prepend=-1) != 0))
+    key, own = key[fresh], own[fresh]
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    last = np.append(first[1:], len(key)) - 1
+    cells, found = key[first], []
+    span = (-1, 0, 1)
+    half = [(i, j, k) for i in span for j in span for k in span if (i, j, k) >= (0, 0, 0)]
+    for offset in half:
+        at = np.minimum(np.searchsorted(cells, cells + key_shift(offset)), len(cells) - 1)
+        hit = np.flatnonzero(cells[at] == cells + key_shift(offset))
+        for mine in (first, last):
+            for theirs in (first, last):
+                a, b = own[mine[hit]], own[theirs[at[hit]]]
+                found.append((np.minimum(a, b) * count + np.maximum(a, b))[a != b])
+    return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
+
+
+def _contact(
+    cloud: Cloud,
+    labels: NDArray[np.int32],
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
+    touching: _Touching,
+    codes: NDArray[np.int64],
+    around: Surroundings,
+) -> NDArray[np.float64]:
+    """What the voxels on both sides of each border tell. Shape (E, 10)."""
+    at = np.searchsorted(codes, touching.code)
+    a, b = pairs[0][touching.row], pairs[1][touching.row]
+    a, b = np.where(touching.flipped, b, a), np.where(touching.flipped, a, b)
+    size = np.bincount(at, minlength=len(codes)).astype(np.float64)
+    length = np.maximum(size, 1.0)
+
+    def mean(values: NDArray[np.generic]) -> NDArray[np.float64]:
+        return np.bincount(at, values, minlength=len(codes)) / length
+
+    way = (cloud.points[b] - cloud.points[a]) / cloud.voxel
+    n, m = cloud.normals[a], cloud.normals[b]
+    known = ((n != 0).any(axis=1) & (m != 0).any(axis=1)).astype(np.float64)
+    bent = ((m - n) * way).sum(axis=1) * known
+    step = np.abs((way * (n + m) / 2.0).sum(axis=1))
+    lab = lab_of(cloud.rgb)
+    color = lab[b] - lab[a]
+    count = int(labels.max(initial=-1)) + 1
+    outline = np.sqrt(np.maximum(np.bincount(labels[labels >= 0], minlength=count), 1.0))
+    return np.column_stack(
+        [
+            np.log1p(size),
+            mean(bent),
+            mean((bent < -0.15) * 1.0),
+            mean(np.where(known > 0, (n * m).sum(axis=1), 0.7)),
+            size / outline[codes // count] / 4.0,
+            size / outline[codes % count] / 4.0,
+            mean(step),
+            mean(np.linalg.norm(color, axis=1)) / 15.0,
+            mean(np.abs(color[:, 0])) / 15.0,
+            mean(np.maximum(cloud.sigma[a], cloud.sigma[b])) / around.unit * 100.0,
+        ]
+    )
+
+
+def _between(stats: _Pieces, left: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How two pieces lie to one another. Shape (E, 7)."""
+    way = stats.center[right] - stats.center[left]
+    far = np.maximum(np.linalg.norm(way, axis=1), 1e-6)
+    n, m = stats.normal[left], stats.normal[right]
+    ahead, back = (way * n).sum(axis=1), -(way * m).sum(axis=1)
+    share = np.log(stats.size[right] / stats.size[left]) / 3.0
+    return np.column_stack(
+        [
+            (n * m).sum(axis=1),
+            np.log(far * 10.0 + 0.1),
+            np.clip(ahead * 20.0, -4, 4),
+            np.clip(back * 20.0, -4, 4),
+            way[:, 2] / far,
+            np.clip((stats.low[right] - stats.low[left]) * 3.0, -4, 4),
+            share,
+        ]
+    )
+
+
+def _contrast(stats: _Pieces, left: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How unlike the colours of two pieces are. Shape (E, 3)."""
+    away = np.abs(stats.lab[right] - stats.lab[left]) / 15.0
+    return np.column_stack([np.clip(away[:, 0], 0, 4), np.clip(np.hypot(away[:, 1], away[:, 2]), 0, 4)])
+
+
+def _seen(
+    cloud: Cloud, views: Sequence[View], labels: NDArray[np.int32], codes: NDArray[np.int64], count: int
+) -> NDArray[np.float64]:
+    """What views show across each border: how often it is seen, who is before whom, the step of colour. (E, 5)."""
+    table = np.append(labels, -1)
+    sums = np.zeros((5, len(codes)))
+    for view, index in zip(views, cloud.index, strict=True):
+        image = table[index]
+        lab = lab_of(view.rgb.reshape(-1, 3).astype(np.float32)).reshape(*view.rgb.shape)
+        limit = 6.0 * view.reading + 0.015 * view.depth
+        for axis in (0, 1):
+            one, two = _apart(axis, REACH_PX)
+            a, b = image[one].ravel().astype(np.int64), image[two].ravel().astype(np.int64)
+            row = np.flatnonzero((a != b) & (a >= 0) & (b >= 0))
+            a, b = a[row], b[row]
+            code = np.minimum(a, b) * count + np.maximum(a, b)
+            at = np.minimum(np.searchsorted(codes, code), len(codes) - 1)
+            hit = codes[at] == code if len(codes) else np.zeros(len(code), bool)
+            row, at, flip = row[hit], at[hit], (a > b)[hit]
+            jump = (view.depth[two].ravel()[row] - view.depth[one].ravel()[row]) * np.where(flip, -1.0, 1.0)
+            sure = limit[one].ravel()[row]
+            step = np.abs(lab[two].reshape(-1, 3)[row] - lab[one].reshape(-1, 3)[row])
+            values = (np.ones(len(row)), jump > sure, jump < -sure, step[:, 0], np.hypot(step[:, 1], step[:, 2]))
+            for k, value in enumerate(values):
+                sums[k] += np.bincount(at, value, minlength=len(codes))
+    times = np.maximum(sums[0], 1.0)
+    return np.column_stack(
+        [np.log1p(sums[0]), sums[1] / times, sums[2] / times, sums[3] / times / 15, sums[4] / times / 15]
+    )
+
+
+def _apart(axis: int, reach: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Two slices of an image, `reach` pixels apart along an axis."""
+    every, head, tail = slice(None), slice(None, -reach), slice(reach, None)
+    return ((head, every), (tail, every)) if axis == 0 else ((every, head), (every, tail))

@@ -1,0 +1,87 @@
+"""The pieces that the first network judges: superpoints, those of one flat calm surface already joined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.geometric.cloud import Cloud
+from list3r.instances.geometric.fusion import View
+from list3r.instances.learned.agglomeration import agglomerate
+from list3r.instances.learned.graph import PieceGraph, Surroundings, piece_graph
+from list3r.instances.learned.superpoints import SuperpointSettings, cut_superpoints
+
+
+@dataclass(frozen=True)
+class CalmSettings:
+    """What counts as one flat surface without a border. Each is where the doubt reaches one."""
+
+    bend: float = 0.06
+    """1 - cosine between the normals of two superpoints (20 degrees)."""
+    step_m: float = 0.015
+    """Distance of a superpoint's middle from the plane of the other."""
+    color: float = 9.0
+    """Difference of their colours, Lab with lightness halved."""
+    least_contact: float = 1.3
+    """Logarithm of the number of voxels that touch; those that touch less are not joined here."""
+
+
+@dataclass(frozen=True)
+class PieceSettings:
+    """How a cloud is cut into pieces."""
+
+    superpoints: SuperpointSettings = field(default_factory=SuperpointSettings)
+    calm: CalmSettings = field(default_factory=CalmSettings)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """P pieces of a cloud of N voxels and the graph of their borders."""
+
+    labels: NDArray[np.int32]
+    """Piece of each voxel, from 0; -1 for none. Shape (N,)."""
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]]
+    """Voxels that are neighbours. Shape (M,) each."""
+    graph: PieceGraph
+
+    def joined(self, cluster: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the cluster of each voxel, given that of each piece (P,); -1 for none. Shape (N,)."""
+        return np.asarray(np.append(cluster, -1)[self.labels], np.int32)
+
+
+def cut_pieces(
+    cloud: Cloud, views: Sequence[View], around: Surroundings, settings: PieceSettings | None = None
+) -> Pieces:
+    """Cut a cloud into pieces: superpoints, and what is flat, even and of one colour as one.
+
+    Large plain surfaces so become single pieces with long borders: a quarter of the pieces is left, and what a network
+    is told at one end of a wall it knows at the other. On 10 chunks of training 6,120 superpoints became 1,600 a chunk;
+    99.9 % of the voxels lie in a piece of their own thing, and no thing was lost.
+    """
+    s = settings or PieceSettings()
+    fine = cut_superpoints(cloud, around.unit, s.superpoints)
+    pairs = (fine.left, fine.right)
+    graph = piece_graph(cloud, views, fine.labels, pairs, around)
+    own = agglomerate(fine.count, graph.left, graph.right, calm(graph, s.calm), graph.weight, 0.0)
+    labels = np.asarray(np.append(own, -1)[fine.labels], np.int32)
+    return Pieces(labels, pairs, piece_graph(cloud, views, labels, pairs, around))
+
+
+def calm(graph: PieceGraph, s: CalmSettings) -> NDArray[np.float32]:
+    """Return above 0 for borders between superpoints of one flat calm surface. Shape (E,)."""
+    e = graph.edges
+    doubts = (
+        (1.0 - e[:, 10]) / s.bend,
+        (1.0 - e[:, 3]) / (2.0 * s.bend),
+        np.abs(e[:, 12]) / (20.0 * s.step_m),
+        np.abs(e[:, 13]) / (20.0 * s.step_m),
+        np.hypot(e[:, 22], e[:, 23]) * 15.0 / s.color,
+        e[:, 7] * 15.0 / (1.5 * s.color),
+        e[:, 18] * 10.0,
+        e[:, 19] * 10.0,
+        (e[:, 0] < s.least_contact) * 9.0,
+    )
+    return np.asarray(1.0 - np.maximum.reduce(doubts), np.float32)

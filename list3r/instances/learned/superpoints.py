@@ -1,0 +1,105 @@
+"""The chunk's cloud cut into small pieces that no border of a thing runs through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from list3r.instances.geometric.cloud import Cloud, neighbour_pairs
+from list3r.instances.geometric.features import lab_of
+
+
+@dataclass(frozen=True)
+class SuperpointSettings:
+    """How fine the pieces are, and what they keep to."""
+
+    seed_m: float = 0.06
+    """Spacing of the seeds from which pieces grow."""
+    normal_weight: float = 3.0
+    """Cost of crossing a right angle, in voxels of way."""
+    color_weight: float = 0.12
+    """Cost of a step of colour, in voxels of way for each unit of Lab (lightness halved)."""
+    step_weight: float = 1.5
+    """Cost of a step across the surface, in voxels of way for each voxel of height."""
+    least: int = 4
+    """Pieces of fewer voxels are no pieces."""
+
+
+@dataclass(frozen=True)
+class Superpoints:
+    """P pieces of a cloud of N voxels, and the E pairs of neighbouring voxels."""
+
+    labels: NDArray[np.int32]
+    """Piece of each voxel, from 0; -1 for none. Shape (N,)."""
+    count: int
+    left: NDArray[np.int64]
+    """Voxels that are neighbours, with `right`. Shape (E,)."""
+    right: NDArray[np.int64]
+
+
+def cut_superpoints(cloud: Cloud, unit: float, settings: SuperpointSettings | None = None) -> Superpoints:
+    """Grow pieces from seeds along the shortest ways over the surface, on which edges, steps and colours cost.
+
+    Every voxel goes to the seed that is nearest by that cost (a geodesic Voronoi diagram), so pieces keep to creases
+    and to borders of colour, and none is much wider than the spacing of the seeds.
+    """
+    s = settings or SuperpointSettings()
+    left, right = neighbour_pairs(cloud.keys, 1)
+    cost = _costs(cloud, left, right, s)
+    seeds = _seeds(cloud, left, right, cost, s.seed_m * unit)
+    size = len(cloud.keys)
+    graph = coo_matrix((cost, (left, right)), shape=(size, size)).tocsr()
+    _, _, source = dijkstra(graph, directed=False, indices=seeds, return_predecessors=True, min_only=True)
+    known = source >= 0
+    number = np.full(size, -1, np.int64)
+    number[known] = np.searchsorted(seeds, source[known])
+    labels, count = _without_scraps(number, s.least)
+    return Superpoints(labels, count, left, right)
+
+
+def _costs(
+    cloud: Cloud, left: NDArray[np.int64], right: NDArray[np.int64], s: SuperpointSettings
+) -> NDArray[np.float32]:
+    """Length of the way between neighbouring voxels. Shape (E,)."""
+    n, lab = cloud.normals, lab_of(cloud.rgb)
+    a, b = n[left], n[right]
+    known = (np.abs(a).sum(axis=1) > 0) & (np.abs(b).sum(axis=1) > 0)
+    bend = np.where(known, 1.0 - np.clip((a * b).sum(axis=1), -1.0, 1.0), 0.3)
+    away = (cloud.points[right] - cloud.points[left]) / cloud.voxel
+    step = np.abs((away * np.where(known[:, None], (a + b) / 2.0, 0.0)).sum(axis=1))
+    color = np.linalg.norm(lab[left] - lab[right], axis=1)
+    way = np.linalg.norm(away, axis=1)
+    return np.asarray(
+        0.2 + way + s.normal_weight * bend + s.color_weight * color + s.step_weight * np.maximum(step - 0.5, 0.0),
+        np.float32,
+    )
+
+
+def _seeds(
+    cloud: Cloud, left: NDArray[np.int64], right: NDArray[np.int64], cost: NDArray[np.float32], spacing: float
+) -> NDArray[np.int64]:
+    """The calmest voxel of each cell of a grid and of each way that surfaces in it face, ascending."""
+    size = len(cloud.keys)
+    ways = np.maximum(np.bincount(left, minlength=size) + np.bincount(right, minlength=size), 1)
+    rough = (np.bincount(left, cost, minlength=size) + np.bincount(right, cost, minlength=size)) / ways
+    rough = rough + 2.0 * (ways < 5)
+    cell = np.floor(cloud.points / spacing).astype(np.int64) + (1 << 14)
+    axis = np.abs(cloud.normals).argmax(axis=1)
+    facing = axis * 2 + (cloud.normals[np.arange(size), axis] > 0)
+    key = ((cell[:, 0] << 30 | cell[:, 1] << 15 | cell[:, 2]) << 3) | facing
+    order = np.lexsort((rough, key))
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    count = np.diff(np.append(first, size))
+    return np.sort(order[first[count >= 4]])
+
+
+def _without_scraps(number: NDArray[np.int64], least: int) -> tuple[NDArray[np.int32], int]:
+    """Pieces renumbered without those of fewer voxels than `least`, and how many are left."""
+    size = np.bincount(number[number >= 0], minlength=1)
+    keep = size >= least
+    new = np.where(keep, np.cumsum(keep) - 1, -1)
+    return np.asarray(np.where(number >= 0, new[number], -1), np.int32), int(keep.sum())

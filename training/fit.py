@@ -1,0 +1,153 @@
+"""Training of one network on lessons: losses, a log, checkpoints to go on from."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from training.graphs import Lesson
+from training.model import PieceNetwork
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How long and how fast."""
+
+    epochs: int = 12
+    rate: float = 3e-3
+    """Largest learning rate; it falls along half a cosine."""
+    decay: float = 1e-4
+    name_share: float = 0.2
+    """Weight of the loss of names."""
+    seed: int = 0
+
+
+def fit(
+    network: PieceNetwork, lessons: Sequence[Lesson], held: Sequence[Lesson], folder: Path, settings: FitSettings
+) -> PieceNetwork:
+    """Train a network; a state of each epoch in `folder` lets an interrupted run go on, `log.jsonl` tells losses."""
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(settings.seed)
+    _standardise(network, lessons)
+    optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
+    state, start = folder / "state.pt", 0
+    if state.exists():
+        saved = torch.load(state, weights_only=True)
+        network.load_state_dict(saved["network"])
+        optimiser.load_state_dict(saved["optimiser"])
+        start = int(saved["epoch"])
+    steps = settings.epochs * len(lessons)
+    for epoch in range(start, settings.epochs):
+        began, losses = time.monotonic(), []
+        order = np.random.default_rng([settings.seed, epoch]).permutation(len(lessons))
+        for k, row in enumerate(order.tolist()):
+            done = (epoch * len(lessons) + k) / steps
+            for group in optimiser.param_groups:
+                group["lr"] = settings.rate * min(1.0, done * 30 + 0.05) * 0.5 * (1 + np.cos(np.pi * done))
+            losses.append(_step(network, optimiser, lessons[row], settings))
+        entry = {"epoch": epoch + 1, **_means(losses), "s": round(time.monotonic() - began, 1), **score(network, held)}
+        with (folder / "log.jsonl").open("a") as log:
+            log.write(json.dumps(entry) + "\n")
+        print(json.dumps(entry), flush=True)  # noqa: T201
+        torch.save({"network": network.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1}, state)
+    return network
+
+
+def tensors(lesson: Lesson) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return what a network takes."""
+    g = lesson.graph
+    return (
+        torch.from_numpy(g.nodes),
+        torch.from_numpy(g.left),
+        torch.from_numpy(g.right),
+        torch.from_numpy(g.edges),
+        torch.from_numpy(g.reversed_edges()),
+    )
+
+
+def _standardise(network: PieceNetwork, lessons: Sequence[Lesson]) -> None:
+    nodes = np.concatenate([lesson.graph.nodes for lesson in lessons])
+    edges = np.concatenate([lesson.graph.edges for lesson in lessons])
+    for name, values in (("node", nodes), ("edge", edges)):
+        getattr(network, f"{name}_mean").copy_(torch.from_numpy(values.mean(axis=0)))
+        getattr(network, f"{name}_std").copy_(torch.from_numpy(values.std(axis=0) + 1e-3))
+
+
+def truths(lesson: Lesson) -> tuple[Any, Any, Any]:
+    """Return of each border whether it is inside of a thing, whether it is known, and its weight. Shape (E,) each."""
+    a, b = lesson.thing[lesson.graph.left], lesson.thing[lesson.graph.right]
+    known = (a > 0) & (b > 0)
+    weight = np.log1p(lesson.graph.weight) * known
+    return a == b, known, weight.astype(np.float32)
+
+
+def _step(
+    network: PieceNetwork, optimiser: torch.optim.Optimizer, lesson: Lesson, settings: FitSettings
+) -> dict[str, float]:
+    network.train()
+    affinity, structure, names, _ = network(*tensors(lesson))
+    same, _, weight = truths(lesson)
+    w = torch.from_numpy(weight)
+    pair = F.binary_cross_entropy_with_logits(
+        affinity, torch.from_numpy(same.astype(np.float32)), w, reduction="sum"
+    ) / w.sum().clamp(min=1)
+    size = torch.from_numpy(np.sqrt(lesson.size) * (lesson.thing > 0))
+    bound = F.binary_cross_entropy_with_logits(
+        structure, torch.from_numpy(lesson.structure.astype(np.float32)), size, reduction="sum"
+    )
+    bound = bound / size.sum().clamp(min=1)
+    named = torch.from_numpy(np.flatnonzero(lesson.name >= 0))
+    word = torch.zeros(())
+    if len(named):
+        word = F.cross_entropy(names[named], torch.from_numpy(lesson.name)[named], label_smoothing=0.05)
+    loss = pair + 0.5 * bound + settings.name_share * word
+    optimiser.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+    optimiser.step()
+    return {"pair": pair.item(), "structure": bound.item(), "name": word.item()}
+
+
+def _means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {k: round(float(np.mean([r[k] for r in rows])), 4) for k in rows[0]}
+
+
+@torch.no_grad()
+def score(network: PieceNetwork, lessons: Sequence[Lesson]) -> dict[str, float]:
+    """Return losses and shares right on lessons not trained on."""
+    network.eval()
+    right: dict[str, list[float]] = {
+        "held_pair": [],
+        "held_apart_found": [],
+        "held_same_kept": [],
+        "held_structure": [],
+        "held_name": [],
+    }
+    for lesson in lessons:
+        affinity, structure, names, _ = network(*tensors(lesson))
+        same, _, weight = truths(lesson)
+        told = affinity.numpy()
+        loss = np.logaddexp(0, told) - told * same
+        right["held_pair"].append(float((loss * weight).sum() / max(weight.sum(), 1)))
+        apart, inside = weight * ~same, weight * same
+        right["held_apart_found"].append(float((apart * (told < 0)).sum() / max(apart.sum(), 1e-6)))
+        right["held_same_kept"].append(float((inside * (told > 0)).sum() / max(inside.sum(), 1e-6)))
+        size = lesson.size * (lesson.thing > 0)
+        right["held_structure"].append(
+            float((size * ((structure.numpy() > 0) == lesson.structure)).sum() / max(size.sum(), 1))
+        )
+        named = lesson.name >= 0
+        if named.any():
+            right["held_name"].append(
+                float((lesson.size * (names.numpy().argmax(1) == lesson.name))[named].sum() / lesson.size[named].sum())
+            )
+    return {k: round(float(np.mean(v)), 4) if v else 0.0 for k, v in right.items()}

@@ -1,0 +1,115 @@
+"""Graphs of pieces with what is true of them: what the networks learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.geometric.cloud import neighbour_pairs
+from list3r.instances.learned.cut import CutSettings, make_parts
+from list3r.instances.learned.graph import PieceGraph, Surroundings
+from list3r.instances.learned.network import judge
+from list3r.instances.learned.pieces import Pieces, cut_pieces
+from training.samples import Sample, read_sample
+from training.worlds.catalogue import LABELS
+
+LEAST_PURE = 0.6
+"""Pieces of which no thing has this share teach nothing."""
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """A graph and its truth."""
+
+    seed: int
+    graph: PieceGraph
+    thing: NDArray[np.int64]
+    """True thing of each piece, 0 for none, -1 where it is mixed. Shape (P,)."""
+    structure: NDArray[np.bool_]
+    """Pieces of what bounds the room. Shape (P,)."""
+    name: NDArray[np.int64]
+    """Row of `LABELS` of each piece, -1 for none. Shape (P,)."""
+    size: NDArray[np.float32]
+    """Voxels of each piece. Shape (P,)."""
+
+
+def surroundings_of(sample: Sample) -> Surroundings:
+    """Return up (the true one, tilted by up to a few degrees), scale and the height of the cameras."""
+    rng = np.random.default_rng([sample.seed, 13])
+    up = sample.up + rng.normal(0, 0.015, 3)
+    up /= np.linalg.norm(up)
+    return Surroundings(up, 1.0, float(np.median(sample.T_chunk_cam[:, :3, 3] @ up)), sample.computed)
+
+
+def lesson_of(sample: Sample, graph: PieceGraph, labels: NDArray[np.int32], truth: NDArray[np.int32]) -> Lesson:
+    """Return a graph with the truth of its pieces; `labels` and `truth` have shape (N,)."""
+    count = len(graph.nodes)
+    known = labels >= 0
+    codes, votes = np.unique(labels[known].astype(np.int64) << 16 | truth[known], return_counts=True)
+    size = np.bincount(labels[known], minlength=count)
+    order = np.lexsort((votes, codes >> 16))
+    thing, most = np.zeros(count, np.int64), np.zeros(count)
+    thing[codes[order] >> 16], most[codes[order] >> 16] = codes[order] & 0xFFFF, votes[order]
+    thing[most < LEAST_PURE * size] = -1
+    truth_of = {t.id: t for t in sample.things}
+    structure = np.array([i > 0 and truth_of[i].structure for i in thing.tolist()], bool)
+    name = [LABELS.index(truth_of[i].label) if i > 0 and not truth_of[i].structure else -1 for i in thing.tolist()]
+    return Lesson(sample.seed, graph, thing, structure, np.array(name, np.int64), size.astype(np.float32))
+
+
+def first_lesson(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
+    """Return the graph of the finest pieces of a sample on disk with its truth, and the piece of each voxel.
+
+    It is kept beside the sample.
+    """
+    kept = path.with_suffix(".graph")
+    if not kept.exists():
+        sample = read_sample(path)
+        cloud = sample.cloud()
+        pieces = cut_pieces(cloud, sample.views, surroundings_of(sample))
+        lesson = lesson_of(sample, pieces.graph, pieces.labels, sample.truth_of(cloud))
+        _write(kept, lesson, pieces.labels)
+    return _read(kept)
+
+
+def second_lesson(path: Path, arrays: Mapping[str, NDArray[Any]]) -> Lesson:
+    """Return the graph of the parts that the first network makes of a sample on disk, with its truth."""
+    lesson, labels = first_lesson(path)
+    sample = read_sample(path)
+    cloud = sample.cloud()
+    pieces = Pieces(labels, neighbour_pairs(cloud.keys, 1), lesson.graph)
+    told = judge(arrays, "fine", lesson.graph)
+    parts, graph = make_parts(cloud, sample.views, surroundings_of(sample), pieces, told, CutSettings().sure)
+    return lesson_of(sample, graph, parts, sample.truth_of(cloud))
+
+
+def _write(path: Path, lesson: Lesson, labels: NDArray[np.int32]) -> None:
+    new = path.with_suffix(".new.npz")
+    g = lesson.graph
+    np.savez(
+        new,
+        seed=lesson.seed,
+        nodes=g.nodes,
+        left=g.left,
+        right=g.right,
+        edges=g.edges,
+        weight=g.weight,
+        thing=lesson.thing,
+        structure=lesson.structure,
+        name=lesson.name,
+        size=lesson.size,
+        labels=labels,
+    )
+    new.replace(path)
+
+
+def _read(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
+    with np.load(path) as data:
+        a = {name: data[name] for name in data.files}
+    graph = PieceGraph(a["nodes"], a["left"], a["right"], a["edges"], a["weight"])
+    return Lesson(int(a["seed"]), graph, a["thing"], a["structure"], a["name"], a["size"]), a["labels"]
