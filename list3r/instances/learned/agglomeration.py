@@ -27,7 +27,7 @@ def agglomerate(
     """
     own = np.arange(count)
     score = np.clip(affinity.astype(np.float64), -STRONGEST, STRONGEST)
-    mass = weight.astype(np.float64)
+    mass: NDArray[np.float64] = weight.astype(np.float64)
     total = score * mass
     a, b = left.astype(np.int64), right.astype(np.int64)
     while len(a):
@@ -44,8 +44,8 @@ def agglomerate(
         apart = a != b
         low, high = np.minimum(a, b)[apart], np.maximum(a, b)[apart]
         code, at = np.unique(low * count + high, return_inverse=True)
-        total = np.bincount(at, total[apart], minlength=len(code))
-        mass = np.bincount(at, mass[apart], minlength=len(code))
+        total = np.bincount(at, total[apart], minlength=len(code)).astype(np.float64)
+        mass = np.bincount(at, mass[apart], minlength=len(code)).astype(np.float64)
         a, b = code // count, code % count
     _, first, number = np.unique(own, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))

@@ -63,7 +63,7 @@ def cut_cloud(
 def make_parts(
     cloud: Cloud, views: Sequence[View], around: Surroundings, pieces: Pieces, told: Judgement, sure: float
 ) -> tuple[NDArray[np.int32], PieceGraph]:
-    """Return the part of each voxel (N,), -1 for none, and the parts' graph with what the first network said of them."""
+    """Return the part of each voxel (N,), -1 for none, and the parts' graph with what the first network said."""
     g = pieces.graph
     own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, sure)
     labels = pieces.joined(own)

@@ -85,7 +85,8 @@ class _Sums:
         self._size, self._count = size.astype(np.float32)[:, None], count
 
     def mean(self, m: Float) -> Float:
-        return self._spread(np.add.reduceat(m[self._order], self._start) / self._size, m)
+        total = np.add.reduceat(m[self._order], self._start)
+        return self._spread(np.asarray(total / self._size, np.float32), m)
 
     def most(self, m: Float) -> Float:
         return self._spread(np.maximum.reduceat(m[self._order], self._start), m)
