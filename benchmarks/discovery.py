@@ -1,7 +1,7 @@
 """What discovery calls one thing, against the truth of worlds that nothing was tuned on.
 
-python benchmarks/discovery.py --seeds 6001-6010 --methods geometric,learned --json benchmarks/results/discovery.json
-python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
+PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --methods geometric,learned --json benchmarks/results/discovery.json
+PYTHONPATH=. python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
 
 Worlds come from `training/worlds` with families, textures and a sensor that training never shows; the house is one that
 others furnished (MIT-0), given by its folder. Each walk is one chunk with poses that drift by some millimetres. A thing
