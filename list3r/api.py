@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.registry import export as export_memory
 from list3r.exporters.tables import Table, Value, records_of
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, naming_extras
 from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance.as_of import store_at
 from list3r.memory.maintenance.editing import MemoryEdits
@@ -54,7 +54,7 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
     @functools.wraps(method)
     def guarded(self: SceneMemory, /, *args: P.args, **kwargs: P.kwargs) -> R:
         # Of what another process writes meanwhile an answer must see one state; a writer has no other beside it.
-        with self._lock, nullcontext() if self.store.writable else self.store.snapshot():
+        with naming_extras(), self._lock, nullcontext() if self.store.writable else self.store.snapshot():
             return method(self, *args, **kwargs)
 
     return guarded
@@ -76,6 +76,7 @@ def open(path: str | Path, *, writable: bool = False, at: int | None = None) -> 
         return SceneMemory(store_at(store, at))
 
 
+@naming_extras()
 def build(
     source: str | Path,
     memory: str | Path,
@@ -101,6 +102,7 @@ def build(
     return open(memory)
 
 
+@naming_extras()
 def update(
     memory: str | Path,
     source: str | Path,

@@ -5,11 +5,15 @@ set -euo pipefail
 source="${1:-}"
 [ -z "$source" ] || { shift; [ ! -e "$source" ] || source="$(realpath "$source")"; }
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
-make_environment ""
+make_environment all
 out="${LIST3R_OUT:-out}"
 
+use_it() { echo; echo "To use the program in this shell: source $venv/bin/activate"; }
+
 if [ -z "$source" ]; then
-    exec list3r demo --out "$out/demo"
+    list3r demo --out "$out/demo"
+    use_it
+    exit 0
 fi
 
 mkdir -p "$out"
@@ -27,3 +31,4 @@ for format in json usd plan glb ply tum; do
 done
 echo
 echo "The picture to look at: ${memory%.l3r}.png"
+use_it

@@ -1,5 +1,5 @@
 # Sourced by the other scripts: makes .venv with what they need and puts it first on PATH.
-# Called with the extras to install, such as "" or "dev". A second call starts in well under a second.
+# Called with the extras to install, such as "all" or "dev". A second call starts in well under a second.
 make_environment() {
     extras="$1"
     root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"

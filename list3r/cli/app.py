@@ -26,7 +26,7 @@ from list3r.cli.models import commands as model_commands
 from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
 from list3r.cli.serve import mcp as mcp_commands
-from list3r.memory.errors import List3rError
+from list3r.memory.errors import List3rError, naming_extras
 
 app = typer.Typer(
     name="list3r",
@@ -87,7 +87,8 @@ def run(arguments: list[str]) -> int:
     """Run one command; its exit status."""
     command = typer.main.get_command(app)
     try:
-        status = command.main(arguments, prog_name="list3r", standalone_mode=False)
+        with naming_extras():
+            status = command.main(arguments, prog_name="list3r", standalone_mode=False)
         sys.stdout.flush()
         if status == _INTERRUPTED:
             raise KeyboardInterrupt

@@ -1,5 +1,10 @@
 """The errors a user can meet. Every message names the thing that is wrong, its value, and how to put it right."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class List3rError(Exception):
     """Base of every error that is the user's to mend; the command line prints it in one line and exits with 2."""
@@ -41,5 +46,44 @@ class SpaceMismatchError(List3rError):
     """Vectors of two different embedding spaces in one comparison."""
 
 
+class MissingPackageError(List3rError):
+    """A package that only some installs have."""
+
+
 class ExportError(List3rError):
     """An export that cannot be written."""
+
+
+EXTRA_OF_PACKAGE = {
+    "cv2": "build",
+    "av": "build",
+    "PIL": "build",
+    "tqdm": "build",
+    "threadpoolctl": "build",
+    "torch": "colour",
+    "pycolmap": "colour",
+    "pxr": "export",
+    "trimesh": "export",
+    "matplotlib": "export",
+    "ncnn": "detector",
+    "lzfse": "record3d",
+    "open3d": "open3d",
+    "mcp": "mcp",
+    "transformers": "models",
+    "huggingface_hub": "models",
+    "safetensors": "models",
+}
+"""Modules that a smaller install lacks, and the extra of this package that brings each."""
+
+
+@contextmanager
+def naming_extras() -> Iterator[None]:
+    """Turn a missing package of an extra into `MissingPackageError`, which names what to install."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRA_OF_PACKAGE:
+            raise
+        install = f"pip install 'list3r[{EXTRA_OF_PACKAGE[module]}]'"
+        raise MissingPackageError(f"this takes {module}, which is not installed: {install}") from None
