@@ -2,4 +2,5 @@
 
 from list3r.cli import main
 
-main()
+if __name__ == "__main__":
+    main()
