@@ -18,7 +18,7 @@ import numpy as np
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.change.places import Places
-from list3r.memory.change.records import Change, Changes, ChangeSettings
+from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
 from list3r.memory.geometry import Sim3
 from list3r.memory.merging.edges import Key, PairScores
 from list3r.memory.overlap.summaries import ChunkSummary
@@ -26,7 +26,7 @@ from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChangeEvent, ChunkRow
 from list3r.memory.store.store import Store
 
-__all__ = ["Change", "ChangeSettings", "Changes", "across_sessions", "as_events", "find_changes"]
+__all__ = ["Change", "ChangeSettings", "Changes", "OverlapGroups", "across_sessions", "as_events", "find_changes"]
 
 _LIGHTNESS = np.array([0.5, 1.0, 1.0])
 
@@ -62,24 +62,18 @@ def across_sessions(
 
 def find_changes(
     store: Store,
-    groups: Sequence[Sequence[Key]],
-    shown: Sequence[bool],
-    fixed: frozenset[Key],
+    found: OverlapGroups,
     chunks: Sequence[ChunkRow],
     summaries: Mapping[int, ChunkSummary],
     settings: ChangeSettings,
 ) -> Changes:
-    """Go through the sessions in order and say what each has changed.
-
-    `groups` are the things by overlap, `shown` those that count, `fixed` the first members of those that were seen
-    moving and have a matching of their own. Nothing is done for a memory of one session.
-    """
-    plain = [list(g) for g in groups]
+    """Go through the sessions in order and find what each has changed; nothing in a memory of one session."""
+    groups = [list(g) for g in found.groups]
     sessions = sorted({c.session_id for c in chunks})
     if len(sessions) < 2:
-        return Changes(plain, {}, {}, (), [])
-    places = Places(store, plain, chunks, summaries, settings)
-    matching = ChangeMatching(places, shown, fixed, store.constraints(), settings)
+        return Changes(groups, {}, {}, (), [])
+    places = Places(store, groups, chunks, summaries, settings)
+    matching = ChangeMatching(places, found, store.constraints(), settings)
     for session in sessions[1:]:
         matching.match(session)
     return matching.result()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from list3r.memory.change.places import Places, difference
-from list3r.memory.change.records import Change, Changes, ChangeSettings
+from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
 from list3r.memory.constraints import Constraints
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
@@ -44,20 +44,15 @@ class ChangeMatching:
     """Tells what each session has changed; the result stands when all are told, in order."""
 
     def __init__(
-        self,
-        places: Places,
-        shown: Sequence[bool],
-        fixed: frozenset[Key],
-        constraints: Constraints,
-        settings: ChangeSettings,
+        self, places: Places, found: OverlapGroups, constraints: Constraints, settings: ChangeSettings
     ) -> None:
         self._p, self._s, self._constraints = places, settings, constraints
-        groups = places.groups
         self._movable = [
-            g[0] not in fixed and places.flagged(n) < settings.most_structure for n, g in enumerate(groups)
+            g[0] not in found.moving and places.flagged(n) < settings.most_structure
+            for n, g in enumerate(places.groups)
         ]
-        self._counts = [bool(show) and loose for show, loose in zip(shown, self._movable, strict=True)]
-        self._thing = {n: _PlacedInstance([n], n) for n in range(len(groups))}
+        self._counts = [bool(show) and loose for show, loose in zip(found.shown, self._movable, strict=True)]
+        self._thing = {n: _PlacedInstance([n], n) for n in range(len(places.groups))}
         self._instead: set[int] = set()
         """New things that stand where others stood."""
         self._events: list[tuple[int, Change]] = []
@@ -113,16 +108,24 @@ class ChangeMatching:
             if seen:
                 self._seen(thing, seen, session)
             elif thing.state != "removed":
-                thing.state = "unseen"
-                if self._movable[thing.now] and p.frames(thing.now, session) >= self._s.least_frames:
-                    found = p.look_after(thing.now, session)
-                    other = self._displaced_by(thing.now, fresh, session)
-                    if found.verdict == "gone" or other is not None or self._taken(thing.now, found, fresh, session):
-                        gone.append((thing, found))
-                        self._instead.update([] if other is None else [other])
-                    elif found.verdict == "there" and self._counts[thing.now]:
-                        self._still_there(thing, session, found)
+                found = self._look_for(thing, fresh, session)
+                gone += [] if found is None else [(thing, found)]
         return gone
+
+    def _look_for(self, thing: _PlacedInstance, fresh: Sequence[int], session: int) -> Look | None:
+        """What frames tell about the place of a thing that was not found again, if it is gone from there."""
+        p = self._p
+        thing.state = "unseen"
+        if not self._movable[thing.now] or p.frames(thing.now, session) < self._s.least_frames:
+            return None
+        found = p.look_after(thing.now, session)
+        other = self._displaced_by(thing.now, fresh, session)
+        if found.verdict == "gone" or other is not None or self._taken(thing.now, found, fresh, session):
+            self._instead.update([] if other is None else [other])
+            return found
+        if found.verdict == "there" and self._counts[thing.now]:
+            self._still_there(thing, session, found)
+        return None
 
     def _taken(self, n: int, found: Look, fresh: Sequence[int], session: int) -> bool:
         """Whether something new stands where a thing was: what is not seen through of it lies at that."""
@@ -171,19 +174,27 @@ class ChangeMatching:
             frames = p.frames_in(place, session)
             reason = f"its surface was found at its place in {frames} frames"
             sure = frames / (frames + 4.0)
-            self._record(thing, session, kind, before, after, p.evidence(place, session), sure, reason)
+            self._record(
+                thing,
+                Change(self._first(thing), session, kind, before, after, p.evidence(place, session), sure, reason),
+            )
 
     def _still_there(self, thing: _PlacedInstance, session: int, found: Look) -> None:
         thing.state = "present"
         box = self._p.box(thing.now, session, before=True, stayed=True)
         reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
-        self._record(thing, session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason)
+        self._record(
+            thing,
+            Change(self._first(thing), session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason),
+        )
 
     def _remove(self, thing: _PlacedInstance, session: int, found: Look) -> None:
         thing.state = "removed"
         box = self._p.box(thing.now, session, before=True)
         reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
-        self._record(thing, session, "removed", box, None, found.frames, _sure(found), reason)
+        self._record(
+            thing, Change(self._first(thing), session, "removed", box, None, found.frames, _sure(found), reason)
+        )
 
     def _add(self, place: int, session: int, found: Look) -> None:
         thing = self._thing[place]
@@ -193,7 +204,10 @@ class ChangeMatching:
         known = found.verdict == "gone"
         reason = seen if known else "it stands where something else stood that is gone"
         sure = _sure(found) if known else 0.5
-        self._record(thing, session, "added", None, box, self._p.evidence(place, session), sure, reason)
+        self._record(
+            thing,
+            Change(self._first(thing), session, "added", None, box, self._p.evidence(place, session), sure, reason),
+        )
 
     def _move(self, move: _Move, session: int, found: Look) -> None:
         p, thing, place = self._p, move.thing, move.place
@@ -204,24 +218,18 @@ class ChangeMatching:
         scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
         self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
         sure = _sure(found) * move.chance
-        self._record(thing, session, "moved", old, new, p.evidence(place, session), sure, reason)
+        self._record(
+            thing, Change(self._first(thing), session, "moved", old, new, p.evidence(place, session), sure, reason)
+        )
         thing.places.append(place)
         thing.now, thing.state = place, "moved"
         del self._thing[place]
 
-    def _record(
-        self,
-        thing: _PlacedInstance,
-        session: int,
-        kind: str,
-        before: OrientedBox | None,
-        after: OrientedBox | None,
-        frames: tuple[tuple[int, int], ...],
-        confidence: float,
-        reason: str,
-    ) -> None:
-        first = self._p.groups[thing.places[0]][0]
-        change = Change(first, session, kind, before, after, frames[:8], round(confidence, 3), reason)
+    def _first(self, thing: _PlacedInstance) -> Key:
+        return self._p.groups[thing.places[0]][0]
+
+    def _record(self, thing: _PlacedInstance, change: Change) -> None:
+        change = replace(change, frames=change.frames[:8], confidence=round(change.confidence, 3))
         self._events.append((thing.places[0], change))
 
     def _moves(self, gone: Sequence[tuple[_PlacedInstance, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
@@ -264,11 +272,8 @@ class ChangeMatching:
                 current[keys[0]] = tuple(self._p.groups[thing.now])
             if thing.state != "present":
                 states[keys[0]] = thing.state
-        events = tuple(Change(names[n], *(getattr(c, f) for f in _FIELDS)) for n, c in self._events if n in names)
+        events = tuple(replace(c, first=names[n]) for n, c in self._events if n in names)
         return Changes(sorted(groups), current, states, events, self._decisions)
-
-
-_FIELDS = ("session_id", "kind", "from_box", "to_box", "frames", "confidence", "reason")
 
 
 def _sure(found: Look) -> float:

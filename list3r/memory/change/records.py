@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from list3r.memory.geometry import OrientedBox
@@ -70,6 +71,17 @@ class ChangeSettings:
     points: int = 200
     """Surface points of a thing that frames are asked about."""
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
+
+
+@dataclass(frozen=True)
+class OverlapGroups:
+    """Instances by overlap alone, before it is asked which of them moved between sessions."""
+
+    groups: Sequence[Sequence[Key]]
+    shown: Sequence[bool]
+    """Which of them count."""
+    moving: frozenset[Key] = frozenset()
+    """First members of those that were seen moving, of which their tracks tell where they are."""
 
 
 @dataclass(frozen=True)

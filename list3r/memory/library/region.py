@@ -20,7 +20,7 @@ from list3r.memory.merging.moving import PlacedChunks, Tracks, without_moving
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, pair_scores
 from list3r.memory.overlap.summaries import ChunkSummary, Summaries
-from list3r.memory.overlap.voxels import ChunkShapes, Ints
+from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
@@ -156,7 +156,7 @@ class Region:
 
     def _score(self, u: int, v: int) -> PairScores:
         S_u_v = self.rows[u].S_graph_chunk.inverse() @ self.rows[v].S_graph_chunk if u != v else Sim3.identity()
-        return pair_scores(self.shapes(u), self.shapes(v), S_u_v)
+        return pair_scores(self.shapes(u), self.shapes(v), S_u_v, self.store.derived.of(GrownCells))
 
     def pairs_of(self, chunk_ids: Iterable[int]) -> dict[tuple[int, int], PairScores]:
         """Return the scores of all pairs of which one is among these chunks, in order."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from list3r.memory.change.detection import as_events, find_changes
+from list3r.memory.change.detection import OverlapGroups, as_events, find_changes
 from list3r.memory.change.ledger import ChangeLedger, Group
 from list3r.memory.change.records import Changes
 from list3r.memory.geometry import Array
@@ -49,12 +49,11 @@ class SessionChanges:
         places, decisions = self._g.partition(seeds)
         self._g.adopt(places)
         weighed = self._weighing.weigh_only(places)
+        moving = frozenset(g[0] for g in places if self._g.mover(g) is not None)
         names = chunks_of(places) | {min(k for k, c in rows.items() if c.component == region.world.first)}
         self._found = find_changes(
             self._store,
-            places,
-            [weighed.shown[g] for g in places],
-            frozenset(g[0] for g in places if self._g.mover(g) is not None),
+            OverlapGroups(places, [weighed.shown[g] for g in places], moving),
             [region.settled_chunk(k) for k in sorted(names)],
             SomeSummaries(region.summaries, names, region.world.unit),
             region.settings.changes,

@@ -134,16 +134,16 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
     """
     with store.transaction():
         edits = store.edits()
-        holding = standing(edits)
+        in_force = standing(edits)
         if entry is None:
-            last = [e.entry for e in holding if e.kind != "undo"]
+            last = [e.entry for e in in_force if e.kind != "undo"]
             if not last:
                 raise OptionError(f"{store.path} has no edit to undo; give the ENTRY of a decision of the merge log")
             entry = last[-1]
         chosen = next((e for e in edits if e.entry == entry), None)
         if chosen is None:
             return _undo_decision(store, entry, author)
-        if chosen not in holding:
+        if chosen not in in_force:
             raise OptionError(f"entry {entry} is undone already; undo the undo to bring it back")
         touched = sorted({k for _, _, keys in chosen.before for k in keys})
         edit = replace(_edit("undo", (), _owners(store, touched), author), target=entry)

@@ -25,8 +25,8 @@ def merge_log(store: Store, instance_id: int | None = None) -> list[LogEntry]:
 def states(store: Store) -> dict[int, str]:
     """Of the entries that are edits: `stands` or `undone`."""
     edits = store.edits()
-    holding = {e.entry for e in standing(edits)}
-    return {e.entry: "stands" if e.entry in holding else "undone" for e in edits}
+    in_force = {e.entry for e in standing(edits)}
+    return {e.entry: "stands" if e.entry in in_force else "undone" for e in edits}
 
 
 def _becomes(store: Store, old: int, current: int) -> bool:

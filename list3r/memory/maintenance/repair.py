@@ -93,9 +93,7 @@ def _repair(path: Path, target: Path) -> RepairReport:
         _copy(path, copy)
         damage = _damage(copy)
         if not damage and target == path:
-            if Path(f"{path}-wal").exists():
-                with contextlib.closing(connected(path, "rw")) as database:
-                    fold_in(database, 2000)
+            _fold_in_log(path)
             return _report(path, path, (), _Lost(), rebuilt=False)
         lost = _Lost()
         with contextlib.closing(_connect(path, copy, lost)) as damaged, Store.create(made) as store:
@@ -109,6 +107,13 @@ def _repair(path: Path, target: Path) -> RepairReport:
         original = path if target != path else _put_aside(path)
         made.rename(target)
     return _report(target, original, tuple(damage), lost, rebuilt=rebuilt)
+
+
+def _fold_in_log(path: Path) -> None:
+    """Write the log beside a sound memory into it."""
+    if Path(f"{path}-wal").exists():
+        with contextlib.closing(connected(path, "rw")) as database:
+            fold_in(database, 2000)
 
 
 def _check_target(path: Path, target: Path) -> None:

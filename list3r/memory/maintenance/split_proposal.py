@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
@@ -41,20 +42,18 @@ def _distances(store: Store, keys: Sequence[Key]) -> Array:
     feature = np.array([shapes[k].feature[a] for (k, _), a in zip(keys, at, strict=True)], float)
     place = {(k, a): n for n, ((k, _), a) in enumerate(zip(keys, at, strict=True))}
     cover = np.zeros((len(keys), len(keys)))
-    for u in shapes:
-        for v in (v for v in shapes if v >= u):
-            p = pair_scores(shapes[u], shapes[v], placed[u].inverse() @ placed[v])
-            for i, j, share in zip(p.i.tolist(), p.j.tolist(), np.maximum(p.i_on_j, p.j_on_i), strict=True):
-                if (u, i) in place and (v, j) in place:
-                    cover[place[u, i], place[v, j]] = cover[place[v, j], place[u, i]] = share
+    for u, v in combinations_with_replacement(shapes, 2):
+        p = pair_scores(shapes[u], shapes[v], placed[u].inverse() @ placed[v])
+        for i, j, share in zip(p.i.tolist(), p.j.tolist(), np.maximum(p.i_on_j, p.j_on_i), strict=True):
+            if (u, i) in place and (v, j) in place:
+                cover[place[u, i], place[v, j]] = cover[place[v, j], place[u, i]] = share
     larger = np.maximum(np.maximum(size[:, None], size[None]), 1e-9)
     offset = np.linalg.norm(center[:, None] - center[None], axis=2) / larger
     unlike = 0.5 * (1.0 - np.clip(feature @ feature.T, -1.0, 1.0))
     out = np.asarray((1.0 - cover) + np.minimum(offset, 1.0) + unlike)
-    for n, (k, a) in enumerate(keys):
-        for m, (other, b) in enumerate(keys):
-            links = summaries[k].cannot_link.tolist() if k == other else []
-            if [a, b] in links or [b, a] in links:
-                out[n, m] = _SEEN_APART
+    number = {key: n for n, key in enumerate(keys)}
+    apart = [((k, a), (k, b)) for k in shapes for a, b in summaries[k].cannot_link.tolist()]
+    for x, y in ((number[x], number[y]) for x, y in apart if x in number and y in number):
+        out[x, y] = out[y, x] = _SEEN_APART
     np.fill_diagonal(out, 0.0)
     return out

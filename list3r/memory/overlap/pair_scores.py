@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Array, Sim3
-from list3r.memory.overlap.voxels import ChunkShapes, Ints, coverage
+from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints, coverage
 
 Key = tuple[int, int]
 """(chunk id, local id)."""
@@ -34,13 +34,14 @@ class PairScores:
     """Mean IoU of their boxes in those frames. Shape (E,)."""
 
 
-def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3) -> PairScores:
+def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3, grown: GrownCells | None = None) -> PairScores:
     """Compare all local instances of two chunks; pairs whose surfaces nowhere meet are left out.
 
-    Pass the same chunk twice, with the identity, for the pairs within a chunk (i < j).
+    Pass the same chunk twice, with the identity, for the pairs within a chunk (i < j); and the `grown` cells of chunks
+    that are compared often.
     """
-    i_on_j = coverage(u, v, S_u_v.inverse())
-    j_on_i = coverage(v, u, S_u_v).T
+    i_on_j = coverage(u, v, S_u_v.inverse(), grown)
+    j_on_i = coverage(v, u, S_u_v, grown).T
     meet = (i_on_j > 0) | (j_on_i > 0)
     if u.chunk_id == v.chunk_id:
         meet = np.triu(meet, 1)
@@ -51,11 +52,11 @@ def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3) -> PairScores:
 
 def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> dict[tuple[int, int], PairScores]:
     """The scores of all pairs of chunks, by chunk ids (u <= v)."""
-    out = {}
+    out, grown = {}, GrownCells()
     for n, u in enumerate(chunks):
         for v in chunks[n:]:
             S_u_v = S_world_chunk[u.chunk_id].inverse() @ S_world_chunk[v.chunk_id]
-            out[(u.chunk_id, v.chunk_id)] = pair_scores(u, v, S_u_v)
+            out[(u.chunk_id, v.chunk_id)] = pair_scores(u, v, S_u_v, grown)
     return out
 
 

@@ -8,7 +8,6 @@ what is small or densely sampled, coarser (by powers of two) where the support p
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import lab_from_rgb
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import FrameSamples
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.tables.local_instances import LocalNode
 
 Ints = NDArray[np.int64]
@@ -212,7 +212,7 @@ def _sampled(samples: FrameSamples, local_id: Sequence[int]) -> tuple[Ints, NDAr
     return np.asarray(keys[order], np.int64), owner[order]
 
 
-def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) -> Array:
+def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, grown: GrownCells | None = None) -> Array:
     """Share of each source instance's points that lie on each target instance. Shape (N_source, N_target).
 
     On means within the tolerance of the target's support and, where the target is flat, of its plane.
@@ -220,7 +220,7 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) ->
     shape = (len(source.local_id), len(target.local_id))
     if len(source.points) == 0 or len(target.occupied) == 0:
         return np.zeros(shape)
-    cells, cell_owner = _grown(target)
+    cells, cell_owner = (GrownCells() if grown is None else grown).of(target)
     p = S_target_source.apply(source.points)
     hits = np.zeros(shape[0] * shape[1])
     for level in np.unique(target.level):
@@ -239,27 +239,38 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3) ->
 
 
 _KEPT_BYTES = 16 << 20
-_known: OrderedDict[int, tuple[ChunkShapes, Ints, NDArray[np.int32]]] = OrderedDict()
-"""The grown cells of the chunks compared last, as many as there is room for: they take more memory than all else of a
-chunk."""
 
 
-def _grown(shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
-    """Keys of the cells within the tolerance of each instance, ascending, and their instances. Shape (G,) each."""
-    found = _known.get(id(shapes))
-    if found is None or found[0] is not shapes:
-        start = np.searchsorted(shapes.occupied_owner, np.arange(len(shapes.local_id) + 1))
-        parts = [_distinct((shapes.occupied[i:j, None] + _REACH).ravel()) for i, j in pairwise(start)]
-        keys = _stack(parts, np.int64)
-        owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
-        order = np.argsort(keys, kind="stable")
-        found = _known[id(shapes)] = (shapes, keys[order], owner[order])
-        held = sum(k.nbytes + n.nbytes for _, k, n in _known.values())
-        while held > _KEPT_BYTES and len(_known) > 1:
-            _, k, n = _known.popitem(last=False)[1]
-            held -= k.nbytes + n.nbytes
-    _known.move_to_end(id(shapes))
-    return found[1], found[2]
+@dataclass(frozen=True)
+class _Grown:
+    """The cells within the tolerance of each instance of a chunk."""
+
+    shapes: ChunkShapes
+    keys: Ints
+    """Ascending. Shape (G,)."""
+    owner: NDArray[np.int32]
+    """Instance of each. Shape (G,)."""
+
+
+class GrownCells(LruCache[int, _Grown]):
+    """Grown cells of the chunks that were compared last: they take more memory than all else of a chunk."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, lambda grown: grown.keys.nbytes + grown.owner.nbytes)
+
+    def of(self, shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
+        """Return the keys of the cells within the tolerance of each instance, and their instances. Shape (G,) each."""
+        found = self.get(id(shapes)) or self.put(id(shapes), _grown(shapes))
+        return found.keys, found.owner
+
+
+def _grown(shapes: ChunkShapes) -> _Grown:
+    start = np.searchsorted(shapes.occupied_owner, np.arange(len(shapes.local_id) + 1))
+    parts = [_distinct((shapes.occupied[i:j, None] + _REACH).ravel()) for i, j in pairwise(start)]
+    keys = _stack(parts, np.int64)
+    owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+    order = np.argsort(keys, kind="stable")
+    return _Grown(shapes, keys[order], owner[order])
 
 
 def _distinct(keys: Ints) -> Ints:

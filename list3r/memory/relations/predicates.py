@@ -22,7 +22,7 @@ import numpy as np
 
 from list3r.memory.records import Relation
 from list3r.memory.relations.instance_geometry import InstanceGeometry, neighbours_of
-from list3r.memory.relations.scene import PairMeasures, RelationScene, RelationSettings, certainty, wall_touched
+from list3r.memory.relations.scene import Found, PairMeasures, RelationScene, RelationSettings, certainty, wall_touched
 from list3r.memory.relations.support import containments, on_hidden_feet, supports
 
 INVERSE = {
@@ -58,27 +58,27 @@ def relations(
     instances = sorted(instances, key=lambda b: b.id)
     scene = RelationScene(instances, unit, s, measured or PairMeasures(), upright=gravity_known)
     out: list[Relation] = []
-    holding: set[tuple[int, int]] = set()
+    support: set[tuple[int, int]] = set()
     if gravity_known:
         inside = containments(scene)
         supported = supports(scene, {a for a, _, _, _ in inside})
         supported += on_hidden_feet(scene, {a for a, _, _, _ in (*inside, *supported)})
-        for predicate, found in (("in", inside), ("on", supported)):
-            for a, b, confidence, margin in found:
-                holding |= {(a, b), (b, a)}
-                if instances[b].structure == "floor":
-                    scene.foot[a] = min(scene.foot[a], float(np.median(instances[b].points[:, 2])))
-                    scene.covering[a] = scene.high[a, 2] - scene.low[a, 2] < s.covering_m * unit
-                out += _both(instances, a, predicate, b, confidence, margin)
-        out += _overhead(scene, holding)
+        for predicate, found in [("in", f) for f in inside] + [("on", f) for f in supported]:
+            a, b, _, _ = found
+            support |= {(a, b), (b, a)}
+            if instances[b].structure == "floor":
+                scene.foot[a] = min(scene.foot[a], float(np.median(instances[b].points[:, 2])))
+                scene.covering[a] = scene.high[a, 2] - scene.low[a, 2] < s.covering_m * unit
+            out += _both(instances, predicate, found)
+        out += _overhead(scene, support)
         out += _attached(scene, {a for a, _, _, _ in (*inside, *supported)})
-    out += _beside(scene, holding, gravity_known)
+    out += _beside(scene, support, gravity_known)
     return sorted(out, key=lambda r: (r.subject, r.predicate, r.object))
 
 
-def _both(
-    instances: Sequence[InstanceGeometry], a: int, predicate: str, b: int, confidence: float, margin: float
-) -> list[Relation]:
+def _both(instances: Sequence[InstanceGeometry], predicate: str, found: Found) -> list[Relation]:
+    """A relation and its inverse."""
+    a, b, confidence, margin = found
     x, y = instances[a].id, instances[b].id
     c, m = round(min(max(confidence, 0.0), 1.0), 4), round(margin, 5)
     return [Relation(x, predicate, y, c, m), Relation(y, INVERSE[predicate], x, c, m)]
@@ -87,7 +87,7 @@ def _both(
 # ---------------------------------------------------------------------------------------------- above, below, under
 
 
-def _overhead(scene: RelationScene, holding: set[tuple[int, int]]) -> list[Relation]:
+def _overhead(scene: RelationScene, support: set[tuple[int, int]]) -> list[Relation]:
     """above and below for things apart in height, under for what stands beneath a surface of another."""
     s, unit = scene.s, scene.unit
     out: list[Relation] = []
@@ -97,7 +97,7 @@ def _overhead(scene: RelationScene, holding: set[tuple[int, int]]) -> list[Relat
     pairs &= (low[:, None, 2] - high[None, :, 2] <= s.above_m * unit) & scene.thing[:, None] & scene.thing[None]
     noise = s.noise_m * unit
     for a, b in np.argwhere(pairs).tolist():
-        found = None if (a, b) in holding else scene.measure("over", a, b, _over)
+        found = None if (a, b) in support else scene.measure("over", a, b, _over)
         if found is None:
             continue
         share, covered, gap = found
@@ -108,7 +108,7 @@ def _overhead(scene: RelationScene, holding: set[tuple[int, int]]) -> list[Relat
             upper, lower = scene.instances[a].id, scene.instances[b].id
             out.append(Relation(lower, "under", upper, round(sure, 4), round(gap, 5)))
         elif share >= s.overhead and low[a, 2] >= low[b, 2]:
-            out += _both(scene.instances, a, "above", b, sure, gap)
+            out += _both(scene.instances, "above", (a, b, sure, gap))
     return out
 
 
@@ -134,18 +134,18 @@ def _attached(scene: RelationScene, held: set[int]) -> list[Relation]:
     """Things that hang on a wall: touching it, standing on nothing."""
     limit = scene.s.attached_m * scene.unit
     out = []
-    for a, body in enumerate(scene.instances):
-        if a in held or body.structure is not None:
+    for a, instance in enumerate(scene.instances):
+        if a in held or instance.structure is not None:
             continue
         touched = wall_touched(scene, a)
         if touched is not None:
             gap, b = touched
             c = round(certainty(limit - gap, scene.s.noise_m * scene.unit), 4)
-            out.append(Relation(body.id, "attached_to", scene.instances[b].id, c, round(limit - gap, 5)))
+            out.append(Relation(instance.id, "attached_to", scene.instances[b].id, c, round(limit - gap, 5)))
     return out
 
 
-def _beside(scene: RelationScene, holding: set[tuple[int, int]], gravity_known: bool) -> list[Relation]:
+def _beside(scene: RelationScene, support: set[tuple[int, int]], gravity_known: bool) -> list[Relation]:
     """next_to and near, from the gap between surfaces relative to the sizes of the two."""
     s, unit = scene.s, scene.unit
     noise = s.noise_m * unit
@@ -156,7 +156,7 @@ def _beside(scene: RelationScene, holding: set[tuple[int, int]], gravity_known: 
     pairs = np.triu(scene.thing[:, None] & scene.thing[None] & in_reach, 1)
     out: list[Relation] = []
     for a, b in np.argwhere(pairs).tolist():
-        if (a, b) in holding:
+        if (a, b) in support:
             continue
         gap, near, beside = scene.gap(a, b), float(reach[a, b]), float(close[a, b])
         for predicate, bound in (("near", near), ("next_to", beside)):
@@ -164,7 +164,7 @@ def _beside(scene: RelationScene, holding: set[tuple[int, int]], gravity_known: 
             if confidence < s.sure:
                 break
             if predicate == "near" or not gravity_known or _side_by_side(scene, a, b):
-                out += _both(scene.instances, a, predicate, b, confidence, bound - gap)
+                out += _both(scene.instances, predicate, (a, b, confidence, bound - gap))
     return out
 
 

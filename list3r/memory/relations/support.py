@@ -28,12 +28,12 @@ def supports(scene: RelationScene, taken: set[int]) -> list[Found]:
     """Each thing on at most one other: the one whose surface it touches best."""
     out = []
     holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.instances], dtype=bool)
-    for a, body in enumerate(scene.instances):
-        if a in taken or body.structure is not None:
+    for a, instance in enumerate(scene.instances):
+        if a in taken or instance.structure is not None:
             continue
         best: Held | None = None
         reach = contact_of(scene, a) + 0.05 * scene.unit
-        middle = body.points[:, :2].mean(axis=0)
+        middle = instance.points[:, :2].mean(axis=0)
         aside = np.maximum(scene.low[:, :2] - middle, middle - scene.high[:, :2]).max(axis=1)
         near = holds & (scene.box_gap[a] <= reach) & (scene.low[:, 2] <= scene.low[a, 2] + reach)
         near &= aside <= 0.25 * scene.unit
@@ -56,19 +56,18 @@ def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
     s = scene.s
     out = []
     floors = [n for n, b in enumerate(scene.instances) if b.structure == "floor"]
-    for a, body in enumerate(scene.instances):
-        if a in held or body.structure is not None or wall_touched(scene, a) is not None:
+    for a, instance in enumerate(scene.instances):
+        if a in held or instance.structure is not None or wall_touched(scene, a) is not None:
             continue
-        z = body.points[:, 2]
-        limit = min(s.hidden_feet * body.size, s.hidden_feet_m * scene.unit)
+        z = instance.points[:, 2]
+        middle, limit = instance.box.center[:2], min(s.hidden_feet * instance.size, s.hidden_feet_m * scene.unit)
         gaps = []
         for b in floors:
-            aside = np.maximum(scene.low[b, :2] - body.box.center[:2], body.box.center[:2] - scene.high[b, :2]).max()
+            aside = np.maximum(scene.low[b, :2] - middle, middle - scene.high[b, :2]).max()
             if np.isfinite(scene.box_gap[a, b]) and aside <= 0.25 * scene.unit:
-                near = neighbours_of(body.box.center[None, :2], scene.plan(b).tree, min(12, len(scene.plan(b).points)))[
-                    1
-                ]
-                gaps.append((float(np.quantile(z, 0.01) - np.median(scene.plan(b).points[near[0], 2])), b))
+                plan = scene.plan(b)
+                near = neighbours_of(instance.box.center[None, :2], plan.tree, min(12, len(plan.points)))[1]
+                gaps.append((float(np.quantile(z, 0.01) - np.median(plan.points[near[0], 2])), b))
         gaps += [(gap, b) for gap, b in _beneath(scene, a) if gap < 0.25 * scene.unit]
         if gaps and 0.0 <= min(gaps)[0] < limit:
             gap, b = min(gaps)
@@ -148,10 +147,10 @@ def _steady(subject: InstanceGeometry, around: Array) -> float:
 def containments(scene: RelationScene) -> list[Found]:
     """Each thing in at most one container, the smallest that encloses it."""
     out = []
-    for a, body in enumerate(scene.instances):
-        if body.structure is not None:
+    for a, instance in enumerate(scene.instances):
+        if instance.structure is not None:
             continue
-        volume = float(np.prod(body.box.size))
+        volume = float(np.prod(instance.box.size))
         holders = [
             (float(np.prod(scene.instances[b].box.size)), b)
             for b in np.flatnonzero(scene.thing & (scene.box_gap[a] == 0.0)).tolist()
