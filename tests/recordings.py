@@ -6,7 +6,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -243,3 +243,141 @@ WITH_DEPTH: dict[str, Callable[[Path], Path]] = {
     "scannet": write_scannet,
     "sens": write_sens,
 }
+
+
+def write_bag(root: Path, kind: str = "mcap", *, registered: bool = False, odometry: bool = False) -> Path:
+    """A recording of ROS 1 ("bag") or ROS 2 ("mcap", "db3"): colour, compressed depth, cameras, `/tf`, interleaved.
+
+    The depth camera stands 2 cm beside the colour camera unless depth is registered; the robot carries both.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+    if kind == "bag":
+        text = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+    root.parent.mkdir(parents=True, exist_ok=True)
+    path = root.with_suffix(".bag") if kind == "bag" else root
+    with _bag_writer(path, kind) as writer:
+        put_ = _Put(writer, store, ros1=kind == "bag")
+        for message in _messages(put_, registered=registered, odometry=odometry):
+            put_(*message)
+    return path
+
+
+def _bag_writer(path: Path, kind: str) -> object:
+    if kind == "bag":
+        from rosbags.rosbag1 import Writer as Writer1
+
+        return Writer1(path)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    return Writer(path, version=9, storage_plugin=StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3)
+
+
+class _Put:
+    """Writes messages to topics that it opens as they come."""
+
+    def __init__(self, writer: object, store: object, *, ros1: bool) -> None:
+        self._writer, self.store, self._ros1, self._open = writer, store, ros1, {}
+
+    def __call__(self, topic: str, kind: str, time_s: float, message: object) -> None:
+        if topic not in self._open:
+            self._open[topic] = self._writer.add_connection(topic, kind, typestore=self.store)
+        pack = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
+        self._writer.write(self._open[topic], int(1e9 * time_s), pack(message, kind))
+
+    def make(self, kind: str, **fields: object) -> object:
+        if self._ros1 and kind == "std_msgs/msg/Header":
+            fields["seq"] = 0
+        if self._ros1 and kind == "sensor_msgs/msg/CameraInfo":
+            fields = {name.upper() if name in ("d", "k", "r", "p") else name: value for name, value in fields.items()}
+        return self.store.types[kind](**fields)
+
+    def header(self, time_s: float, frame: str) -> object:
+        stamp = self.make("builtin_interfaces/msg/Time", sec=int(time_s), nanosec=round(1e9 * (time_s % 1)))
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+SIDE_M = 0.02
+"""The depth camera's place to the right of the colour camera."""
+
+
+def _messages(put_: _Put, *, registered: bool, odometry: bool) -> Iterator[tuple[str, str, float, object]]:
+    T_base_color = np.eye(4)
+    T_base_color[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = 0.0 if registered else SIDE_M
+    static = [("base", "color_optical", T_base_color), ("color_optical", "depth_optical", T_color_depth)]
+    yield "/tf_static", "tf2_msgs/msg/TFMessage", 50.0, _tf(put_, 50.0, static)
+    depth_frame = "color_optical" if registered else "depth_optical"
+    size = (HEIGHT, WIDTH) if registered else (DEPTH_HEIGHT, DEPTH_WIDTH)
+    for k, shot in enumerate(shots()):
+        time = 51.0 + 0.1 * k
+        T_world_base = shot.T_world_cam @ np.linalg.inv(T_base_color)
+        if odometry:
+            yield "/odom", "nav_msgs/msg/Odometry", time, _odometry(put_, time, T_world_base)
+        else:
+            yield "/tf", "tf2_msgs/msg/TFMessage", time, _tf(put_, time, [("map", "base", T_world_base)])
+        color = np.ascontiguousarray(shot.color)
+        pixels = put_.make(
+            "sensor_msgs/msg/Image", header=put_.header(time, "color_optical"), height=HEIGHT, width=WIDTH,
+            encoding="rgb8", is_bigendian=0, step=3 * WIDTH, data=color.ravel(),
+        )  # fmt: skip
+        yield "/camera/color/image_raw", "sensor_msgs/msg/Image", time + 0.01, pixels
+        depth = millimetres(plane_depth(shot.T_world_cam @ T_color_depth, K, size))
+        packed = np.frombuffer(bytes(12) + png(depth), np.uint8)
+        small = put_.make(
+            "sensor_msgs/msg/CompressedImage", header=put_.header(time + 0.004, depth_frame),
+            format="16UC1; compressedDepth png", data=packed,
+        )  # fmt: skip
+        yield "/camera/depth/image_raw/compressedDepth", "sensor_msgs/msg/CompressedImage", time + 0.02, small
+        for name, frame, shape in (("color", "color_optical", (HEIGHT, WIDTH)), ("depth", depth_frame, size)):
+            info = _camera_info(put_, time, frame, shape)
+            yield f"/camera/{name}/camera_info", "sensor_msgs/msg/CameraInfo", time + 0.02, info
+
+
+def _tf(put_: _Put, time_s: float, links: list[tuple[str, str, Array]]) -> object:
+    out = []
+    for parent, child, T in links:
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        out.append(
+            put_.make(
+                "geometry_msgs/msg/TransformStamped",
+                header=put_.header(time_s, parent),
+                child_frame_id=child,
+                transform=put_.make(
+                    "geometry_msgs/msg/Transform",
+                    translation=put_.make("geometry_msgs/msg/Vector3", x=T[0, 3], y=T[1, 3], z=T[2, 3]),
+                    rotation=put_.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+                ),
+            )
+        )
+    return put_.make("tf2_msgs/msg/TFMessage", transforms=out)
+
+
+def _odometry(put_: _Put, time_s: float, T: Array) -> object:
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    pose = put_.make(
+        "geometry_msgs/msg/Pose", position=put_.make("geometry_msgs/msg/Point", x=T[0, 3], y=T[1, 3], z=T[2, 3]),
+        orientation=put_.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )  # fmt: skip
+    zero = put_.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    twist = put_.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    unknown = np.zeros(36)
+    return put_.make(
+        "nav_msgs/msg/Odometry", header=put_.header(time_s, "odom"), child_frame_id="base",
+        pose=put_.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=unknown),
+        twist=put_.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
+    )  # fmt: skip
+
+
+def _camera_info(put_: _Put, time_s: float, frame: str, size: tuple[int, int]) -> object:
+    x, y = size[1] / WIDTH, size[0] / HEIGHT
+    k = matrix((K[0] * x, K[1] * y, (K[2] + 0.5) * x - 0.5, (K[3] + 0.5) * y - 0.5))
+    roi = put_.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return put_.make(
+        "sensor_msgs/msg/CameraInfo", header=put_.header(time_s, frame), height=size[0], width=size[1],
+        distortion_model="plumb_bob", d=np.zeros(5), k=k[:3, :3].ravel(), r=np.eye(3).ravel(),
+        p=k[:3, :4].ravel(), binning_x=0, binning_y=0, roi=roi,
+    )  # fmt: skip

@@ -21,6 +21,7 @@ KINDS = (
     "polycam",
     "arkitscenes",
     "scannet",
+    "rosbag",
     "nerfstudio",
     "7scenes",
     "tum",
@@ -30,6 +31,9 @@ KINDS = (
     "video",
 )
 """Kinds of sources; docs/sources.md says what each is made of."""
+
+ROLES = ("color", "depth", "pose")
+"""What topics of a ROS recording can be."""
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
@@ -61,6 +65,8 @@ class SourceOptions:
     """Depth already lies on the colour image's pixels, whatever the layout usually means."""
     depth_scale: float | None = None
     """Stored depth units per metre."""
+    topics: tuple[tuple[str, str], ...] | None = None
+    """Of a ROS recording: (role, topic) with the roles color, depth and pose; what is not said is what fits."""
     fps: float | None = None
     """Frames per second: of a source with a clock so many are handed out, of one without this is the rate."""
     max_depth_m: float | None = None
@@ -75,9 +81,15 @@ class SourceOptions:
     """Longest side of the frames handed out, px; larger pictures are reduced. 0 for as stored; None: 960, 1280 with
     depth. Intrinsics are given for pictures as stored."""
 
+    def topics_by_role(self) -> dict[str, str]:
+        """The topics that were chosen, by role."""
+        return dict(self.topics or ())
+
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise OptionError(f"source kind {self.kind!r} is unknown; choose one of {', '.join(KINDS)}")
+        if unknown := sorted(set(self.topics_by_role()) - set(ROLES)):
+            raise OptionError(f"topics of {', '.join(unknown)}: the roles are {', '.join(ROLES)}")
         if self.every < 1:
             raise OptionError(f"every {self.every}: take every n-th frame with n of at least 1")
         if (self.start or 0) < 0 or (self.stop is not None and self.stop <= (self.start or 0)):
@@ -187,6 +199,14 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
         order = ",".join("q" + letter for letter in quaternion)
         raise OptionError(f"{name} {text!r}: 16 numbers (4x4) or tx,ty,tz,{order} are needed, not {len(v)}")
     return tuple(tuple(float(x) for x in row) for row in check_rigid(matrix, name))
+
+
+def parse_topics(text: str) -> tuple[tuple[str, str], ...]:
+    """`color=/a,depth=/b,pose=/c`, any of them. Raises `OptionError`."""
+    pairs = [tuple(part.strip() for part in word.partition("=")[::2]) for word in text.split(",") if word.strip()]
+    if not pairs or any(not role or not topic for role, topic in pairs):
+        raise OptionError(f"topics {text!r}: like color=/camera/color/image_raw,depth=/camera/depth/image_raw")
+    return tuple((role, topic) for role, topic in pairs)
 
 
 def parse_range(text: str) -> tuple[int | None, int | None]:

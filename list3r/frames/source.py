@@ -18,12 +18,13 @@ from list3r.frames.readers import (
     polycam,
     record3d,
     replica,
+    rosbag,
     scannet,
     seven_scenes,
     stray,
     tum,
 )
-from list3r.memory.errors import SourceError
+from list3r.memory.errors import OptionError, SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
 
@@ -49,8 +50,8 @@ FILES: dict[str, tuple[str, Callable[[Path, SourceOptions], FolderLayout]]] = {
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 _OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 _WANTED = (
-    "give a video file, a recording of Record3D (.r3d), Stray Scanner, Polycam or ScanNet (.sens), a folder in "
-    "ARKitScenes, nerfstudio (transforms.json), COLMAP, 7-Scenes, TUM RGB-D or Replica layout, or of images"
+    "give a video file, a recording of Record3D (.r3d), Stray Scanner, Polycam or ScanNet (.sens), a ROS bag or mcap, "
+    "a folder in ARKitScenes, nerfstudio (transforms.json), COLMAP, 7-Scenes, TUM RGB-D or Replica layout, or of images"
 )
 
 
@@ -66,6 +67,10 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
     try:
         if not root.exists():
             raise SourceError(f"{root} does not exist; {_WANTED}")
+        if options.kind in ("auto", "rosbag") and os.access(root, os.R_OK) and rosbag.is_recording(root):
+            return rosbag.BagSource(root, options)
+        if options.topics:
+            raise OptionError(f"--topics is of ROS recordings, and {root} is none; leave it out")
         return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
         raise SourceError(f"{error.filename or root} may not be read; check its permissions") from None

@@ -67,6 +67,7 @@ EXTRA_OF_PACKAGE = {
     "matplotlib": "export",
     "ncnn": "detector",
     "lzfse": "record3d",
+    "rosbags": "ros",
     "open3d": "open3d",
     "mcp": "mcp",
     "transformers": "models",

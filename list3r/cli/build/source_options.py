@@ -36,6 +36,14 @@ DepthToColor = Annotated[
         help="Depth camera to colour camera: tx,ty,tz,qx,qy,qz,qw in metres, or a 4x4 matrix row by row, or a file.",
     ),
 ]
+Topics = Annotated[
+    str | None,
+    typer.Option(
+        "--topics",
+        metavar="ROLE=TOPIC,...",
+        help="Topics of a ROS recording: color=/a,depth=/b,pose=/c; default: those that fit.",
+    ),
+]
 Registered = Annotated[bool, typer.Option("--registered", help="Depth already lies on the colour image's pixels.")]
 DepthScale = Annotated[
     float | None, typer.Option("--depth-scale", metavar="UNITS", help="Stored depth units per metre.")
@@ -76,6 +84,7 @@ class SourceWords:
     distortion: Distortion = None
     depth_intrinsics: DepthIntrinsics = None
     depth_to_color: DepthToColor = None
+    topics: Topics = None
     registered: Registered = False
     depth_scale: DepthScale = None
     fps: Fps = None
@@ -108,6 +117,7 @@ class SourceWords:
             distortion=words.parse_distortion(self.distortion) if self.distortion else None,
             depth_intrinsics=words.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
             T_color_depth=words.parse_transform(transform, "--depth-to-color") if transform else None,
+            topics=words.parse_topics(self.topics) if self.topics else None,
             registered=self.registered,
             depth_scale=self.depth_scale,
             fps=self.fps,

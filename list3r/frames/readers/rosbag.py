@@ -1,0 +1,326 @@
+"""Recordings of robots: a ROS 1 `.bag` (RealSense's too), a ROS 2 folder, `.mcap` or `.db3`, read by `rosbags`.
+
+The topics of colour, depth and poses are those that fit, or what `--topics color=/a,depth=/b,pose=/c` says. Colour and
+depth are brought together by the times in their headers. Poses come from an odometry or pose topic, or from `/tf`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.folder import fingerprint
+from list3r.frames.layout import FolderLayout, Optics
+from list3r.frames.options import SourceOptions
+from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
+from list3r.frames.registration.rig import build_rig, merge_optics
+from list3r.frames.ros_images import camera_of, is_depth, read_color, read_depth
+from list3r.frames.ros_transforms import TransformTree
+from list3r.frames.selection import select
+from list3r.memory.errors import FrameError, OptionError, SourceError
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+ENDINGS = (".bag", ".mcap", ".db3")
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_TF = "tf2_msgs/msg/TFMessage"
+_INFO = "sensor_msgs/msg/CameraInfo"
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is such a recording, by its name and, of a folder, by its metadata."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() and any(path.glob(f"*{end}") for end in ENDINGS[1:])
+    return path.suffix.lower() in ENDINGS
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The messages of an image topic."""
+
+    topic: str
+    times_s: NDArray[np.float64]
+    """Of their headers, ascending. Shape (N,)."""
+    received_ns: NDArray[np.int64]
+    """When they were recorded, in the same order. Shape (N,)."""
+    frame: str
+    """Name of the camera's frame of reference."""
+    first: Any
+    """The first message."""
+
+
+class BagSource:
+    """A `FrameSource` over one recording; nothing but its index is kept."""
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        """One pass over the recording. Raises `SourceError` for what cannot be read and `OptionError` for topics."""
+        self._path, self._options = path, options
+        wanted = options.topics_by_role()
+        with _opened(path) as reader:
+            found = _Topics(reader, wanted, path)
+            color = found.color()
+            depth = found.depth()
+            tree = found.transforms(color.frame)
+            optics, notes = found.optics(color, depth, tree)
+        self._color, self._depth = color, depth
+        pairs = np.stack([np.arange(len(color.times_s))] * 2, axis=1)
+        if depth is not None:
+            pairs = associate(color.times_s, depth.times_s, MAX_PAIR_GAP_S)
+            if not len(pairs):
+                raise SourceError(f"{path}: no picture of {color.topic} has depth of {depth.topic} within 20 ms")
+        self._pairs = pairs
+        self._times_s = color.times_s[pairs[:, 0]]
+        world = tree.world_of(color.frame)
+        self._poses = tree.poses(color.frame, world, self._times_s) if world else [None] * len(pairs)
+        self._chosen = select(self._times_s, options, path, clock=True, video=False)
+        merged, said = merge_optics(FolderLayout("rosbag", (), optics), options)
+        size = None if depth is None else read_depth(depth.first).shape
+        stored = read_color(color.first).shape[:2]
+        self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
+        posed = sum(T is not None for T in self._poses)
+        notes = [*notes, *said]
+        if posed:
+            notes.append(f"poses of {color.frame} in {world}")
+        elif tree.moving:
+            notes.append(f"poses of {', '.join(sorted(tree.moving))}; no transform leads from there to {color.frame}")
+        self._info = self._describe(tuple(notes), posed > 0)
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was recognised."""
+        return self._info
+
+    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
+        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
+        return self.read_every(start, stop, 1)
+
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but only each `step`-th frame from `start` on."""
+        numbers = [int(self._chosen.starts[k]) for k in range(len(self._chosen))[start:stop:step]]
+        if not numbers:
+            return
+        waiting: dict[int, dict[str, bytes]] = {n: {} for n in numbers}
+        roles = ["color"] if self._depth is None else ["color", "depth"]
+        at = {role: self._wanted(role, numbers) for role in roles}
+        upcoming = iter(numbers)
+        due = next(upcoming)
+        with _opened(self._path) as reader:
+            topics = {self._stream(role).topic: role for role in roles}
+            connections = [c for c in reader.connections if c.topic in topics]
+            first = min(min(stamps) for stamps in at.values())
+            last = max(max(stamps) for stamps in at.values())
+            for connection, received, raw in reader.messages(connections, start=first, stop=last + 1):
+                role = topics[connection.topic]
+                number = at[role].get(received)
+                if number is None:
+                    continue
+                waiting[number][role] = raw
+                kinds = {topics[c.topic]: c.msgtype for c in connections}
+                while len(waiting.get(due, ())) == len(roles):
+                    yield self._frame(reader, due, waiting.pop(due), kinds)
+                    following = next(upcoming, None)
+                    if following is None:
+                        return
+                    due = following
+        for number in [due, *upcoming]:
+            yield BadFrame(number, "its messages are missing from the recording")
+
+    def position(self, index: int) -> int:
+        """Where a frame (Frame.index) is among those handed out."""
+        return self._chosen.position(index)
+
+    def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
+        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
+        numbers = [int(n) for n in self._chosen.starts]
+        return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
+
+    def _stream(self, role: str) -> Stream:
+        stream = self._color if role == "color" else self._depth
+        assert stream is not None
+        return stream
+
+    def _wanted(self, role: str, numbers: list[int]) -> dict[int, int]:
+        """The frame number of each recorded time that is to be read."""
+        column, stream = (0 if role == "color" else 1), self._stream(role)
+        return {int(stream.received_ns[self._pairs[n, column]]): n for n in numbers}
+
+    def _frame(
+        self, reader: AnyReader, number: int, raw: Mapping[str, bytes], kinds: Mapping[str, str]
+    ) -> Frame | BadFrame:
+        try:
+            color = self._rig.color(read_color(reader.deserialize(raw["color"], kinds["color"])))
+            depth = None
+            if "depth" in raw:
+                depth = self._rig.depth(read_depth(reader.deserialize(raw["depth"], kinds["depth"])))
+        except FrameError as error:
+            return BadFrame(number, str(error))
+        return Frame(number, float(self._times_s[number]), color, depth, self._poses[number])
+
+    def _describe(self, notes: tuple[str, ...], has_poses: bool) -> SourceInfo:
+        rig, separate = self._rig, self._rig.registration
+        files = [self._path] if self._path.is_file() else sorted(self._path.iterdir())
+        listing = [(p.name, p.stat().st_size) for p in files]
+        missing = [] if rig.camera else ["the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy"]
+        if self._depth is None:
+            missing.append("there is no depth: build takes colour alone (--reconstruction sfm or a network)")
+        gaps = np.diff(self._times_s)
+        return SourceInfo(
+            kind="rosbag",
+            path=str(self._path),
+            frame_count=len(self._chosen),
+            fps=float(1.0 / np.median(gaps)) if len(gaps) and np.median(gaps) > 0 else 30.0,
+            camera=rig.camera,
+            has_depth=self._depth is not None,
+            has_poses=has_poses,
+            scale_kind="metric" if self._depth is not None else "relative",
+            fingerprint=fingerprint("rosbag", listing, self._options),
+            depth_camera=separate.depth_camera if separate else None,
+            T_color_depth=separate.T_color_depth if separate else None,
+            depth_scale=rig.depth_scale if self._depth is not None else None,
+            notes=notes,
+            missing=tuple(missing),
+            image_size=rig.color_size,
+        )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[AnyReader]:
+    """The recording, open. Raises `SourceError` for one that is cut off, has no index or is of another kind."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise OptionError(f"{path} is a ROS recording, which takes: pip install 'list3r[ros]'") from None
+    known = get_typestore(Stores.ROS2_HUMBLE)
+    try:
+        with AnyReader([path], default_typestore=known) as reader:
+            yield reader
+    except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SourceError(f"{path} cannot be read as a ROS recording ({said}); reindex it, or copy it again") from None
+
+
+class _Topics:
+    """What a recording holds, looked at once."""
+
+    def __init__(self, reader: AnyReader, wanted: Mapping[str, str], path: Path) -> None:
+        self._reader, self._wanted, self._path = reader, wanted, path
+        self._of = {c.topic: c for c in reader.connections}
+        for role, topic in wanted.items():
+            if topic not in self._of:
+                raise OptionError(f"--topics {role}={topic}: {path} has {', '.join(sorted(self._of)) or 'no topics'}")
+        self._streams, self._tree, self._infos, self._units = self._scan()
+
+    def color(self) -> Stream:
+        """The pictures. Raises `SourceError` where none or several would fit."""
+        found = [s for s in self._streams.values() if not is_depth(s.first)]
+        return self._choose("color", found, ("color", "rgb"))
+
+    def depth(self) -> Stream | None:
+        """The depth images, None where there are none."""
+        found = [s for s in self._streams.values() if is_depth(s.first)]
+        return self._choose("depth", found, ("aligned_depth", "depth")) if found else None
+
+    def transforms(self, frame: str) -> TransformTree:
+        """Where things were; a pose of a topic that does not say what it moves is that of the camera's `frame`."""
+        self._tree.rename("", frame)
+        return self._tree
+
+    def optics(self, color: Stream, depth: Stream | None, tree: TransformTree) -> tuple[Optics, list[str]]:
+        """The cameras that CameraInfo states, and what is assumed."""
+        notes = [f"colour of {color.topic}" + (f", depth of {depth.topic}" if depth else "")]
+        intrinsics, lens, size = self._camera(color)
+        if depth is None:
+            return Optics(intrinsics, lens, intrinsics_size=size), notes
+        units = 1.0 if read_depth(depth.first).dtype.kind == "f" else 1.0 / self._units.get(depth.topic, 0.001)
+        if "aligned_depth" in depth.topic or depth.frame == color.frame:
+            return Optics(intrinsics, lens, depth_scale=units, intrinsics_size=size), notes
+        depth_intrinsics, _, depth_size = self._camera(depth)
+        T_color_depth = tree.between(color.frame, depth.frame)
+        if T_color_depth is not None:
+            notes.append("the place of the depth camera is that of /tf_static")
+        return Optics(intrinsics, lens, depth_intrinsics, T_color_depth, units, size, depth_size), notes
+
+    def _camera(self, stream: Stream) -> tuple[Any, tuple[float, ...], tuple[int, int] | None]:
+        base = stream.topic.removesuffix("/compressed").removesuffix("/compressedDepth")
+        parent = base.rsplit("/", 1)[0]
+        names = (f"{parent}/camera_info", f"{parent.rsplit('/', 1)[0]}/info/camera_info", f"{base}/camera_info")
+        info = next((self._infos[n] for n in names if n in self._infos), None)
+        if info is None:
+            same = [i for i in self._infos.values() if i.header.frame_id.lstrip("/") == stream.frame]
+            info = same[0] if same else None
+        if info is None:
+            return None, (), None
+        return camera_of(info, stream.topic, rectified="rect" in base.rsplit("/", 1)[-1])
+
+    def _choose(self, role: str, found: list[Stream], likely: tuple[str, ...]) -> Stream:
+        if role in self._wanted:
+            topic = self._wanted[role]
+            if topic not in self._streams:
+                raise OptionError(f"--topics {role}={topic} is no topic of pictures")
+            return self._streams[topic]
+        for word in (*likely, ""):
+            fitting = [s for s in found if word in s.topic]
+            if len(fitting) == 1 or (fitting and word):
+                return max(fitting, key=lambda s: (len(s.times_s), s.topic))
+        names = ", ".join(s.topic for s in found)
+        said = f"several topics hold pictures ({names})" if found else "no topic holds pictures"
+        raise SourceError(f"{self._path}: {said}; choose by --topics {role}=/TOPIC")
+
+    def _scan(self) -> tuple[dict[str, Stream], TransformTree, dict[str, Any], dict[str, float]]:
+        """One pass: times of pictures, transforms, cameras; of pictures the headers alone are read."""
+        stamps: dict[str, list[tuple[float, int]]] = {}
+        first: dict[str, Any] = {}
+        infos: dict[str, Any] = {}
+        units: dict[str, float] = {}
+        tree = TransformTree()
+        pose_topic = self._wanted.get("pose") or self._only_pose_topic()
+        for connection, received, raw in self._reader.messages():
+            topic, kind = connection.topic, connection.msgtype
+            if kind in _IMAGES:
+                if topic not in first:
+                    first[topic] = self._reader.deserialize(raw, kind)
+                    stamps[topic] = []
+                stamps[topic].append((_stamp_s(raw, ros2=self._reader.is2), received))
+            elif kind == _INFO and topic not in infos:
+                infos[topic] = self._reader.deserialize(raw, kind)
+            elif kind == _TF and pose_topic is None:
+                tree.add(self._reader.deserialize(raw, kind), fixed="static" in topic)
+            elif kind == _TF and "static" in topic:
+                tree.add(self._reader.deserialize(raw, kind), fixed=True)
+            elif topic == pose_topic:
+                tree.add_pose(self._reader.deserialize(raw, kind), "")
+            elif topic.endswith("/option/Depth_Units/value"):
+                sensor = topic.split("/option/")[0]
+                stated: Any = self._reader.deserialize(raw, kind)
+                units[sensor] = float(stated.data)
+        streams = {}
+        for topic, rows in stamps.items():
+            rows.sort()
+            frame = first[topic].header.frame_id.lstrip("/")
+            times, received_ns = np.array([t for t, _ in rows]), np.array([r for _, r in rows], np.int64)
+            streams[topic] = Stream(topic, times, received_ns, frame, first[topic])
+        by_topic = {t: u for t in streams for sensor, u in units.items() if t.startswith(sensor) and u > 0}
+        return streams, tree, infos, by_topic
+
+    def _only_pose_topic(self) -> str | None:
+        """The only topic of poses where `/tf` does not move anything."""
+        if any(c.msgtype == _TF and "static" not in c.topic for c in self._of.values()):
+            return None
+        topics = sorted({c.topic for c in self._of.values() if c.msgtype in _POSES})
+        return topics[0] if len(topics) == 1 else None
+
+
+def _stamp_s(raw: bytes, *, ros2: bool) -> float:
+    """Seconds of a message's header, without decoding the rest: after CDR's four bytes, or ROS 1's sequence number."""
+    sec, nanosec = np.frombuffer(raw, "<u4", 2, 4)
+    return float(sec) + 1e-9 * float(nanosec)

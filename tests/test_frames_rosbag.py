@@ -1,0 +1,75 @@
+"""Recordings of robots: topics by what fits, times by headers, cameras and places by the recording's own transforms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.frames.base import Frame
+from list3r.frames.options import SourceOptions
+from list3r.frames.source import open_source
+from list3r.memory.errors import List3rError, OptionError
+from tests.recordings import COUNT, off_plane, shots, write_bag
+from tests.test_frames_recordings import frames_of, world_points
+
+KINDS = ("bag", "mcap", "db3")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("registered", [False, True])
+def test_depth_through_every_pose_lies_on_the_wall(kind: str, registered: bool, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", kind, registered=registered)
+    info = open_source(path).info
+    assert info.kind == "rosbag" and info.has_depth and info.has_poses and info.frame_count == COUNT
+    assert (info.depth_camera is None) == registered
+    for frame, shot in zip(frames_of(path), shots(), strict=True):
+        off = off_plane(world_points(frame, info.camera))
+        assert np.median(off) < 0.002 and np.quantile(off, 0.95) < 0.012
+        assert np.allclose(frame.T_source_cam, shot.T_world_cam, atol=1e-5)
+        assert (frame.color == shot.color).all()
+
+
+def test_poses_of_odometry_are_carried_to_the_camera(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", "mcap", odometry=True)
+    assert any("in odom" in note for note in open_source(path).info.notes)
+    for frame, shot in zip(frames_of(path), shots(), strict=True):
+        assert np.allclose(frame.T_source_cam, shot.T_world_cam, atol=1e-5)
+
+
+def test_frames_are_read_from_the_middle_and_thinned(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", "db3")
+    source = open_source(path)
+    assert [f.index for f in source.read(1, 3)] == [1, 2]
+    thinned = open_source(path, SourceOptions(every=2))
+    assert [f.index for f in thinned.read(0, 9)] == [0, 2]
+    assert [k for k, _, _ in source.read_poses()] == list(range(COUNT))  # type: ignore[attr-defined]
+
+
+def test_topics_are_chosen_by_name(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", "mcap")
+    chosen = SourceOptions(topics=(("color", "/camera/color/image_raw"),))
+    assert all(isinstance(f, Frame) for f in open_source(path, chosen).read(0, COUNT))
+    with pytest.raises(OptionError, match=r"--topics color=/nothing: .* has /camera/color/camera_info"):
+        open_source(path, SourceOptions(topics=(("color", "/nothing"),)))
+    with pytest.raises(OptionError, match="the roles are color, depth, pose"):
+        SourceOptions(topics=(("smell", "/a"),))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_recording_that_is_cut_off_is_one_clear_line(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", kind)
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix == f".{kind}")
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    with pytest.raises(List3rError) as caught:
+        list(open_source(path).read(0, COUNT))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_of_noise_is_one_clear_line(tmp_path: Path) -> None:
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / name).write_bytes(b"\x89" * 500)
+        with pytest.raises(List3rError, match="ROS recording"):
+            open_source(tmp_path / name)
