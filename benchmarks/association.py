@@ -120,7 +120,7 @@ def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
 
 def variant_settings(variant: str) -> Any:
     """Return the product's settings with the parts that a variant lacks switched off."""
-    from list3r.pipeline.mapping import AssociationSettings
+    from list3r.pipeline.settings import AssociationSettings
 
     full = AssociationSettings()
     plain_edges = replace(full.edges, instance_aware=False)

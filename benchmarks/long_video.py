@@ -22,7 +22,7 @@ from machine import _resident, descendants, write_json
 
 from list3r.frames.source import SourceOptions, open_source
 from list3r.pipeline.build import build
-from list3r.pipeline.chunk import BuildSettings
+from list3r.pipeline.settings import BuildSettings
 
 
 class _EnoughError(Exception):

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory, build, open, update
     from list3r.frames.options import SourceOptions
     from list3r.memory.errors import List3rError
-    from list3r.pipeline.chunk import BuildSettings
+    from list3r.pipeline.settings import BuildSettings
 
 __version__ = "0.1.0"
 __all__ = ["BuildSettings", "List3rError", "SceneMemory", "SourceOptions", "__version__", "build", "open", "update"]
 
 _HOMES = {
-    "BuildSettings": "list3r.pipeline.chunk",
+    "BuildSettings": "list3r.pipeline.settings",
     "SourceOptions": "list3r.frames.options",
     "List3rError": "list3r.memory.errors",
     "SceneMemory": "list3r.api",

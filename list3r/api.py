@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from list3r.exporters.prompt.scene_text import ScenePrompt
     from list3r.frames.options import SourceOptions
-    from list3r.pipeline.chunk import BuildSettings
+    from list3r.pipeline.settings import BuildSettings
 
 
 P = ParamSpec("P")

@@ -25,8 +25,9 @@ from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import _runs, build
 from list3r.pipeline.calibration import camera_notes
-from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
+from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.session import Job, plan_session
+from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.sfm.calibration import _focal_sigma
 from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
 from benchmarks.simulation.presets import make_video
@@ -14,29 +13,29 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult
 from list3r.memory.store.store import Store
 from list3r.pipeline import mapping
+from list3r.pipeline.settings import AssociationSettings
 
 
-def placed(path: Path, chunks: list[ChunkResult], model: FeedForwardModel) -> list[Sim3]:
+def placed(
+    path: Path, chunks: list[ChunkResult], model: FeedForwardModel, settings: AssociationSettings | None = None
+) -> list[Sim3]:
     with Store.create(path) as store:
         with store.transaction():
             store.set_value("scale_kind", "relative")
             session = store.add_session("simulation", "", {}, 400)
         for chunk in chunks:
-            mapping.add_chunk(store, session, chunk, model, library=False)
-        mapping.finish_session(store, session, library=False)
+            mapping.add_chunk(store, session, chunk, model, settings, library=False)
+        mapping.finish_session(store, session, settings, library=False)
         rows = store.chunks()
         assert len({c.component for c in rows}) == 1
         assert all(c.covariance is not None for c in rows)
         return [c.S_world_chunk for c in rows]
 
 
-def test_a_chunk_fitted_in_ends_where_solving_the_whole_graph_puts_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_fitted_in_ends_where_solving_the_whole_graph_puts_it(tmp_path: Path) -> None:
     model = FeedForwardModel(make_video("calm", 102), seed=102)
     chunks = [model.chunk(span) for span in plan_chunks(400, ChunkSettings())]
     whole = placed(tmp_path / "whole.l3r", chunks, model)
-    monkeypatch.setattr(mapping, "SOLVED_WHOLE", 0)
-    grown = placed(tmp_path / "grown.l3r", chunks, model)
+    grown = placed(tmp_path / "grown.l3r", chunks, model, AssociationSettings(solved_whole=0))
     for a, b in zip(whole, grown, strict=True):
         assert np.abs((a.inverse() @ b).log()).max() < 1e-6

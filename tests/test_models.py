@@ -47,8 +47,8 @@ from list3r.models.device import Gpu
 from list3r.models.licences import PROFILES, choose_weights, objection, terms
 from list3r.models.presets import ModelSelection, obstacle, select
 from list3r.models.upstream import load_upstream, upstream_class
-from list3r.pipeline.chunk import BuildSettings
 from list3r.pipeline.session import prepare, with_weights
+from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import MODELS
 from list3r.semantics.embedding import embed_memory
 from tests import neural_scenes

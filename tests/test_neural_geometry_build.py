@@ -21,8 +21,9 @@ from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.records import Session
 from list3r.models.device import Gpu
-from list3r.pipeline.chunk import BuildSettings, ChunkTask, joint_model, process_chunk, process_parts
+from list3r.pipeline.chunk import ChunkTask, joint_model, process_chunk, process_parts
 from list3r.pipeline.joint_windows import joint_windows
+from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.workers import OrderedPool
 from tests import neural_models, neural_scenes
 

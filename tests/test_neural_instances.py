@@ -16,12 +16,12 @@ from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.views import chunk_views
 from list3r.instances.library import build_library
 from list3r.instances.neural.appearance import Appearance, WithAppearance, label_shares
-from list3r.instances.neural.candidates import CandidateSettings, SoftMasks, bounds_the_room, choose_candidates
+from list3r.instances.neural.candidates import SoftMasks, bounds_the_room, choose_candidates
 from list3r.instances.neural.query_segmenter import QuerySegmenter
-from list3r.instances.neural.sam_masks import SamMasks, SamMaskSettings
+from list3r.instances.neural.sam_masks import SamMasks
 from list3r.instances.registry import check_choice, make_discoverer, make_tracker
-from list3r.instances.settings import InstanceSettings
-from list3r.instances.tracking.video_tracker import VideoTracker, VideoTrackerSettings, _Things
+from list3r.instances.settings import CandidateSettings, InstanceSettings, SamMaskSettings, VideoTrackerSettings
+from list3r.instances.tracking.video_tracker import VideoTracker, _Things
 from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
 from list3r.models import pretrained
@@ -47,7 +47,7 @@ def chunk():
 @pytest.mark.parametrize("model", ["eomt", "mask2former"])
 def test_segmenter_proposes_disjoint_named_masks(model: str, checkpoints: dict[str, Path], chunk) -> None:
     frames, reconstruction = chunk
-    segmenter = QuerySegmenter(model, checkpoints[f"discovery/{model}"], "cpu", candidates=EVERYTHING)
+    segmenter = QuerySegmenter(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(candidates=EVERYTHING))
     found = segmenter(frames, reconstruction, 5)
     assert found.labels.shape == frames[5].color.shape[:2]
     assert found.labels.max() == len(found.score) > 0
@@ -61,7 +61,9 @@ def test_segmenter_proposes_disjoint_named_masks(model: str, checkpoints: dict[s
 @pytest.mark.parametrize("model", ["sam2", "sam3"])
 def test_point_grid_finds_masks(model: str, checkpoints: dict[str, Path], chunk) -> None:
     frames, _ = chunk
-    masks = SamMasks(model, checkpoints[f"discovery/{model}"], "cpu", sam=SAM_ALL).look(frames[3].color)
+    masks = SamMasks(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(sam=SAM_ALL)).look(
+        frames[3].color
+    )
     assert masks.probability.shape[1:] == frames[3].color.shape[:2]
     assert len(masks.score) == len(masks.features) == len(masks.probability)
     assert (np.diff(masks.score) <= 0).all()
@@ -96,8 +98,7 @@ def test_every_network_runs_in_half_precision(
         made = list(Appearance(model, checkpoints[name], "cpu").tokens(color))
     elif part == "discovery":
         maker = SamMasks if model.startswith("sam") else QuerySegmenter
-        extra = {"sam": SAM_ALL} if maker is SamMasks else {"candidates": EVERYTHING}
-        found = maker(model, checkpoints[name], "cpu", **extra).look(color)
+        found = maker(model, checkpoints[name], "cpu", InstanceSettings(candidates=EVERYTHING, sam=SAM_ALL)).look(color)
         assert len(found.score) > 0
         made = [found.probability, found.score, found.features]
     else:
@@ -114,9 +115,11 @@ def test_every_network_runs_in_half_precision(
 def test_a_picture_without_things_has_none(model: str, checkpoints: dict[str, Path], chunk) -> None:
     nothing = CandidateSettings(min_score=1.1)
     if model == "sam2":
-        network = SamMasks(model, checkpoints["discovery/sam2"], "cpu", sam=SamMaskSettings(4, min_quality=1.1))
+        network = SamMasks(
+            model, checkpoints["discovery/sam2"], "cpu", InstanceSettings(sam=SamMaskSettings(4, min_quality=1.1))
+        )
     else:
-        network = QuerySegmenter(model, checkpoints[f"discovery/{model}"], "cpu", candidates=nothing)
+        network = QuerySegmenter(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(candidates=nothing))
     frames, reconstruction = chunk
     found = network(frames, reconstruction, 0)
     assert len(found.score) == 0 and found.labels.max() == 0
@@ -141,7 +144,9 @@ def test_the_tracker_state_stays_small(checkpoints: dict[str, Path], chunk) -> N
 def test_live_things_are_capped(checkpoints: dict[str, Path], chunk) -> None:
     frames, reconstruction = chunk
     labels = np.arange(240 * 320).reshape(240, 320) // (48 * 320) + 1
-    tracker = VideoTracker("sam2", checkpoints["tracking/sam2"], "cpu", tracker=VideoTrackerSettings(most_live=3))
+    tracker = VideoTracker(
+        "sam2", checkpoints["tracking/sam2"], "cpu", InstanceSettings(video_tracker=VideoTrackerSettings(most_live=3))
+    )
     things = _things(reconstruction, [0, 6], labels.astype(np.int32), most_live=3)
     seen = [len(masks) for _, masks in tracker._sweep(frames, range(10), things, forwards=True)]
     assert things.count >= 5

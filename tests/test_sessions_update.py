@@ -15,7 +15,7 @@ from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunk import BuildSettings
+from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.update import ties, update
 from list3r.simulation.dataset import WalkSettings, write_walk
 

@@ -81,6 +81,61 @@ class MaskTrackSettings:
 
 
 @dataclass(frozen=True)
+class CandidateSettings:
+    """Which masks of a network become candidates."""
+
+    min_score: float = 0.3
+    """Class probability (or predicted quality) times the mean probability inside the mask."""
+    max_overlap: float = 0.7
+    """A mask of which a larger share lies under better ones is redundant (the ratio that panoptic networks use)."""
+    min_area_share: float = 0.0002
+    """Of the picture: 60 pixels of 640 x 480."""
+    flat_rms: float = 2.0
+    """A mask is flat when its points lie off their best plane by less than this many deviations of the noise."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.max_overlap <= 1.0:
+            raise OptionError(f"max overlap {self.max_overlap} must lie in (0, 1]")
+
+
+@dataclass(frozen=True)
+class SamMaskSettings:
+    """How the picture is prompted and what is kept."""
+
+    points_per_side: int = 24
+    """Prompts along each side of the picture (32 in the authors' generator, for larger pictures)."""
+    points_at_once: int = 64
+    """Prompts decoded together; halved when the device's memory does not hold them."""
+    min_quality: float = 0.7
+    """Predicted IoU."""
+    min_stability: float = 0.85
+    """IoU of the masks cut at logits of plus and minus one."""
+    max_iou: float = 0.7
+    """Of two masks that overlap more, the better one stays."""
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+
+    def __post_init__(self) -> None:
+        if self.points_per_side < 1:
+            raise OptionError(f"points per side {self.points_per_side} must be at least 1")
+
+
+@dataclass(frozen=True)
+class VideoTrackerSettings:
+    """How things are followed and handed over."""
+
+    most_live: int = 60
+    """Things followed at one time; cost and memory of a frame grow with each."""
+    same_iou: float = 0.5
+    """A candidate that overlaps a followed thing's mask by this is a view of that thing."""
+    covered: float = 0.7
+    """A candidate of which this share is followed already, by whatever, is no new thing."""
+
+    def __post_init__(self) -> None:
+        if self.most_live < 1:
+            raise OptionError(f"at least 1 thing must be followed, not {self.most_live}")
+
+
+@dataclass(frozen=True)
 class MoverInstanceSettings:
     """What is kept of a thing that moves."""
 
@@ -108,6 +163,11 @@ class InstanceSettings:
     segment: SegmentSettings = field(default_factory=SegmentSettings)
     track: MaskTrackSettings = field(default_factory=MaskTrackSettings)
     movers: MoverInstanceSettings = field(default_factory=MoverInstanceSettings)
+
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    """Of networks that look for things."""
+    sam: SamMaskSettings = field(default_factory=SamMaskSettings)
+    video_tracker: VideoTrackerSettings = field(default_factory=VideoTrackerSettings)
 
     @property
     def feature_space(self) -> str:

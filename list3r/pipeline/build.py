@@ -20,7 +20,6 @@ from list3r.frames.source import SourceOptions
 from list3r.memory.errors import TrackingError
 from list3r.memory.store.store import Store
 from list3r.models.licences import DEFAULT_PROFILE
-from list3r.pipeline.chunk import BuildSettings
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.session import (
     Job,
@@ -34,6 +33,7 @@ from list3r.pipeline.session import (
     settled_notes,
     shot_cuts,
 )
+from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import make_folder, open_target
 from list3r.reconstruction.registry import entry
 
@@ -95,7 +95,7 @@ def build(
         session = _session(target.store, job)
         plan = plan_session(target.store, session, job, look, debug_dir)
         add_chunks(target.store, job, plan, progress, added=lambda part: target.keep() if part.posed.any() else None)
-        return _finish(target.store, job.info, plan, started)
+        return _finish(target.store, job, plan, started)
 
 
 def _session(store: Store, job: Job) -> int:
@@ -110,7 +110,9 @@ def _session(store: Store, job: Job) -> int:
         store.set_value("scale_source", _scale_source(info, settings))
         store.set_value("gravity", "unknown")
         store.set_value("poses", settings.poses)
-        return store.add_session(str(Path(info.path).resolve()), info.fingerprint, asdict(settings), info.frame_count)
+        return store.add_session(
+            str(Path(info.path).resolve()), info.fingerprint, settings.as_plain(), info.frame_count
+        )
 
 
 def _scale_kind(info: SourceInfo, settings: BuildSettings) -> str:
@@ -128,7 +130,8 @@ def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:
     return "given poses" if settings.poses == "given" else "none"
 
 
-def _finish(store: Store, info: SourceInfo, plan: Plan, started: float) -> BuildReport:
+def _finish(store: Store, job: Job, plan: Plan, started: float) -> BuildReport:
+    info, settings = job.info, job.settings
     frames = store.frames(plan.session)
     posed = sum(f.state == "posed" for f in frames)
     if posed == 0:
@@ -139,7 +142,7 @@ def _finish(store: Store, info: SourceInfo, plan: Plan, started: float) -> Build
             + "; ".join(filter(None, (*why[:1], hint)))
         )
     with threadpool_limits(1):
-        finish_session(store, plan.session)
+        finish_session(store, plan.session, settings.association, settings.carving)
     seconds = time.monotonic() - started
     components = len({c.component for c in store.chunks()})
     lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))

@@ -15,6 +15,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.registration.rig import resized
 from list3r.frames.source import open_source
 from list3r.memory.store.store import Store
+from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
 
 _SILENT_ON_DISTORTION = ("images", "video")
@@ -26,7 +27,7 @@ def with_camera(
     session: int,
     source: str | Path,
     options: SourceOptions,
-    model: str,
+    settings: BuildSettings,
     info: SourceInfo,
     look: Callable[[str, int, int], None] | None = None,
 ) -> SourceOptions:
@@ -36,7 +37,7 @@ def with_camera(
     """
     known = store.get_value(camera_key(session))
     if known is None:
-        known = estimated_camera(source, options, model, info, look)
+        known = estimated_camera(source, options, settings, info, look)
         if known is None:
             return options
         with store.transaction():
@@ -47,7 +48,7 @@ def with_camera(
 def estimated_camera(
     source: str | Path,
     options: SourceOptions,
-    model: str,
+    settings: BuildSettings,
     info: SourceInfo,
     look: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any] | None:
@@ -55,7 +56,7 @@ def estimated_camera(
 
     `look` hears ("camera", windows of the video done, in all).
     """
-    module = entry(model).calibration
+    module = entry(settings.reconstruction).calibration
     told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
     if not module or (info.camera is not None and told):
         return None
@@ -64,7 +65,7 @@ def estimated_camera(
         calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
         opened, size = open_source(source, options), _stored_size(source, options)
         height, width = opened.info.image_size or size
-        found = calibrate(opened, progress=progress, stored_px=max(size) / max(height, width))
+        found = calibrate(opened, settings.models.sfm, progress, stored_px=max(size) / max(height, width))
     return {"notes": list(found.notes), **_as_stored(found.camera, size)}
 
 

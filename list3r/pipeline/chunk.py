@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -17,55 +17,22 @@ from numpy.typing import NDArray
 from list3r.association.overlap.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunking.borrowing import Borrowed, Repeat, borrow, frames_around
-from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
+from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.registry import make_discoverer, make_tracker
-from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
+from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.models.device import memory_said
+from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
-
-
-@dataclass(frozen=True)
-class BuildSettings:
-    """What shapes a memory. Two builds of one source with equal settings give equal memories."""
-
-    reconstruction: str = "auto"
-    """The reconstruction model; auto: rgbd where the source has depth, else sfm (see `session_stage`)."""
-    poses: str = "estimate"
-    """given or estimate."""
-    device: str = "auto"
-    """Where neural models run: cpu, cuda, or auto, the first GPU where there is one."""
-    weights: str | None = None
-    """Weights of the reconstruction model instead of its own."""
-    discovery: str = "geometric"
-    """What finds things on anchor frames."""
-    tracking: str = "reprojection"
-    """What follows them through the chunk."""
-    features: str = "geometric"
-    """What things are known again by."""
-    instance_weights: tuple[tuple[str, str], ...] = ()
-    """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
-    local_features: str = "sift"
-    """What finds a keyframe again: sift or aliked; aliked also ties frames of `sfm` between which nothing can be
-    followed."""
-    feature_weights: str | None = None
-    """File of the weights of learned local features."""
-    chunks: ChunkSettings = field(default_factory=ChunkSettings)
-    """By frames that get depth."""
-    depth_every: int | None = None
-    """From every how many frames models that compute depth do so, the others get a pose; None: see `frames.pace`."""
-    instances: InstanceSettings = field(default_factory=InstanceSettings)
-    keep_pictures: bool = True
-    """Keep a JPEG of each keyframe in the memory."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +109,7 @@ def reconstruct(
         failed = error
     alone = len(_posed(parts))
     if task.shot is not None and (failed or (hasattr(model, "parts") and 2 * alone < len(frames))):
-        more = borrow(source, (task.span.start, task.span.stop), task.shot, frames)
+        more = borrow(source, (task.span.start, task.span.stop), task.shot, frames, task.settings.borrowing)
         if failed or 2 * more.followed > len(frames):
             found = _borrowed_parts(task, model, more, camera, deep)
             shown = _posed(found)
@@ -241,15 +208,15 @@ def _described(
     discoverer: Discoverer | None,
 ) -> ChunkResult:
     """What is found in a reconstruction, and what is kept of it."""
-    named, tracker = _instance_models(task.settings)
+    s = task.settings
+    named, tracker = _instance_models(s)
     with memory_said("what finds and follows things"):
-        library = build_library(frames, reconstruction, task.settings.instances, discoverer or named, tracker)
+        library = build_library(frames, reconstruction, s.instances, discoverer or named, tracker)
     clock.mark("instances")
-    detector = _detector(task.settings)
-    keyframes = make_keyframes(frames, reconstruction, task.settings.keep_pictures, detector=detector)
-    samples = frame_samples(reconstruction, library)
+    keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, _detector(s))
+    samples = frame_samples(reconstruction, library, s.models.samples)
     if reconstruction.depth_noise is None:  # stereo has no depth where things move; what it sees through is error
-        library = flag_moving(samples, library, reconstruction.camera)
+        library = flag_moving(samples, library, reconstruction.camera, s.motion)
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
@@ -317,13 +284,11 @@ def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
     return np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
 
 
-def joint_model(task: ChunkTask) -> Reconstructor | None:
-    """What reconstructs joint windows of frames of two places in the way of the chunks; None for the usual one.
+def joint_model(task: ChunkTask) -> Reconstructor:
+    """Return what reconstructs joint windows of frames of two places in the way of the chunks.
 
     A network is loaded when the first window is asked for.
     """
-    if task.settings.reconstruction == "rgbd":
-        return None
     free, known = replace(task.settings, poses="estimate"), _source(task.path, task.options).info.camera is not None
 
     def reconstruct(frames: Sequence[Frame], camera: Camera) -> Reconstruction:
@@ -336,8 +301,16 @@ def joint_model(task: ChunkTask) -> Reconstructor | None:
 def _model(settings: BuildSettings, camera_known: bool) -> Reconstructor:
     """The model, loaded once in a process."""
     s = settings
-    options = ModelOptions(s.poses, camera_known, s.device, s.weights, s.local_features, s.feature_weights)
-    return make_reconstructor(settings.reconstruction, options)
+    options = ModelOptions(
+        poses=s.poses,
+        camera_known=camera_known,
+        device=s.device,
+        weights=s.weights,
+        local_features=s.local_features,
+        feature_weights=s.feature_weights,
+        settings=s.models,
+    )
+    return make_reconstructor(s.reconstruction, options)
 
 
 def _instance_models(settings: BuildSettings) -> tuple[Discoverer, Tracker]:

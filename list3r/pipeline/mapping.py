@@ -8,27 +8,26 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.graph.chunk_nodes import NodeSettings
 from list3r.association.graph.growth import extend
 from list3r.association.graph.node_graph import bend_chunks
-from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.graph.surface_graph import place_by_surfaces
 from list3r.association.overlap.camera_edge import better_edge, camera_edge
-from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, measure_edge
+from list3r.association.overlap.edges import EdgeEnd, measure_edge
 from list3r.association.revisits.joint_window import JointReconstructor
 from list3r.association.revisits.overlays import write_loop
-from list3r.association.revisits.reprojection_edge import refine_loop
-from list3r.association.revisits.search import RevisitSettings, find_loops
+from list3r.association.revisits.reprojection_edge import ReprojectionSettings, refine_loop
+from list3r.association.revisits.search import find_loops
 from list3r.association.revisits.session_ties import hold_back
 from list3r.frames.base import Camera
-from list3r.instances.carving.carved_instances import add_changed_places
+from list3r.instances.carving.carved_instances import ChangedPlaceSettings, add_changed_places
 from list3r.instances.overlays import write_support
 from list3r.memory.bends import Bend
 from list3r.memory.errors import DegenerateError
@@ -39,18 +38,10 @@ from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.memory.world.gravity import estimate_gravity, world_from_graph
 from list3r.memory.world.scale import settle_scale
+from list3r.pipeline.settings import AssociationSettings, session_settings
+from list3r.reconstruction.registry import MODELS
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class AssociationSettings:
-    """How chunks become one world."""
-
-    revisits: RevisitSettings = field(default_factory=RevisitSettings)
-    edges: EdgeSettings = field(default_factory=EdgeSettings)
-    graph: GraphSettings = field(default_factory=GraphSettings)
-    nodes: NodeSettings = field(default_factory=NodeSettings)
 
 
 def add_chunk(
@@ -79,11 +70,11 @@ def add_chunk(
         if given:
             store.add_edges(_edge_of_given_poses(store, session_id))
         else:
-            store.add_edges(_adjacent_edge(store, session_id, chosen.edges, debug_dir))
+            store.add_edges(_adjacent_edge(store, session_id, chosen, debug_dir))
         if not given or len(store.sessions()) > 1:
             loops = find_loops(store, chunk_id, joint, chosen.revisits)
-            store.add_edges(_refined(store, e) if e.accepted else e for e in loops)
-        place_chunks(store, chosen.graph, chunk_id)
+            store.add_edges(_refined(store, e, chosen.reprojection) if e.accepted else e for e in loops)
+        place_chunks(store, chosen, chunk_id)
         if debug_dir is not None:
             _draw_loops(store, chunk_id, debug_dir)
         if library:
@@ -93,12 +84,12 @@ def add_chunk(
 
 def _poses_given(store: Store, session_id: int) -> bool:
     """Whether the source of a session said where its camera was; each session has a world of its own for that."""
-    chosen = {s.session_id: s.settings.get("poses") for s in store.sessions()}
+    chosen = {s.session_id: session_settings(s).poses for s in store.sessions()}
     first = min(chosen, default=session_id)
     return (chosen.get(session_id) if session_id != first else store.get_value("poses")) == "given"
 
 
-def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_dir: Path | None) -> list[Edge]:
+def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debug_dir: Path | None) -> list[Edge]:
     """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it.
 
     What moved between the two is flagged on the way.
@@ -111,13 +102,13 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
     samples_u, samples_v = store.frame_samples(u.chunk_id), store.frame_samples(v.chunk_id)
     by_cameras = None
     if not metric and _from_motion(store, session_id):
-        by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id)
+        by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id, how.cameras)
     try:
         ends = (
             EdgeEnd(u.chunk_id, samples_u, store.dynamic_locals(u.chunk_id)),
             EdgeEnd(v.chunk_id, samples_v, store.dynamic_locals(v.chunk_id)),
         )
-        found = measure_edge(*ends, _camera(v), metric, settings)
+        found = measure_edge(*ends, _camera(v), metric, how.edges)
     except DegenerateError:
         return [] if by_cameras is None else [by_cameras]
     if by_cameras is None:  # where points lie less well than cameras, what they disagree in has not moved
@@ -129,7 +120,7 @@ def _adjacent_edge(store: Store, session_id: int, settings: EdgeSettings, debug_
     return [better_edge(found.edge, by_cameras) or found.edge]
 
 
-def _refined(store: Store, edge: Edge) -> Edge:
+def _refined(store: Store, edge: Edge, settings: ReprojectionSettings) -> Edge:
     """A loop between chunks of structure from motion, refined by where features are seen."""
     if edge.frames is None:
         return edge
@@ -138,12 +129,14 @@ def _refined(store: Store, edge: Edge) -> Edge:
     if "metric" in (u.scale_kind, v.scale_kind) or not all(_from_motion(store, c.session_id) for c in (u, v)):
         return edge
     keyframes = store.keyframe(u.chunk_id, edge.frames[0]), store.keyframe(v.chunk_id, edge.frames[1])
-    return refine_loop(edge, *keyframes, _camera(u), _camera(v))
+    return refine_loop(edge, *keyframes, _camera(u), _camera(v), settings)
 
 
 def _from_motion(store: Store, session_id: int) -> bool:
     """Whether a session's cameras are known better than its surfaces."""
-    return any(s.session_id == session_id and s.settings.get("reconstruction") == "sfm" for s in store.sessions())
+    models = {s.session_id: MODELS.get(session_settings(s).reconstruction) for s in store.sessions()}
+    model = models.get(session_id)
+    return model is not None and model.by_cameras
 
 
 def _draw_loops(store: Store, chunk_id: int, debug_dir: Path) -> None:
@@ -173,37 +166,31 @@ def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
     return [Edge(u, v, "adjacent", Sim3.identity(), 1.0, 1.0, 0, 0.0, True, "both lie in the source's own world")]
 
 
-SOLVED_WHOLE = 60
-"""Chunks up to which every new one solves the whole graph again (some milliseconds); beyond, it is fitted in."""
-
-
 def place_chunks(
-    store: Store,
-    settings: GraphSettings | None = None,
-    new: int | None = None,
-    nodes: NodeSettings | None = None,
+    store: Store, settings: AssociationSettings | None = None, new: int | None = None, *, bend: bool = False
 ) -> None:
     """Optimise the graph, find which way is up, and write where every chunk lies.
 
     With the id of a `new` chunk in a long video only what that chunk touches is solved; `finish_session` solves all.
-    With `nodes` it is also found how each chunk bends.
+    With `bend` it is also found how each chunk bends.
     """
+    how = settings or AssociationSettings()
     chunks = store.chunks()
     measured = store.edges()
-    edges = hold_back(measured, {c.chunk_id: c.session_id for c in chunks}, _metre(chunks))
+    edges = hold_back(measured, {c.chunk_id: c.session_id for c in chunks}, _metre(chunks), how.ties)
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
-    fitted = new is not None and len(chunks) > SOLVED_WHOLE
+    fitted = new is not None and len(chunks) > how.solved_whole
     if new is not None and fitted:
-        graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, settings)
+        graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, how.graph)
     else:
-        graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=settings)
+        graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=how.graph)
     store.add_edges(after for before, after in zip(measured, graph.edges, strict=True) if after is not before)
-    if nodes is not None:
-        graph = _straightened(store, graph, chunks, metric, settings, nodes)
+    if bend:
+        graph = _straightened(store, graph, chunks, metric, how)
     known = {} if store.get_value("poses") == "given" else graph.covariances
-    settled = store.get_value("gravity") == "estimated" or len(chunks) % UP_AGAIN
-    if fitted and len(chunks) > UP_ALWAYS and settled:
+    settled = store.get_value("gravity") == "estimated" or len(chunks) % how.up_again
+    if fitted and len(chunks) > how.up_always and settled:
         _place_fitted(store, graph, known)
         return
     gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
@@ -213,12 +200,6 @@ def place_chunks(
     store.set_value("T_world_graph", S_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
     store.place_chunks({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
-
-
-UP_ALWAYS, UP_AGAIN = 64, 32
-"""Chunks up to which every new one makes it be asked which way is up and what a unit of the world is. Beyond, that
-stands until the session is finished: to turn the world is to touch all of it. Where up is not known yet it is asked
-again after so many chunks."""
 
 
 def _place_fitted(store: Store, graph: GraphResult, covariances: Mapping[int, NDArray[np.float64]]) -> None:
@@ -234,17 +215,16 @@ def _straightened(
     graph: GraphResult,
     chunks: Sequence[ChunkRow],
     metric: bool,
-    settings: GraphSettings | None,
-    nodes: NodeSettings,
+    how: AssociationSettings,
 ) -> GraphResult:
     """The graph with the bending of chunks undone; chunks whose poses were given do not bend."""
     given = {s.session_id for s in store.sessions() if _poses_given(store, s.session_id)}
     rigid = {c.chunk_id for c in chunks if c.session_id in given}
     bends: dict[int, Bend] = {}
     if len(rigid) < len(chunks):
-        graph, bends = bend_chunks(store.frame_samples, graph, rigid, metric, nodes, settings)
+        graph, bends = bend_chunks(store.frame_samples, graph, rigid, metric, how.nodes, how.graph)
     if not metric and not rigid and all(_from_motion(store, k) for k in {c.session_id for c in chunks}):
-        graph, bends = place_by_surfaces(store.frame_samples, graph, bends)
+        graph, bends = place_by_surfaces(store.frame_samples, graph, bends, how.surfaces)
     store.set_bends(bends)
     return graph
 
@@ -255,14 +235,19 @@ def _metre(chunks: Sequence[ChunkRow]) -> float:
 
 
 def finish_session(
-    store: Store, session_id: int, settings: AssociationSettings | None = None, *, library: bool = True
+    store: Store,
+    session_id: int,
+    settings: AssociationSettings | None = None,
+    carving: ChangedPlaceSettings | None = None,
+    *,
+    library: bool = True,
 ) -> None:
     """Place all chunks once more by all edges, derive the library from that, and mark the session as complete."""
     chosen = settings or AssociationSettings()
     with store.transaction():
-        place_chunks(store, chosen.graph, nodes=chosen.nodes)
+        place_chunks(store, chosen, bend=True)
         if library:
-            add_changed_places(store, session_id)
+            add_changed_places(store, session_id, carving)
             consolidate(store)
             apply_labels(store)
         store.complete_session(session_id)

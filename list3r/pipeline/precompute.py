@@ -18,8 +18,9 @@ from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.pipeline.calibration import estimated_camera, told_camera
-from list3r.pipeline.chunk import BuildSettings, ChunkTask, reconstruct
+from list3r.pipeline.chunk import ChunkTask, reconstruct
 from list3r.pipeline.session import Look, check_buildable, resolve_settings, with_weights
+from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import make_folder
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.precomputed_files import (
@@ -31,6 +32,7 @@ from list3r.reconstruction.precomputed_files import (
     write_manifest,
     write_piece,
 )
+from list3r.reconstruction.registry import entry
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,11 @@ def precompute(
     settings = with_weights(settings, licence)
     _begin(out, settings, info, force)
     scan = None if look is None else (lambda done, total: look("cuts", done, total))
-    cuts = () if settings.poses == "given" else tuple(find_cuts(open_source(source, options), progress=scan))
+    cuts = () if settings.poses == "given" else tuple(find_cuts(open_source(source, options), settings.cuts, scan))
     spans = plan_chunks(info.frame_count, settings.chunks, cuts)
     notes: list[str] = []
     if force or not all(_file(out, span).exists() for span in spans):
-        camera = estimated_camera(source, options, settings.reconstruction, info, look)
+        camera = estimated_camera(source, options, settings, info, look)
         if camera is not None:
             options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
     opened = open_source(source, options)
@@ -109,7 +111,7 @@ def precompute(
 
 def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) -> None:
     """Write the manifest, or check that the one that is there says the same."""
-    metric = settings.poses == "given" or (settings.reconstruction == "rgbd" and info.has_depth)
+    metric = settings.poses == "given" or (entry(settings.reconstruction).needs_depth and info.has_depth)
     named = settings.reconstruction + (f" {settings.weights}" if settings.weights else "")
     chunks = settings.chunks
     manifest = Manifest("metric" if metric else "relative", named, chunks.length, chunks.overlap)

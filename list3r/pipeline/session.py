@@ -17,17 +17,19 @@ from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
 from list3r.memory.errors import OptionError
 from list3r.memory.records import ChunkResult
+from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
 from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
 from list3r.pipeline.calibration import camera_key, camera_notes, with_camera
-from list3r.pipeline.chunk import BuildSettings, ChunkTask, process_parts
+from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.joint_windows import joint_windows
-from list3r.pipeline.mapping import AssociationSettings, add_chunk, place_chunks
+from list3r.pipeline.mapping import add_chunk, place_chunks
+from list3r.pipeline.settings import AssociationSettings, BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
-from list3r.reconstruction.registry import MODELS, entry
+from list3r.reconstruction.registry import entry, usual_model
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all) at the start and after every chunk."""
@@ -91,7 +93,7 @@ def plan_session(
     step = _depth_step(store, session, job, look)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks(session)}
-    options = with_camera(store, session, job.source, job.options, job.settings.reconstruction, job.info, look)
+    options = with_camera(store, session, job.source, job.options, job.settings, job.info, look)
     tasks = []
     for span in spans:
         if span.index not in done:
@@ -124,6 +126,7 @@ def add_chunks(
     if progress is not None:
         progress(len(store.frames(session)), count)
     known = {c.index for c in store.chunks(session)}
+    how = job.settings.association
     workers = min(job.workers or usual_workers(job.settings), len(plan.tasks))
     with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
@@ -132,7 +135,7 @@ def add_chunks(
             bad.update(index for index, _ in found)
             check_bad_share(len(bad), count, found[0][1] if found else "")
             for part in (p for p in results if p.index not in known):
-                add_chunk(store, session, part, joint, library=library, debug_dir=debug_dir)
+                add_chunk(store, session, part, joint, how, library=library, debug_dir=debug_dir)
                 _note_lost(store, session, part)
                 if added is not None:
                     added(part)
@@ -154,7 +157,7 @@ def take_back(store: Store, session: int) -> None:
             store.drop_value(name)
         store.drop_session(session)
         if placed:
-            place_chunks(store, nodes=AssociationSettings().nodes)
+            place_chunks(store, stored_settings(store, AssociationSettings, "association"), bend=True)
 
 
 def lost_reasons(store: Store, session: int) -> list[str]:
@@ -191,7 +194,7 @@ def _depth_step(store: Store, session: int, job: Job, look: Look | None) -> int:
             scan = None if look is None else (lambda done, total: look("pace", done, total))
             begun = store.chunks(session)  # by a version that took all frames
             source, length = open_source(job.source, job.options), job.settings.chunks.length
-            known = 1 if begun else depth_step(source, length, progress=scan)
+            known = 1 if begun else depth_step(source, length, job.settings.pace, progress=scan)
         with store.transaction():
             store.set_value(name, known)
     return known
@@ -220,7 +223,7 @@ def _cuts(store: Store, session: int, job: Job, look: Look | None) -> tuple[int,
     if known is None:
         scan = None if look is None else (lambda done, total: look("cuts", done, total))
         begun = store.chunks(session)  # by a version that did not look for any
-        known = [] if begun else list(find_cuts(open_source(job.source, job.options), progress=scan))
+        known = [] if begun else list(find_cuts(open_source(job.source, job.options), job.settings.cuts, scan))
         with store.transaction():
             store.set_value(name, known)
     return tuple(known)
@@ -232,7 +235,7 @@ def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings
     if poses == "auto":
         poses = "given" if info.has_poses else "estimate"
     if reconstruction == "auto":
-        reconstruction = "rgbd" if info.has_depth or "sfm" not in MODELS else "sfm"
+        reconstruction = usual_model(info.has_depth)
     return replace(settings, poses=poses, reconstruction=reconstruction)
 
 

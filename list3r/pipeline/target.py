@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import stat
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from list3r.frames.base import SourceInfo
 from list3r.memory.errors import MemoryFileError, OptionError
-from list3r.memory.store.codec import to_json
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.file import rename_exclusively, taken
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunk import BuildSettings
+from list3r.pipeline.settings import BuildSettings, session_settings
 
 _MARK = "replaces"
 """Under this key a new memory says which file it replaces."""
@@ -147,8 +144,7 @@ def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None
                 f"{store.path} was begun from {session.source} with other frames or camera options; "
                 "give the same source and options to --resume, or --force to begin anew"
             )
-        wanted = json.loads(to_json(asdict(settings)))
-        different = sorted(k for k in wanted if session.settings.get(k) != wanted[k])
+        different = session_settings(session).differing(settings)
         if different:
             raise OptionError(
                 f"{store.path} was begun with other settings ({', '.join(different)}); "

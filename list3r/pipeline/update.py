@@ -20,7 +20,6 @@ from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
 from list3r.memory.records import Edge
 from list3r.memory.store.store import Store
 from list3r.models.licences import DEFAULT_PROFILE
-from list3r.pipeline.chunk import BuildSettings
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.session import (
     Look,
@@ -33,6 +32,7 @@ from list3r.pipeline.session import (
     settled_notes,
     take_back,
 )
+from list3r.pipeline.settings import BuildSettings
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def update(
                     take_back(store, session)
             raise
         with threadpool_limits(1):
-            finish_session(store, session)
+            finish_session(store, session, job.settings.association, job.settings.carving)
         return _report(store, job.info, plan, started)
 
 
@@ -148,7 +148,7 @@ def _session(store: Store, info: SourceInfo, settings: BuildSettings, *, resume:
     if begun:
         return begun[0].session_id
     with store.transaction():
-        return store.add_session(path, info.fingerprint, asdict(settings), info.frame_count)
+        return store.add_session(path, info.fingerprint, settings.as_plain(), info.frame_count)
 
 
 def ties(store: Store, session: int) -> list[Edge]:

@@ -46,17 +46,21 @@ class ModelEntry:
     """Module that estimates an unknown camera before the chunks, by `calibrate(source, settings)`."""
     thins: bool = False
     """Computes depth, so that frames which show the same from nearly the same place need not all have it."""
+    by_cameras: bool = False
+    """Knows its cameras better than its surfaces: chunks are joined by both, loops refined by features."""
+    reads_files: bool = False
+    """Reads geometry from a folder, which takes the place of weights and says how it was cut."""
 
 
 MODELS: dict[str, ModelEntry] = {
     "rgbd": ModelEntry("rgbd.reconstructor", needs_depth=True, needs_camera=True),
-    "sfm": ModelEntry("sfm.reconstructor", calibration="sfm.calibration", thins=True),
+    "sfm": ModelEntry("sfm.reconstructor", calibration="sfm.calibration", thins=True, by_cameras=True),
     "pi3": ModelEntry("networks.pi3"),
     "pi3x": ModelEntry("networks.pi3x"),
     "vggt": ModelEntry("networks.vggt"),
     "mapanything": ModelEntry("networks.mapanything"),
     "da3": ModelEntry("networks.da3"),
-    "precomputed": ModelEntry("precomputed"),
+    "precomputed": ModelEntry("precomputed", reads_files=True),
 }
 """All that `--reconstruction` knows."""
 
@@ -65,6 +69,11 @@ def make_reconstructor(name: str, options: ModelOptions) -> Reconstructor:
     """The model of that name. Raises `OptionError` for a name that is not known or a package that is missing."""
     model = import_module(f"list3r.reconstruction.{entry(name).module}").make(options)
     return model  # type: ignore[no-any-return]
+
+
+def usual_model(has_depth: bool) -> str:
+    """Return the model that needs no weights for a source with or without depth."""
+    return next(name for name, model in MODELS.items() if model.needs_depth == has_depth)
 
 
 def entry(name: str) -> ModelEntry:

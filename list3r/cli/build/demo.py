@@ -26,7 +26,7 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     _say(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
     _render(walk, seed=seed, frames=frames, workers=workers, quiet=quiet)
     _say(quiet, f"\n2. list3r build {walk} -m {memory} --poses estimate")
-    from list3r.pipeline.chunk import BuildSettings
+    from list3r.pipeline.settings import BuildSettings
 
     settings = BuildSettings(poses="estimate")
     report = run_build(walk, memory, quiet=quiet, settings=settings, workers=workers, resume=memory.exists())

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from list3r.frames.chunking.chunks import ChunkSettings
     from list3r.models.cards import ModelCard
     from list3r.models.presets import ModelSelection
-    from list3r.pipeline.chunk import BuildSettings
+    from list3r.pipeline.settings import BuildSettings
 
 Reconstruction = Annotated[
     str | None,
@@ -166,7 +166,7 @@ def build_settings(
     Raises `OptionError` for what is not known, not allowed or not installed, before anything is loaded or fetched.
     """
     from list3r.models.choice import check_allowed, parse_weights
-    from list3r.pipeline.chunk import BuildSettings
+    from list3r.pipeline.settings import BuildSettings
     from list3r.reconstruction.registry import entry
 
     selection = _selection(info, words)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from list3r.frames.base import SourceInfo
     from list3r.frames.options import SourceOptions
     from list3r.models.cards import ModelCard, Weights
-    from list3r.pipeline.chunk import BuildSettings
+    from list3r.pipeline.settings import BuildSettings
 
 models = typer.Typer(
     no_args_is_help=True,

@@ -11,25 +11,7 @@ from numpy.typing import NDArray
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.fusion import View
 from list3r.instances.geometric.views import ChunkViews
-from list3r.memory.errors import OptionError
-
-
-@dataclass(frozen=True)
-class CandidateSettings:
-    """Which masks of a network become candidates."""
-
-    min_score: float = 0.3
-    """Class probability (or predicted quality) times the mean probability inside the mask."""
-    max_overlap: float = 0.7
-    """A mask of which a larger share lies under better ones is redundant (the ratio that panoptic networks use)."""
-    min_area_share: float = 0.0002
-    """Of the picture: 60 pixels of 640 x 480."""
-    flat_rms: float = 2.0
-    """A mask is flat when its points lie off their best plane by less than this many deviations of the noise."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.max_overlap <= 1.0:
-            raise OptionError(f"max overlap {self.max_overlap} must lie in (0, 1]")
+from list3r.instances.settings import CandidateSettings
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.views import chunk_views
-from list3r.instances.neural.candidates import CandidateSettings, SoftMasks, choose_candidates
+from list3r.instances.neural.candidates import SoftMasks, choose_candidates
 from list3r.instances.settings import InstanceSettings
 from list3r.models.images import InputShape, network_input, to_picture
 from list3r.models.pretrained import load_named, space_name
@@ -39,13 +39,11 @@ class QuerySegmenter:
         folder: Path,
         device: str = "auto",
         settings: InstanceSettings | None = None,
-        candidates: CandidateSettings | None = None,
     ) -> None:
         """`model` is eomt or mask2former, `folder` holds its configuration and weights. Raises `OptionError`."""
         exact = model == "mask2former"  # its deformable attention gives NaN in bfloat16
         self._network, self._device = load_named(CLASSES, "discovery", model, folder, device, exact=exact)
         self._settings = settings or InstanceSettings()
-        self._candidates = candidates or CandidateSettings()
         config = self._network.config
         height, width = _sides(config.image_size) if model == "eomt" else MASK2FORMER_SIZE
         self._shape = InputShape(height, width, keep_aspect=True, black=model == "eomt")
@@ -62,7 +60,7 @@ class QuerySegmenter:
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Candidates on the frame at `position`."""
         views = chunk_views(frames, reconstruction, self._settings)
-        return choose_candidates(self.look(frames[position].color), views, position, self._candidates)
+        return choose_candidates(self.look(frames[position].color), views, position, self._settings.candidates)
 
     def look(self, color: NDArray[np.uint8]) -> SoftMasks:
         """What the network says of one picture (H, W, 3); queries that show nothing are left out."""
@@ -73,7 +71,7 @@ class QuerySegmenter:
             out = self._network(pixel_values=picture)
             chance = out.class_queries_logits[0].float().softmax(dim=-1)[:, :-1]
             score, kind = chance.max(dim=-1)
-            keep = torch.nonzero(score >= self._candidates.min_score)[:, 0]
+            keep = torch.nonzero(score >= self._settings.candidates.min_score)[:, 0]
             probability = to_picture(out.masks_queries_logits[0][keep], self._shape, *color.shape[:2]).sigmoid()
             features = self._embedding(out)[keep].float()
         names = tuple(self._names.get(k, f"class {k}") for k in kind[keep].tolist())

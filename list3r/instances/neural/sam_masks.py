@@ -7,7 +7,6 @@ two masks that are nearly one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.views import chunk_views
-from list3r.instances.neural.candidates import CandidateSettings, SoftMasks, choose_candidates
+from list3r.instances.neural.candidates import SoftMasks, choose_candidates
 from list3r.instances.settings import InstanceSettings
-from list3r.memory.errors import OptionError
 from list3r.models.images import network_input, sam_input, to_picture
 from list3r.models.pretrained import load_named, space_name
 from list3r.reconstruction.base import Reconstruction
@@ -28,27 +26,6 @@ if TYPE_CHECKING:
     import torch
 
 CLASSES = {"sam2": "Sam2Model", "sam3": "Sam3TrackerModel"}
-
-
-@dataclass(frozen=True)
-class SamMaskSettings:
-    """How the picture is prompted and what is kept."""
-
-    points_per_side: int = 24
-    """Prompts along each side of the picture (32 in the authors' generator, for larger pictures)."""
-    points_at_once: int = 64
-    """Prompts decoded together; halved when the device's memory does not hold them."""
-    min_quality: float = 0.7
-    """Predicted IoU."""
-    min_stability: float = 0.85
-    """IoU of the masks cut at logits of plus and minus one."""
-    max_iou: float = 0.7
-    """Of two masks that overlap more, the better one stays."""
-    candidates: CandidateSettings = field(default_factory=CandidateSettings)
-
-    def __post_init__(self) -> None:
-        if self.points_per_side < 1:
-            raise OptionError(f"points per side {self.points_per_side} must be at least 1")
 
 
 class SamMasks:
@@ -60,12 +37,11 @@ class SamMasks:
         folder: Path,
         device: str = "auto",
         settings: InstanceSettings | None = None,
-        sam: SamMaskSettings | None = None,
     ) -> None:
         """`model` is sam2 or sam3, `folder` holds its configuration and weights. Raises `OptionError`."""
         self._network, self._device = load_named(CLASSES, "discovery", model, folder, device)
         self._settings = settings or InstanceSettings()
-        self._sam = sam or SamMaskSettings()
+        self._sam = self._settings.sam
         self._shape = sam_input(model, int(self._network.prompt_encoder.input_image_size))
         self._space = space_name(model, folder, int(self._network.config.mask_decoder_config.hidden_size))
 

@@ -8,7 +8,6 @@ found on a later anchor is followed backwards in a second sweep. Ids are handed 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +18,8 @@ from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews, chunk_views
-from list3r.instances.settings import InstanceSettings
+from list3r.instances.settings import InstanceSettings, VideoTrackerSettings
 from list3r.instances.tracking.reprojection import LabelledChunk
-from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
 from list3r.models.images import InputShape, network_input, sam_input
 from list3r.models.pretrained import load_named
@@ -44,22 +42,6 @@ SESSIONS = {
 }
 
 
-@dataclass(frozen=True)
-class VideoTrackerSettings:
-    """How things are followed and handed over."""
-
-    most_live: int = 60
-    """Things followed at one time; cost and memory of a frame grow with each."""
-    same_iou: float = 0.5
-    """A candidate that overlaps a followed thing's mask by this is a view of that thing."""
-    covered: float = 0.7
-    """A candidate of which this share is followed already, by whatever, is no new thing."""
-
-    def __post_init__(self) -> None:
-        if self.most_live < 1:
-            raise OptionError(f"at least 1 thing must be followed, not {self.most_live}")
-
-
 class VideoTracker:
     """Tracker: candidates of the anchors prompt a network that carries masks from frame to frame."""
 
@@ -69,7 +51,6 @@ class VideoTracker:
         folder: Path,
         device: str = "auto",
         settings: InstanceSettings | None = None,
-        tracker: VideoTrackerSettings | None = None,
     ) -> None:
         """`model` is sam2, sam3 or edgetam, `folder` holds its configuration and weights. Raises `OptionError`."""
         self._network, self._device = load_named(CLASSES, "tracking", model, folder, device)
@@ -77,7 +58,7 @@ class VideoTracker:
             _even_scores(self._network)
         self._session_class = SESSIONS[model]
         self._settings = settings or InstanceSettings()
-        self._tracker = tracker or VideoTrackerSettings()
+        self._tracker = self._settings.video_tracker
         self._shape = sam_input(model, int(self._network.config.image_size))
 
     def __call__(

@@ -67,7 +67,7 @@ def consolidate(
     if not chunks:
         return ConsolidationReport(0, 0, (), (), 0)
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
-    summaries, before = chunk_summaries(store), store.settled()
+    summaries, before = chunk_summaries(store, s.shapes), store.settled()
     ledger, world = read_ledger(store, chunks), _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))
     if ledger is None or world is None or _most_moved(store, moved, len(before), world, s):

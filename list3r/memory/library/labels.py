@@ -14,6 +14,7 @@ from typing import Any
 
 from list3r.memory.constraints import Key
 from list3r.memory.records import Instance
+from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
 
 _CLASSES = "label classes"
@@ -182,6 +183,7 @@ def apply_labels(
     known = store.get_value(_CLASSES)
     if known is None:
         return {}
+    settings = settings or stored_settings(store, LabelSettings, "library", "labels")
     before: dict[str, list[Any]] = store.get_value("detected labels", {})
     instances = store.instances() if written is None else store.instances_of(sorted(written))
     home = _home(store, None if written is None else [i.id for i in instances])

@@ -12,16 +12,19 @@ from list3r.memory.constraints import Key
 from list3r.memory.description.colors import Reference
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.instances import DeriveSettings
+from list3r.memory.library.labels import LabelSettings
 from list3r.memory.library.settled_poses import HysteresisSettings
 from list3r.memory.merging.moving import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
 from list3r.memory.overlap.planes import place_planes
 from list3r.memory.overlap.summaries import Summaries, cameras_of, light_of, sample_of, world_unit
+from list3r.memory.overlap.voxels import ShapeSettings
 from list3r.memory.records import ChunkRow
 from list3r.memory.relations.scene import RelationSettings
 from list3r.memory.relations.structure import StructureSettings
+from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import floor_height
+from list3r.memory.world.gravity import GravitySettings, floor_height
 
 _POSED = 80
 """Posed frames from which it does not matter any more how many there are, see `EvidenceSettings.min_share`."""
@@ -39,6 +42,9 @@ class ConsolidationSettings:
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     hysteresis: HysteresisSettings = field(default_factory=HysteresisSettings)
     changes: ChangeSettings = field(default_factory=ChangeSettings)
+    labels: LabelSettings = field(default_factory=LabelSettings)
+    shapes: ShapeSettings = field(default_factory=ShapeSettings)
+    gravity: GravitySettings = field(default_factory=GravitySettings)
     whole_chunks: int = 6
     """Up to so many chunks the library is derived as a whole; then only what a chunk touches."""
     whole_share: float = 0.3
@@ -46,8 +52,11 @@ class ConsolidationSettings:
 
 
 def settings_of(store: Store, settings: ConsolidationSettings | None) -> ConsolidationSettings:
-    """The settings for a memory: what no sensor measured is less exact."""
-    s = settings or ConsolidationSettings()
+    """Return the settings for a memory, those it was begun with unless others are given.
+
+    What no sensor measured is less exact.
+    """
+    s = settings or stored_settings(store, ConsolidationSettings, "library")
     if store.get_value("scale_kind", "metric") == "metric":
         return s
     noise, band = s.relations.computed_noise_m, s.structure.computed_floor_band_m

@@ -13,6 +13,7 @@ from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.planes import Planes, chunk_planes
 from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes
 from list3r.memory.records import ChunkRow, MotionTrack
+from list3r.memory.settings import stored_settings
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
@@ -115,8 +116,8 @@ class SomeSummaries(Mapping[int, ChunkSummary]):
 
 
 def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> Summaries:
-    """The summaries of all chunks by id."""
-    return Summaries(store, settings)
+    """Return the summaries of all chunks by id; without settings, by those that the memory was begun with."""
+    return Summaries(store, settings or stored_settings(store, ShapeSettings, "library", "shapes"))
 
 
 def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:

@@ -11,6 +11,7 @@ import numpy as np
 from list3r.memory.geometry import Array, Sim3, rotation_exp
 from list3r.memory.overlap.planes import Planes, place_planes
 from list3r.memory.overlap.summaries import cameras_of, chunk_summaries, sample_of, world_unit
+from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
 
 
@@ -178,7 +179,7 @@ def estimate_gravity(
     agrees with the one before within `settled_deg` gives way to that one, so that the world does not tremble with every
     chunk.
     """
-    s = settings or GravitySettings()
+    s = settings or stored_settings(store, GravitySettings, "library", "gravity")
     chunks = store.chunks()
     if S_graph_chunk is None or components is None:
         S_graph_chunk = {c.chunk_id: c.S_world_chunk for c in chunks}

@@ -1,0 +1,125 @@
+"""All that decides what a build or an update makes of a video, one field for each stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from list3r.association.graph.chunk_nodes import NodeSettings
+from list3r.association.graph.pose_graph import GraphSettings
+from list3r.association.graph.surface_graph import SurfaceSettings
+from list3r.association.overlap.camera_edge import CameraEdgeSettings
+from list3r.association.overlap.edges import EdgeSettings
+from list3r.association.overlap.motion import MotionSettings
+from list3r.association.revisits.reprojection_edge import ReprojectionSettings
+from list3r.association.revisits.search import RevisitSettings
+from list3r.association.revisits.session_ties import TieSettings
+from list3r.frames.chunking.borrowing import BorrowSettings
+from list3r.frames.chunking.chunks import ChunkSettings
+from list3r.frames.chunking.cuts import CutSettings
+from list3r.frames.chunking.pace import PaceSettings
+from list3r.instances.carving.carved_surfaces import ChangedPlaceSettings
+from list3r.instances.settings import InstanceSettings
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.library.rules import ConsolidationSettings
+from list3r.memory.records import Session
+from list3r.memory.settings import as_plain, from_plain
+from list3r.reconstruction.settings import ReconstructionSettings
+
+
+@dataclass(frozen=True)
+class AssociationSettings:
+    """How chunks become one world."""
+
+    revisits: RevisitSettings = field(default_factory=RevisitSettings)
+    edges: EdgeSettings = field(default_factory=EdgeSettings)
+    cameras: CameraEdgeSettings = field(default_factory=CameraEdgeSettings)
+    """Of edges by the cameras of two chunks, where a model knows those better than surfaces."""
+    reprojection: ReprojectionSettings = field(default_factory=ReprojectionSettings)
+    """Of loops of such models."""
+    ties: TieSettings = field(default_factory=TieSettings)
+    graph: GraphSettings = field(default_factory=GraphSettings)
+    nodes: NodeSettings = field(default_factory=NodeSettings)
+    surfaces: SurfaceSettings = field(default_factory=SurfaceSettings)
+    solved_whole: int = 60
+    """Chunks up to which every new one solves the whole graph again (some milliseconds); beyond, it is fitted in."""
+    up_always: int = 64
+    """Chunks up to which every new one makes it be asked which way is up and what a unit of the world is. Beyond, that
+    stands until the session is finished: to turn the world is to touch all of it."""
+    up_again: int = 32
+    """Where up is not known yet it is asked again after so many chunks."""
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """What shapes a memory. Two builds of one source with equal settings give equal memories.
+
+    The settings are stored with the session. `--resume` goes on with them, and an update without settings of its own
+    takes those of the memory's stages.
+    """
+
+    reconstruction: str = "auto"
+    """The reconstruction model; auto: rgbd where the source has depth, else sfm."""
+    poses: str = "estimate"
+    """given, estimate, or auto: given where the source has them."""
+    device: str = "auto"
+    """Where neural models run: cpu, cuda, or auto, the first GPU where there is one."""
+    weights: str | None = None
+    """Weights of the reconstruction model instead of its own."""
+    discovery: str = "geometric"
+    """What finds things on anchor frames."""
+    tracking: str = "reprojection"
+    """What follows them through the chunk."""
+    features: str = "geometric"
+    """What describes the look of a thing, by which it is recognised."""
+    instance_weights: tuple[tuple[str, str], ...] = ()
+    """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
+    local_features: str = "sift"
+    """What finds a keyframe again: sift or aliked; aliked also ties frames of `sfm` between which nothing can be
+    followed."""
+    feature_weights: str | None = None
+    """File of the weights of learned local features."""
+    chunks: ChunkSettings = field(default_factory=ChunkSettings)
+    """By frames that get depth."""
+    depth_every: int | None = None
+    """From every how many frames models that compute depth do so, the others get a pose; None: by `pace`."""
+    instances: InstanceSettings = field(default_factory=InstanceSettings)
+    keep_pictures: bool = True
+    """Keep a JPEG of each keyframe in the memory."""
+    cuts: CutSettings = field(default_factory=CutSettings)
+    """Where the video jumps."""
+    pace: PaceSettings = field(default_factory=PaceSettings)
+    borrowing: BorrowSettings = field(default_factory=BorrowSettings)
+    """Frames from around a chunk through which the camera hardly moves."""
+    models: ReconstructionSettings = field(default_factory=ReconstructionSettings)
+    """Of every reconstruction model and its estimate of an unknown camera, and what a chunk keeps of its frames."""
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    """What has moved inside a chunk."""
+    association: AssociationSettings = field(default_factory=AssociationSettings)
+    carving: ChangedPlaceSettings = field(default_factory=ChangedPlaceSettings)
+    """Surfaces that another session sees through."""
+    library: ConsolidationSettings = field(default_factory=ConsolidationSettings)
+    """How the library is derived from the chunks. Those of the first session hold for a memory."""
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return them for JSON."""
+        return as_plain(self)
+
+    def differing(self, other: BuildSettings) -> list[str]:
+        """Return the names of the fields in which two settings differ."""
+        return [f.name for f in fields(self) if getattr(self, f.name) != getattr(other, f.name)]
+
+
+CHOICES = ("reconstruction", "poses", "device", "weights", "discovery", "tracking", "features", "instance_weights")
+"""Fields that name models: what suits one source may not suit the next."""
+
+
+def session_settings(session: Session) -> BuildSettings:
+    """Return the settings that a session was made with; what an older version did not store has its default.
+
+    Raises `MemoryFileError`.
+    """
+    try:
+        return from_plain(BuildSettings, session.settings)
+    except (ValueError, TypeError) as error:
+        raise MemoryFileError(f"the settings of session {session.session_id} cannot be read: {error}") from error
