@@ -60,8 +60,8 @@ def test_every_number_of_every_stage_survives_the_way_through_json() -> None:
 
 def test_what_is_not_there_is_as_by_default_and_what_nobody_knows_is_left_out() -> None:
     assert from_plain(BuildSettings, {}) == BuildSettings()
-    found = from_plain(BuildSettings, {"chunks": {"length": 40, "overlap": 12}, "gone": 1, "rgbd": {"gone": {}}})
-    assert found.chunks.length == 40 and found.rgbd == BuildSettings().rgbd
+    found = from_plain(BuildSettings, {"chunks": {"length": 40, "overlap": 12}, "gone": 1, "models": {"gone": {}}})
+    assert found.chunks.length == 40 and found.models == BuildSettings().models
 
 
 @pytest.mark.parametrize(
