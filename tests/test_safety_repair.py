@@ -69,6 +69,7 @@ def test_what_is_not_as_it_was_written_is_not_answered_with(
     path = make_memory()
     spoil(path, "UPDATE instances SET confidence = 0.123 WHERE id = 3")
     monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 2**40 if whole else 0)
+    monkeypatch.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
     for ask in (
         lambda store: store.instances(),
         lambda store: store.instance(3),
@@ -85,6 +86,7 @@ def test_large_memories_check_the_relations_and_surfaces_that_they_read(
 ) -> None:
     path = make_memory()
     monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
+    monkeypatch.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
     with Store.open(path) as store:
         assert len(store.relations(3)) == 1 and len(store.surface_points(5)) == len(store.support(5).points) == 400
     spoil(path, "UPDATE relations SET margin = 0.5 WHERE subject = 3")
@@ -95,7 +97,7 @@ def test_large_memories_check_the_relations_and_surfaces_that_they_read(
         with Store.open(path) as store, pytest.raises(MemoryFileError, match="supports 1:4: the checksum"):
             ask(store)
     with Store.open(path) as store:
-        assert len(store.relations(4)) == 1 and len(store.support(2).points) == 400
+        assert len(store.relations(4)) == 1
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Unpack
 
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.errors import OptionError
 from list3r.memory.records import BestView
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
@@ -117,10 +117,6 @@ def _followed(store: Store, camera: PosedCamera) -> set[int] | None:
     out = set()
     for o in store.observations():
         if o.chunk_id == camera.frame.chunk_id:
-            try:
-                frames = store.mask_track(o.chunk_id, o.local_id).frames
-            except MemoryFileError:
-                continue
-            if camera.frame.frame_index in frames:
+            if camera.frame.frame_index in store.mask_track(o.chunk_id, o.local_id).frames:
                 out.add(o.instance_id)
     return out

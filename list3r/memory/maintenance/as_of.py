@@ -7,7 +7,10 @@ today. Relations among what has not changed since are those of the file; the oth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +21,9 @@ from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.predicates import relations
+from list3r.memory.store.committed import Committed
+from list3r.memory.store.lock import WriterLock
+from list3r.memory.store.read_checks import ReadChecks
 from list3r.memory.store.store import Store
 
 _BY_SESSION = ("sessions", "chunks", "frames", "events")
@@ -28,31 +34,79 @@ _REACH_M = 2.0
 
 def store_at(store: Store, session_id: int) -> Store:
     """A store to read, as it was after a session; close it like any other. Raises `OptionError` for no such session."""
-    with store.snapshot():
-        then, now = world_at(store, session_id), {i.id: i for i in store.instances()}
-        known = store.relations()
-        vertical = store.get_value("gravity", "unknown") != "unknown"
     past = _PastStore.open(store.path)
+    past.session_id = session_id
     try:
-        past.show(session_id, then)
-        changed = {i.id for i in then if _has_changed(i, now.get(i.id))}
-        past.relate([*_kept(known, then, changed), *_told_anew(past, then, changed, vertical)])
+        with past.snapshot():
+            return past
     except BaseException:
         past.close()
         raise
-    return past
 
 
 class _PastStore(Store):
-    """A store whose tables end with a session. Checksums are those of the file's own rows, which were checked as they
-    were read to make it."""
+    """A store whose tables end with a session; what is read is checked in the file itself, by a connection of its own.
+    What another process writes is taken in when the next snapshot begins, all of it or nothing.
+    """
+
+    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
+        super().__init__(path, database, lock)
+        file = database.execute("SELECT file FROM pragma_database_list WHERE name = 'main'").fetchone()[0]
+        self._plain = Committed(path)
+        if file and Path(file).exists():  # else a copy of our own, whose rows were checked as it was made
+            self._checks = ReadChecks(database, self._plain, whole=not self._checks.by_part("supports"))
+
+    def close(self) -> None:
+        """Let the file go. A second call does nothing."""
+        self._plain.close()
+        super().close()
+
+    session_id = 0
+    _shown: int | None = None
+    """The state of the file that is shown."""
+
+    @contextlib.contextmanager
+    def _state(self) -> Iterator[None]:
+        with self._guard:
+            if self._database.in_transaction:
+                yield
+                return
+            self._database.execute("BEGIN")
+            try:
+                self._database.execute("SELECT 1 FROM main.memory LIMIT 1").fetchall()
+                version = int(self._database.execute("PRAGMA main.data_version").fetchone()[0])
+                if version != self._shown:
+                    self._take_in()
+                    self._shown = version
+                yield
+            finally:
+                if self._database.in_transaction:
+                    self._database.execute("COMMIT")
+
+    def _take_in(self) -> None:
+        """Show the file as it is now, as far as it was known after the session."""
+        self._database.execute("PRAGMA query_only=OFF")
+        for kind, name in self._database.execute("SELECT type, name FROM sqlite_temp_master").fetchall():
+            if kind == "view" or name in ("instances", "relations", "instance_boxes"):
+                self._database.execute(f"DROP {kind} temp.{name}")
+        self.forget_rows()
+        then, now = world_at(self, self.session_id), {i.id: i for i in self.instances()}
+        known = self.relations()
+        vertical = self.get_value("gravity", "unknown") != "unknown"
+        self.show(self.session_id, then)
+        changed = {i.id for i in then if _has_changed(i, now.get(i.id))}
+        self.relate([*_kept(known, then, changed), *_told_anew(self, then, changed, vertical)])
+
+    def verify(self) -> list[str]:
+        """Every damage of the file itself."""
+        with Store.open(self.path) as store:
+            return store.verify()
 
     def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         return rows
 
     def show(self, session_id: int, instances: Sequence[Instance]) -> None:
         """From now on only what was known after a session is read."""
-        self._checks = None
         self.forget_rows()
         made = dict(self._rows("SELECT name, sql FROM main.sqlite_master WHERE sql IS NOT NULL"))
         self._database.execute("PRAGMA query_only=OFF")

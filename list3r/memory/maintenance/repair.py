@@ -25,7 +25,15 @@ from list3r.memory.store.checksums import (
     write_part,
 )
 from list3r.memory.store.codec import checksum, pack_sim3, unpack
-from list3r.memory.store.file import check_schema, connected, fold_in, migrate, protect
+from list3r.memory.store.file import (
+    check_beside,
+    check_schema,
+    connected,
+    fold_in,
+    migrate,
+    protect,
+    rename_exclusively,
+)
 from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
@@ -105,7 +113,7 @@ def _repair(path: Path, target: Path) -> RepairReport:
         if left:
             raise MemoryFileError(f"{path} could not be repaired: {left[0]}; keep the file and report this")
         original = path if target != path else _put_aside(path)
-        made.rename(target)
+        rename_exclusively(made, target)
     return _report(target, original, tuple(damage), lost, rebuilt=rebuilt)
 
 
@@ -121,6 +129,7 @@ def _check_target(path: Path, target: Path) -> None:
         raise MemoryFileError(f"{path} does not exist")
     if target != path and target.exists():
         raise MemoryFileError(f"{target} exists already; give --out a new name")
+    check_beside(path)
     if not target.resolve().parent.is_dir():
         raise MemoryFileError(f"the folder {target.resolve().parent} does not exist; create it first")
 
@@ -128,6 +137,13 @@ def _check_target(path: Path, target: Path) -> None:
 def _copy(path: Path, copy: Path) -> None:
     """The file and its write-ahead log, so that the original stays as it is."""
     try:
+        size = sum(Path(f"{path}{end}").stat().st_size for end in ("", "-wal") if Path(f"{path}{end}").exists())
+        free = shutil.disk_usage(copy.parent).free
+        if 2 * size > free:
+            raise MemoryFileError(
+                f"{path} takes {size / 1e6:.0f} MB, and so does what is saved of it; {copy.parent.parent} has "
+                f"{free / 1e6:.0f} MB free: free some space, or name another folder by --out"
+            )
         for end in ("", "-wal", "-journal"):
             if Path(f"{path}{end}").exists():
                 shutil.copyfile(f"{path}{end}", f"{copy}{end}")
@@ -150,6 +166,11 @@ def _connect(path: Path, copy: Path, lost: _Lost) -> sqlite3.Connection:
     """
     database = sqlite3.connect(copy, isolation_level=None)
     try:
+        _check_ours(path, database)
+    except MemoryFileError:
+        database.close()
+        raise
+    try:
         protect(database)
         database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         version = int(database.execute("PRAGMA user_version").fetchone()[0])
@@ -159,8 +180,7 @@ def _connect(path: Path, copy: Path, lost: _Lost) -> sqlite3.Connection:
             migrate(database, version)
         check_schema(path, database, SCHEMA_VERSION)
     except (*FAILURES, MemoryFileError) as error:
-        with contextlib.closing(database):
-            _check_ours(path, database)
+        database.close()
         raise MemoryFileError(
             f"{path} cannot be repaired: what says which tables it holds is damaged ({error}); use a backup"
         ) from error

@@ -61,6 +61,12 @@ class SummedTable:
             return f"%s.{first}"
         return f"(%s.{first} >> {_ROWS_OF_A_PART})" if self.numbered else "0"
 
+    def part_of_first(self, key: int) -> int:
+        """The part of the rows whose first column of the key is this number; not for `frames`."""
+        if self.key[0] == "chunk_id" and len(self.key) > 1:
+            return key
+        return key >> _ROWS_OF_A_PART if self.numbered else 0
+
     def part_of(self, row: str) -> str:
         """`part` over the columns of a named row."""
         return self.part.replace("%s", row)
@@ -271,12 +277,14 @@ def _missing(count: int) -> str:
     return "a row is missing" if count == 1 else f"{count} rows are missing"
 
 
-def own_crc_wrong(database: sqlite3.Connection, table: str, keys: Iterable[str]) -> Iterator[BadRow]:
+def own_crc_wrong(
+    database: sqlite3.Connection, table: str, keys: Iterable[str], where: tuple[str, tuple[int, ...]] = ("1", ())
+) -> Iterator[BadRow]:
     """Rows whose blobs do not match the checksum in their own row."""
     names = ", ".join(keys)
     count = len(names.split(","))
-    query = f"SELECT {names}, crc, {', '.join(OWN_CRC[table])} FROM {table}"
-    for row in database.execute(query):
+    query = f"SELECT {names}, crc, {', '.join(OWN_CRC[table])} FROM {table} WHERE {where[0]}"
+    for row in database.execute(query, where[1]):
         key, crc, blobs = row[:count], row[count], row[count + 1 :]
         value = 0
         for blob in blobs:

@@ -6,14 +6,15 @@ import contextlib
 import os
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from traceback import walk_tb
 from types import TracebackType
 from typing import Any, Self
 
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.checksums import Sums
-from list3r.memory.store.codec import checksum, from_json, to_json
+from list3r.memory.store.codec import from_json, to_json
 from list3r.memory.store.committed import Committed
 from list3r.memory.store.derived import Derived
 from list3r.memory.store.file import (
@@ -53,7 +54,7 @@ class Connection:
         self._sums = None if lock is None else Sums(database)
         self._followers = () if self._sums is None else (WordIndex(database), self._sums)
         """What follows the rows that a transaction changes; in this order as it commits."""
-        self._checks = ReadChecks(database, self._committed) if _size(database) <= WHOLE_BYTES else None
+        self._checks = ReadChecks(database, self._committed, whole=_size(database) <= WHOLE_BYTES)
         self._writing = False
         self._guard = threading.RLock()
         self.derived = Derived()
@@ -187,7 +188,8 @@ class Connection:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        found = self._damage() if isinstance(error, Exception) and not isinstance(error, List3rError | OSError) else []
+        ours = isinstance(error, Exception) and not isinstance(error, List3rError | OSError) and _is_ours(trace)
+        found = self._damage() if ours else []
         self.close()
         if found:
             raise MemoryFileError(_damaged(self.path, found[0])) from error
@@ -205,7 +207,7 @@ class Connection:
                 self._writing = True
                 try:
                     yield
-                    self._refuse(self._checks.found() if self._checks is not None else None)
+                    self._refuse(self._checks.found())
                     self._refuse(self._written_over())
                     for follower in self._followers:
                         follower.write()
@@ -239,6 +241,13 @@ class Connection:
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
         """All that is read inside belongs to one state of the memory, whatever a writer commits meanwhile."""
+        self._refuse(self._checks.damage)
+        with self._state():
+            yield
+
+    @contextlib.contextmanager
+    def _state(self) -> Iterator[None]:
+        """`snapshot`, of a damaged memory too."""
         with self._guard:
             if self._database.in_transaction:
                 yield
@@ -276,15 +285,14 @@ class Connection:
     def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         try:
             rows = self._database.execute(query, arguments).fetchall()
-            if self._checks is not None:
-                self._refuse(self._checks.found())
+            self._refuse(self._checks.found())
             return rows
         except FAILURES as error:
             raise MemoryFileError(explained(self.path, error)) from error
 
     def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
-        if self._checks is None:
+        if self._checks.by_part(table):
             written = frozenset[int]() if self._sums is None else self._sums.touched(table)
             try:
                 bad = unbelieved(self._database, table, [row for row in rows if int(row[0]) >> 4 not in written])
@@ -293,15 +301,14 @@ class Connection:
             self._refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
         return rows
 
-    def _own_crc_believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Rows that begin with two keys and a count and end with blobs and their checksum: that is compared where the
-        table is not checked as a whole.
-        """
-        if self._checks is None:
-            for row in rows:
-                if checksum(*(blob if isinstance(blob, bytes) else b"" for blob in row[3:-1])) != row[-1]:
-                    self._refuse(f"{table} {row[0]}:{row[1]}: the checksum does not match")
-        return rows
+    def _sound(self, table: str, keys: Iterable[int]) -> None:
+        """Check what rows with these first keys stand in, where the table is not checked as a whole."""
+        self._refuse(self._checks.found_in_parts(table, keys))
+
+
+def _is_ours(trace: TracebackType | None) -> bool:
+    """Whether an error came out of this package, and not of what its user does beside."""
+    return any(str(frame.f_globals.get("__name__", "")).startswith("list3r.") for frame, _ in walk_tb(trace))
 
 
 def remove_memory(path: Path) -> None:

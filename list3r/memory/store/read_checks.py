@@ -1,24 +1,28 @@
 """What is read is checked first, so that a flipped byte is an error and no wrong answer.
 
-In files of up to `WHOLE_BYTES` a table is checked as a whole when it is first read: its pages and indices, the sums of
-its rows and blobs, and, for what is derived, what it was derived from. That takes about as long as reading it, once for
-each connection. In larger ones rows of instances and relations (`unbelieved`) and the surfaces of things are checked
-one by one as they are read; the rest, and rows that are missing, by `verify` alone.
+A table is checked as a whole when it is first read: its pages and indices, the sums of its rows and blobs, and, for
+what is derived, what it was derived from. That takes about as long as reading it, once for each connection. In files of
+more than `WHOLE_BYTES` tables that no question reads whole are checked part by part as they are read: those with large
+blobs, and those of more than `MOST_ROWS` rows that belong to instances. There, rows that are missing, and what the
+R*Tree and the table of words leave out, are found by `verify` alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, own_crc_wrong, row_crc, summed_tables
+from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, bad_rows_of_part, own_crc_wrong, row_crc, summed_tables
 from list3r.memory.store.word_index import expected_words, up_to_date
 
 WHOLE_BYTES = 128 * 2**20
 """Half a second of checking, at the most."""
+MOST_ROWS = 50_000
+"""Of one table; a third of a second."""
 FAILURES = (sqlite3.Error, UnicodeError)
 """What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
 GEOMETRY_BYTES = 24 * 8
@@ -26,21 +30,40 @@ _PARTS = 500
 """Parts of the sums that are asked for in one statement."""
 BOXES = "instance_boxes"
 WORDS = "words"
+_OF_INSTANCES = {
+    name: name for name in ("instances", "relations", "observations", "embeddings", "overlaps", "members")
+} | {BOXES: "instances", WORDS: "instances"}
+"""Tables that grow with what there is to see and are read in part, and the table whose rows tell how large they are."""
 
 
 class ReadChecks:
     """Knows which tables a connection has read, and which of them are sound; damage once found is never forgotten."""
 
-    def __init__(self, database: sqlite3.Connection, committed: Callable[[], sqlite3.Connection] | None = None) -> None:
-        """`committed`, for a connection that writes, leads to another that does not see what is not committed yet."""
+    def __init__(
+        self,
+        database: sqlite3.Connection,
+        committed: Callable[[], sqlite3.Connection] | None = None,
+        *,
+        whole: bool = True,
+    ) -> None:
+        """`committed`, for a connection that writes, leads to another that does not see what is not committed yet.
+
+        Without `whole` the large tables are left to `found_in_parts`.
+        """
         self._database = database
         self._committed = committed
         self._checked: set[str] = set()
         self._read: set[str] = set()
-        self._damage: str | None = None
+        self.damage: str | None = None
+        """What was found; from then on every question is refused."""
         self._busy = False
-        self._known = {*summed_tables(), BOXES, WORDS}
+        self._known = {*summed_tables(), BOXES, WORDS} - (set() if whole else _large(database))
+        self._sound_parts: set[tuple[str, int]] = set()
         database.set_authorizer(self._note)
+
+    def by_part(self, table: str) -> bool:
+        """Whether a table is checked part by part."""
+        return table not in self._known
 
     def _note(self, action: int, table: str | None, *_: str | None) -> int:
         if action == sqlite3.SQLITE_READ and table is not None and not self._busy:
@@ -49,13 +72,30 @@ class ReadChecks:
                 self._read.add(name)
         return sqlite3.SQLITE_OK
 
+    @contextlib.contextmanager
+    def resting(self) -> Iterator[None]:
+        """What is read inside is looked at as it is."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+
     def found(self) -> str | None:
         """The first damage of the tables that this connection has read so far."""
-        if self._damage is None and self._read:
-            self._damage = self._found(sorted(self._read))
-        return self._damage
+        if self.damage is None and self._read:
+            self.damage = self._found(sorted(self._read))
+        return self.damage
 
-    def _found(self, names: Sequence[str]) -> str | None:
+    def found_in_parts(self, table: str, keys: Iterable[int]) -> str | None:
+        """The first damage of the parts of a table that rows with these first keys lie in."""
+        if self.damage is None and self.by_part(table):
+            fresh = {(table, summed_tables()[table].part_of_first(int(k))) for k in keys} - self._sound_parts
+            self.damage = self._found(sorted(fresh))
+        return self.damage
+
+    def _found(self, names: Sequence[str] | Sequence[tuple[str, int]]) -> str | None:
+        """The first damage of tables, or of parts of tables."""
         database = self._database if self._committed is None else self._committed()
         self._busy, opened = True, not database.in_transaction
         text_factory, database.text_factory = database.text_factory, any_text
@@ -63,10 +103,13 @@ class ReadChecks:
             if opened:
                 database.execute("BEGIN")
             for name in names:
-                for text in damage_of(database, name):
+                for text in damage_of(database, name) if isinstance(name, str) else damage_of_part(database, *name):
                     return text
-                self._checked.add(name)
-                self._read.discard(name)
+                if isinstance(name, str):
+                    self._checked.add(name)
+                    self._read.discard(name)
+                else:
+                    self._sound_parts.add(name)
             return None
         except FAILURES as error:
             return str(error)
@@ -91,6 +134,21 @@ def damage_of(database: sqlite3.Connection, name: str, *, pages: bool = True) ->
     if name in OWN_CRC:
         yield from map(str, own_crc_wrong(database, name, summed_tables()[name].key))
     yield from map(str, bad_rows_of(database, summed_tables()[name]))
+
+
+def damage_of_part(database: sqlite3.Connection, name: str, part: int) -> Iterator[str]:
+    """Every damage of one part of a table: its sums and its blobs."""
+    table = summed_tables()[name]
+    yield from map(str, bad_rows_of_part(database, table, part))
+    if name in OWN_CRC:
+        yield from map(str, own_crc_wrong(database, name, table.key, table.where(part)))
+
+
+def _large(database: sqlite3.Connection) -> set[str]:
+    """Tables that are checked part by part in a large file."""
+    query = "SELECT coalesce(sum(length(crcs) / 4 - 1), 0) FROM sums WHERE name = ?"
+    rows = {n: database.execute(query, (n,)).fetchone()[0] for n in {*_OF_INSTANCES.values()}}
+    return {*OWN_CRC, *(name for name, of in _OF_INSTANCES.items() if rows[of] > MOST_ROWS)}
 
 
 def bad_boxes(database: sqlite3.Connection) -> Iterator[str]:

@@ -38,7 +38,7 @@ class Store(EditVerbs, EventVerbs, LibraryVerbs):
             before = self._database.text_factory
             self._database.text_factory = any_text
             try:
-                with self.snapshot():
+                with self._state(), self._checks.resting():
                     return list(self._verify())
             finally:
                 self._database.text_factory = before

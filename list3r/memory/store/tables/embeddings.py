@@ -46,6 +46,7 @@ class EmbeddingVerbs(ChunkVerbs, WordVerbs):
     def embeddings(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Ids of shape (N,) and vectors of shape (N, D) of a named space."""
         rows = self._rows("SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance", (space,))
+        self._sound("embeddings", (row[0] for row in rows))
         ids = np.array([r[0] for r in rows], dtype=np.int64)
         return ids, np.array([np.frombuffer(r[1], "<f4") for r in rows], dtype=np.float32)
 
@@ -57,6 +58,7 @@ class EmbeddingVerbs(ChunkVerbs, WordVerbs):
             marks = ",".join("?" * len(part))
             query = f"SELECT instance, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
             rows += self._rows(query, (*part, space))
+        self._sound("embeddings", (row[0] for row in rows))
         return _vectors(sorted(rows), space)
 
     def embedding_batches(
@@ -67,6 +69,7 @@ class EmbeddingVerbs(ChunkVerbs, WordVerbs):
         query = "SELECT instance, vector FROM embeddings WHERE instance > ? AND space = ? ORDER BY instance LIMIT ?"
         while rows := self._rows(query, (last, space, size)):
             last = rows[-1][0]
+            self._sound("embeddings", (row[0] for row in rows))
             yield _vectors(rows, space)
 
     def embedding_count(self, space: str) -> int:

@@ -111,11 +111,13 @@ class FrameVerbs(PlacementVerbs):
 
     def keyframes(self, chunk_id: int) -> list[Keyframe]:
         """The keyframes of a chunk in order."""
+        self._sound("keyframes", [chunk_id])
         query = "SELECT frame_index, descriptor, features, jpeg FROM keyframes WHERE chunk_id = ? ORDER BY frame_index"
         return [read_keyframe(chunk_id, *row) for row in self._rows(query, (chunk_id,))]
 
     def keyframe(self, chunk_id: int, frame_index: int) -> Keyframe:
         """One keyframe. Raises `MemoryFileError` when the memory has none there."""
+        self._sound("keyframes", [chunk_id])
         query = "SELECT frame_index, descriptor, features, jpeg FROM keyframes WHERE chunk_id = ? AND frame_index = ?"
         rows = self._rows(query, (chunk_id, frame_index))
         if not rows:
@@ -132,6 +134,7 @@ class FrameVerbs(PlacementVerbs):
         where = "" if chunk_ids is None else f"WHERE chunk_id IN ({','.join(str(int(k)) for k in chunk_ids)})"
         query = f"SELECT chunk_id, frame_index, descriptor FROM keyframes {where} ORDER BY chunk_id, frame_index"
         rows = self._rows(query)
+        self._sound("keyframes", (row[0] for row in rows))
         keys = np.array([(r[0], r[1]) for r in rows], dtype=np.int64).reshape(-1, 2)
         out = np.zeros((len(rows), len(rows[0][2]) // 4 if rows else 0), np.float32)
         for k, row in enumerate(rows):

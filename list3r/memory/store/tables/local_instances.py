@@ -111,10 +111,14 @@ class LocalVerbs(FrameVerbs):
             " JOIN chunks c USING (chunk_id) JOIN supports s USING (chunk_id, local_id)"
             f" {where} ORDER BY l.chunk_id, l.local_id"
         )
-        return [_local_node(row) for row in self._rows(query, tuple(chunk_ids or ()))]
+        rows = self._rows(query, tuple(chunk_ids or ()))
+        for table in ("local_instances", "supports"):
+            self._sound(table, (row[0] for row in rows))
+        return [_local_node(row) for row in rows]
 
     def mask_track(self, chunk_id: int, local_id: int) -> MaskTrack:
         """The masks of one local instance. Raises `MemoryFileError` when it is not there."""
+        self._sound("local_instances", [chunk_id])
         rows = self._rows("SELECT track FROM local_instances WHERE chunk_id = ? AND local_id = ?", (chunk_id, local_id))
         if not rows:
             raise MemoryFileError(f"{self.path} has no local instance {local_id} in chunk {chunk_id}")
@@ -131,11 +135,13 @@ class LocalVerbs(FrameVerbs):
 
     def dynamic_locals(self, chunk_id: int) -> list[int]:
         """Local ids of a chunk's instances that move."""
+        self._sound("local_instances", [chunk_id])
         query = "SELECT local_id FROM local_instances WHERE chunk_id = ? AND dynamic ORDER BY local_id"
         return [int(n) for (n,) in self._rows(query, (chunk_id,))]
 
     def motion_track(self, chunk_id: int, local_id: int) -> MotionTrack | None:
         """Where a moving local instance was, chunk coordinates; None for one that does not move."""
+        self._sound("local_instances", [chunk_id])
         query = "SELECT motion FROM local_instances WHERE chunk_id = ? AND local_id = ?"
         rows = self._rows(query, (chunk_id, local_id))
         return read_motion(rows[0][0], f"the motion of local instance {chunk_id}:{local_id}") if rows else None

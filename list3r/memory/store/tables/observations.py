@@ -39,7 +39,9 @@ class ObservationVerbs(InstanceVerbs):
         """Which local instances make up an instance, or all of them."""
         where, arguments = ("", ()) if instance_id is None else ("WHERE instance = ?", (self.resolve(instance_id),))
         query = f"SELECT instance, chunk_id, local_id FROM observations {where} ORDER BY chunk_id, local_id"
-        return [Observation(*r) for r in self._rows(query, arguments)]
+        rows = self._rows(query, arguments)
+        self._sound("observations", (row[1] for row in rows))
+        return [Observation(*row) for row in rows]
 
     def observed_as(self, keys: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
         """The instances of these local instances (chunk id, local id) that belong to one."""
@@ -87,10 +89,12 @@ class ObservationVerbs(InstanceVerbs):
     def surface_points(self, instance_id: int) -> NDArray[np.float32]:
         """Support points of one instance (no alias) in the world, without their colours. Shape (N, 3)."""
         query = (
-            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb, s.crc FROM observations o"
+            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb FROM observations o"
             " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
         )
-        rows = self._own_crc_believed("supports", self._rows(query, (int(instance_id),)))
+        rows = self._rows(query, (int(instance_id),))
+        for table in ("observations", "supports"):
+            self._sound(table, (row[0] for row in rows))
         if not rows:
             return np.zeros((0, 3), np.float32)
         placed = self._poses({row[0] for row in rows})
@@ -102,11 +106,13 @@ class ObservationVerbs(InstanceVerbs):
 
     def _support_parts(self, instance_id: int) -> list[tuple[int, Support]]:
         query = (
-            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb, s.crc FROM observations o"
+            "SELECT s.chunk_id, s.local_id, s.count, s.grid, s.points, s.confidence, s.rgb FROM observations o"
             " JOIN supports s USING (chunk_id, local_id) WHERE o.instance = ? ORDER BY s.chunk_id, s.local_id"
         )
-        rows = self._own_crc_believed("supports", self._rows(query, (instance_id,)))
-        return [_support_part(row[:-1]) for row in rows]
+        rows = self._rows(query, (instance_id,))
+        for table in ("observations", "supports"):
+            self._sound(table, (row[0] for row in rows))
+        return [_support_part(row) for row in rows]
 
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a moving instance was: seconds of shape (V,) and places in the world of shape (V, 3), in order of time.
@@ -150,6 +156,7 @@ class ObservationVerbs(InstanceVerbs):
             " WHERE chunk_id = ? AND local_id = ?"
         )
         rows = self._rows(query, (observation.chunk_id, observation.local_id))
+        self._sound("supports", [observation.chunk_id])
         points = _support_part(rows[0])[1].points if rows else np.zeros((0, 3), np.float32)
         if len(points) == 0:
             return np.full(3, np.nan)

@@ -64,7 +64,9 @@ class PlacementVerbs(EdgeVerbs):
             " p.S_world_chunk, c.fx, c.fy, c.cx, c.cy, c.height, c.width, c.scale_kind, p.covariance"
             f" FROM chunks c JOIN placements p USING (chunk_id) {where} ORDER BY c.chunk_id"
         )
-        return {row[0]: read_chunk_row(row) for row in self._rows(query, tuple(chunk_ids))}
+        rows = self._rows(query, tuple(chunk_ids))
+        self._sound("chunks", (row[0] for row in rows))
+        return {row[0]: read_chunk_row(row) for row in rows}
 
     def place_chunks(
         self,
