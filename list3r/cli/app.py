@@ -27,6 +27,8 @@ from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
 from list3r.cli.serve import mcp as mcp_commands
 from list3r.memory.errors import List3rError, naming_extras
+from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
+from list3r.memory.errors import List3rError
 
 app = typer.Typer(
     name="list3r",
@@ -65,12 +67,13 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
     if version:
         from list3r import __version__
 
-        print(f"list3r {__version__}")
+        say(f"list3r {__version__}")
         raise typer.Exit
 
 
 def main() -> None:
     """Run the command line and exit."""
+    prepare_streams()
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what is wrong with a picture is said by us, in one line
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL:
@@ -90,6 +93,8 @@ def run(arguments: list[str]) -> int:
         with naming_extras():
             status = command.main(arguments, prog_name="list3r", standalone_mode=False)
         sys.stdout.flush()
+        status = command.main(arguments, prog_name="list3r", standalone_mode=False)
+        flush()
         if status == _INTERRUPTED:
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
@@ -98,24 +103,37 @@ def run(arguments: list[str]) -> int:
     except _COMMAND_ERROR as error:
         return _fail(error.format_message())  # type: ignore[attr-defined]
     except List3rError as error:
-        return _fail(str(error))
+        return _unwritten(error) if isinstance(error, OutputError) else _fail(str(error))
     except (KeyboardInterrupt, typer.Abort):
-        print("\ninterrupted", file=sys.stderr)
+        tell("", "interrupted")
         return 1
-    except SystemExit as stop:
-        if not isinstance(stop.__context__, BrokenPipeError):
+    except (SystemExit, BrokenPipeError) as stop:
+        if not isinstance(stop, BrokenPipeError) and not isinstance(stop.__context__, BrokenPipeError):
             raise
         return _unheard()
-    except BrokenPipeError:
-        return _unheard()
-    except OSError as error:
-        where = f" {error.filename}:" if error.filename else ""
-        return _fail(f"{where} {error.strerror or error}".strip())
+    except (RuntimeError, OSError) as error:
+        return _fail_of_system(error)
+
+
+def _fail_of_system(error: RuntimeError | OSError) -> int:
+    """What the system says, and links that lead to themselves, which Python calls no error of the system."""
+    if isinstance(error, RuntimeError):
+        if not str(error).startswith("Symlink loop"):
+            raise error
+        return _fail(f"{error}; remove one of the links")
+    where = f" {error.filename}:" if error.filename else ""
+    return _fail(f"{where} {error.strerror or error}".strip())
+
+
+def _unwritten(error: OutputError) -> int:
+    mute()
+    _fail(str(error))
+    return 1
 
 
 def _unheard() -> int:
     """Whoever read the output has heard enough, as in `list3r list house.l3r | head -1`: that is no failure."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    mute()
     return 0
 
 
@@ -123,12 +141,12 @@ def _usage_error(error: BaseException) -> int:
     context = error.ctx  # type: ignore[attr-defined]
     message = error.format_message()  # type: ignore[attr-defined]
     if not message or message.startswith("Usage:"):
-        print(message or context.get_help(), file=sys.stderr)
+        tell(*(message or context.get_help()).splitlines())
         return 2
     path = context.command_path if context is not None else "list3r"
     return _fail(f"{message.rstrip('.')}; see `{path} --help`")
 
 
 def _fail(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    tell(f"error: {message}")
     return 2

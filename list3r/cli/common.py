@@ -7,7 +7,6 @@ import functools
 import inspect
 import json
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
@@ -15,6 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
+
+from list3r.cli.terminal import say, shown, tell, write
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -110,29 +111,28 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
 
 def print_json(value: object) -> None:
     """JSON on standard output; NaN becomes null."""
-    print(json.dumps(_plain(value), indent=2, allow_nan=False))
+    write(json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
 
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
     """Left-aligned columns under a header; a word where there are no rows."""
     rows = list(rows)
     if not rows:
-        print("nothing found")
+        say("nothing found")
         return
     cells = [list(header), *[[_cell(v) for v in row] for row in rows]]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-def note(message: str) -> None:
-    """A line for people, on standard error; work goes on where nobody listens any more."""
-    with contextlib.suppress(BrokenPipeError):
-        print(message, file=sys.stderr, flush=True)
+def note(*lines: str) -> None:
+    """Lines for people, on standard error; work goes on where nobody listens any more."""
+    tell(*lines)
 
 
 def _cell(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
+    return f"{value:.3f}" if isinstance(value, float) else shown(value)
 
 
 def _plain(value: Any) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING, Any
 
+from list3r.cli.terminal import say
+
 if TYPE_CHECKING:
     from list3r.memory.records import ChunkRow, Edge
     from list3r.memory.store.store import Store
@@ -80,21 +82,21 @@ def print_loop_report(report: dict[str, Any], units: str) -> None:
     """The report for people, at most 100 columns wide."""
     loops = [e for e in report["edges"] if e["kind"] == "loop"]
     accepted = sum(e["accepted"] for e in loops)
-    print()
+    say("")
     for line in _component_lines(report):
-        print(line)
+        say(line)
     for line in _adjacent_lines([e for e in report["edges"] if e["kind"] == "adjacent"], units):
-        print(line)
-    print(f"loops: {len(loops)} candidates, {accepted} accepted, {len(loops) - accepted} rejected")
+        say(line)
+    say(f"loops: {len(loops)} candidates, {accepted} accepted, {len(loops) - accepted} rejected")
     if loops:
-        print()
+        say("")
         for line in _loop_lines(loops, units):
-            print(line)
+            say(line)
     placed = [c for c in report["chunk_poses"] if c["sigma"] is not None]
     if placed:
-        print()
+        say("")
         for line in _sigma_lines(placed, units):
-            print(line)
+            say(line)
 
 
 def _component_lines(report: dict[str, Any]) -> list[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -48,11 +49,9 @@ def info(
         return
     for key, value in report.items():
         if key != "sessions" and (key, value) != ("beside", None):
-            print(f"{key.replace('_', ' '):20} {value}")
+            say(f"{key.replace('_', ' '):20} {value}")
     for session in report["sessions"]:
-        print(
-            f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}"
-        )
+        say(f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}")
     if loops:
         print_loop_report(chunks, units)
 
@@ -167,7 +166,7 @@ def show(
         told = {"relations": related, "aliases": aliases, "observed_as": parts}
         print_json({**instance_dict(instance, track), **label_source(instance, named), **told})
         return
-    print(f"{instance.id}  {instance.label or instance.description}")
+    say(f"{instance.id}  {instance.label or instance.description}")
     for key, value in (
         ("center", f"{_triple(instance.center)} {units}{_give_or_take(instance.position_sigma_m, units)}"),
         ("size", f"{_triple(instance.box.size)} {units}"),
@@ -180,9 +179,9 @@ def show(
         ("aliases", ", ".join(map(str, aliases)) or "none"),
         *(() if track is None else _track_lines(*track, units)),
     ):
-        print(f"  {key:11} {value}")
+        say(f"  {key:11} {value}")
     for r in relations:
-        print(
+        say(
             f"  {names.get(r.subject, '?')} ({r.subject}) {r.predicate} {names.get(r.object, '?')} ({r.object})"
             f"  confidence {r.confidence:.2f}, margin {r.margin:.3f} {units}"
         )

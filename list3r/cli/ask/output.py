@@ -9,6 +9,7 @@ import typer
 
 from list3r.cli.ask.memory import instance_dict
 from list3r.cli.common import note, print_json, print_table
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -117,7 +118,7 @@ def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
         print_json({**head, "relations": entries})
         return
     if found.state == "unknown":
-        print(f"unknown: {found.reason}")
+        say(f"unknown: {found.reason}")
         return
     rows = [
         [r.subject, names[r.subject], r.predicate, r.object, _object(r, names), r.confidence, r.margin] for r in found

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json
+from list3r.cli.terminal import say
 
 
 def register(app: typer.Typer) -> None:
@@ -44,4 +45,4 @@ def picture(
         told = {"id": found.instance_id, "session": found.session_id, "frame": found.frame_index}
         print_json({**told, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)})
     else:
-        print(f"{out}  frame {found.frame_index} of session {found.session_id}, {found.visible_fraction:.0%} visible")
+        say(f"{out}  frame {found.frame_index} of session {found.session_id}, {found.visible_fraction:.0%} visible")

@@ -28,6 +28,7 @@ from list3r.cli.ask.output import (
     print_relations,
 )
 from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, parse_point, print_json, print_table
+from list3r.cli.terminal import say
 
 query_app = typer.Typer(help="Ask a memory.", no_args_is_help=True, rich_markup_mode=None)
 """The group that the commands of questions belong to."""
@@ -303,7 +304,7 @@ def seen(
         ]
         print_json({"id": sightings.instance_id, "spans": spans, "frames": frames})
         return
-    print(f"{name.id}  {name.label or name.description}: seen in {len(sightings.frames)} frames")
+    say(f"{name.id}  {name.label or name.description}: seen in {len(sightings.frames)} frames")
     rows = []
     for s in spans:
         inside = [

@@ -15,6 +15,7 @@ from list3r.cli.build.progress import report_lines, run_build
 from list3r.cli.common import JsonOption, check_one_way, note, print_json, spread
 from list3r.cli.edit.scale import ScaleAnchor, check_anchor
 from list3r.cli.models.detect import ClassFile, DetectorFile, check_detector
+from list3r.cli.terminal import say
 
 
 def register(app: typer.Typer) -> None:
@@ -62,7 +63,7 @@ def inspect(
     if json:
         print_json(report)
     else:
-        print("\n".join(lines(report)))
+        say(*lines(report))
 
 
 def _check_overlay(overlay: Path, source: Path) -> None:
@@ -127,7 +128,7 @@ def build(
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:
-        print("\n".join(report_lines(memory, report)))
+        say(*report_lines(memory, report))
     if failure is not None:
         raise failure
 

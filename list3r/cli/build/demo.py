@@ -11,6 +11,7 @@ from list3r.api import SceneMemory
 from list3r.cli.build.progress import report_lines, run_build
 from list3r.cli.common import open_memory, print_table
 from list3r.cli.measure.commands import score_rows
+from list3r.cli.terminal import say
 from list3r.memory.errors import OptionError
 
 EXPORTS = (("json", "json"), ("usd", "usda"), ("plan", "png"), ("glb", "glb"), ("ply", "ply"), ("tum", "txt"))
@@ -75,15 +76,15 @@ def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
         return
     things = scene.instances()
     names = {i.id: i.description for i in scene.instances(structure=None)}
-    print(f"\n3. list3r list {memory}")
+    say("", f"3. list3r list {memory}")
     print_table([[i.id, i.description, i.confidence] for i in things], ["id", "what", "conf"])
-    print(f"\n4. list3r query relations {memory} --predicate on")
+    say("", f"4. list3r query relations {memory} --predicate on")
     rows = [[names[r.subject], "on", names[r.object], r.confidence] for r in scene.relations(predicate="on")]
     print_table(rows, ["subject", "", "object", "conf"])
     if not things:
         return
     first = min(things, key=lambda i: float(i.box.size.prod()))
-    print(f"\n5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {first.description})")
+    say("", f"5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {first.description})")
     matches = scene.nearest(first.id, k=3)
     print_table([[m.instance.id, m.instance.description, m.distance_m] for m in matches], ["id", "what", "surface (m)"])
 
@@ -110,7 +111,7 @@ def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
     scene = evaluate_scene(read_scene(out / "rooms.json"), read_scene(walk / "truth.json"), S_truth_scene)
     _say(quiet, "\n7. against the known truth")
     if not quiet:
-        print(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
+        say(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
         print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
     return {"trajectory": errors.as_dict(), "scene": scene}
 
@@ -123,4 +124,4 @@ def _check_numbers(*, seed: int, frames: int | None, workers: int | None) -> Non
 
 def _say(quiet: bool, text: str) -> None:
     if not quiet:
-        print(text)
+        say(*text.splitlines())

@@ -35,9 +35,9 @@ def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any
         except KeyboardInterrupt:
             bar.close()
             if kept and memory.exists():
-                note(f"\ninterrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
+                note("", f"interrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
             else:
-                note("\ninterrupted before a chunk was finished; nothing was changed")
+                note("", "interrupted before a chunk was finished; nothing was changed")
             raise typer.Exit(1) from None
 
 

@@ -18,6 +18,7 @@ from list3r.cli.build.progress import looking, show
 from list3r.cli.common import JsonOption, MemoryArgument, check_one_way, note, print_json, spread, with_at
 from list3r.cli.edit.scale import ScaleAnchor, check_anchor
 from list3r.cli.models.detect import ClassFile, DetectorFile, check_detector
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.pipeline.update import UpdateReport
@@ -81,7 +82,7 @@ def update(
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
     else:
-        print("\n".join(report_lines(memory, report)))
+        say(*report_lines(memory, report))
     if failure is not None:
         raise failure
 
@@ -112,5 +113,5 @@ def _run(memory: Path, source: str, *, quiet: bool, **arguments: Any) -> UpdateR
             return update_memory(memory, source, progress=progress, look=looking(bar, "updating"), **arguments)
         except KeyboardInterrupt:
             bar.close()
-            note(f"\ninterrupted; {memory} keeps what it knew and the finished chunks: go on with --resume")
+            note("", f"interrupted; {memory} keeps what it knew and the finished chunks: go on with --resume")
             raise typer.Exit(1) from None

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -158,11 +159,11 @@ def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool
     if json:
         print_json(report.as_dict())
         return
-    print(f"{report.text} (entry {report.entry})")
+    say(f"{report.text} (entry {report.entry})")
     told = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]
     told += [f"#{old} resolves to #{new}" for old, new in report.aliases]
     if told:
-        print("; ".join(told))
+        say("; ".join(told))
 
 
 def _parse_parts(text: str) -> list[tuple[int, int]]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.terminal import say
 from list3r.exporters.registry import FOLDERS, FORMATS
 
 
@@ -39,7 +40,7 @@ def export(
         size = sizes.get(str(out), sum(sizes.values()))
         print_json({"format": to, "path": str(out), "bytes": size, "files": sizes})
     else:
-        print("\n".join(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
+        say(*(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
 
 
 def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
@@ -65,15 +66,15 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": beside}
         print_json({**facts, "sessions": state, "chunks": chunks})
     elif found:
-        print("\n".join(found))
-        print(f"`list3r repair {memory}` saves what is sound")
+        say(*found)
+        say(f"`list3r repair {memory}` saves what is sound")
     else:
         unfinished = (
             "; the build is unfinished, go on with --resume" if any(s["state"] == "building" for s in state) else ""
         )
-        print(f"{memory} is sound: {chunks} chunks{unfinished}")
+        say(f"{memory} is sound: {chunks} chunks{unfinished}")
     if beside and not json:
-        print(beside)
+        say(beside)
     if found:
         raise typer.Exit(1)
 
@@ -108,16 +109,16 @@ def repair(
         return
     if not report.damage:
         where = "nothing was changed" if out is None else f"{out} is a copy"
-        print(f"{memory} is sound; {where}")
+        say(f"{memory} is sound; {where}")
         return
-    print(f"{report.memory} is sound: {report.chunks} chunks, {report.instances} instances")
-    print(f"the damaged file is {report.original}")
+    say(f"{report.memory} is sound: {report.chunks} chunks, {report.instances} instances")
+    say(f"the damaged file is {report.original}")
     for kind, names in report.lost.items():
-        print(f"lost {kind.replace('_', ' ')}: {', '.join(names)}")
+        say(f"lost {kind.replace('_', ' ')}: {', '.join(names)}")
     if not report.lost:
-        print("nothing is lost")
+        say("nothing is lost")
     elif report.rebuilt:
-        print("instances and relations were derived anew from what is left")
+        say("instances and relations were derived anew from what is left")
 
 
 def doctor(json: JsonOption = False) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json
 from list3r.cli.edit.commands import AuthorOption
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.memory.maintenance.edits import EditReport
@@ -51,7 +52,7 @@ def scale(
     if anchor is not None:
         report = anchor_scale(memory, anchor, author)
         if not json:
-            print(f"{report.text} (entry {report.entry})")
+            say(f"{report.text} (entry {report.entry})")
     with open_memory(memory) as scene:
         kind, source = scene.store.get_value("scale_kind", "relative"), scene.store.get_value("scale_source")
         units = scene.units
@@ -59,9 +60,9 @@ def scale(
         told = None if anchor is None else report.as_dict()
         print_json({"scale": kind, "scale_source": source, "units": units, "edit": told})
     elif kind == "relative":
-        print('scale relative: lengths are in units that nobody knows; --anchor "ID=0.095m" makes them metres')
+        say('scale relative: lengths are in units that nobody knows; --anchor "ID=0.095m" makes them metres')
     else:
-        print(f"scale {kind}: lengths are metres ({source})")
+        say(f"scale {kind}: lengths are metres ({source})")
 
 
 def anchor_scale(memory: Path, anchor: str, author: str | None = None) -> EditReport:

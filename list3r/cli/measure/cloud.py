@@ -22,6 +22,7 @@ from list3r.cli.measure.options import (
     free_scale,
     save_picture,
 )
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,9 +93,9 @@ def cloud(
         counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
         print_json({**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)})
         return
-    print(f"truth     {true.words}; {len(true.points):,} compared")
-    print(f"estimate  {found.words}; {len(found.points):,} compared")
-    print(f"aligned   {how}")
+    say(f"truth     {true.words}; {len(true.points):,} compared")
+    say(f"estimate  {found.words}; {len(found.points):,} compared")
+    say(f"aligned   {how}")
     _print_errors(errors)
 
 

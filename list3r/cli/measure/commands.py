@@ -23,6 +23,7 @@ from list3r.cli.measure.options import (
     share,
 )
 from list3r.cli.measure.revisits import revisits
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,12 +80,12 @@ def trajectory(
         print_json(scores)
         return
     covered = errors.covered
-    print(f"{errors.pairs} poses associated; scale {errors.scale:.4f}; RPE over {apart}")
+    say(f"{errors.pairs} poses associated; scale {errors.scale:.4f}; RPE over {apart}")
     gaps = f"{covered.gaps} gap{'s' * (covered.gaps != 1)}, the longest stretch without poses"
     missing = "" if covered.longest_gap_s == 0 else f"; {gaps} {covered.longest_gap_s:.2f} s"
-    print(f"the estimate covers {100 * covered.truth:.1f} % of the truth's time{missing}")
+    say(f"the estimate covers {100 * covered.truth:.1f} % of the truth's time{missing}")
     if errors.coverage < 1:
-        print(f"{100 * errors.coverage:.1f} % of its poses have a true one within {tolerance:g} s")
+        say(f"{100 * errors.coverage:.1f} % of its poses have a true one within {tolerance:g} s")
     names = ("ate_se3_m", "ate_sim3_m", "rpe_translation_m", "rpe_translation_sim3_m", "rpe_rotation_deg")
     keys = ("rmse", "mean", "median", "std", "max")
     print_table([[name, *[f"{scores[name][key]:.4f}" for key in keys]] for name in names], ["", *keys])
@@ -157,18 +158,16 @@ def instances(
         print_json(scores)
         return
     if S_truth_scene is not None:
-        print(f"placed by the camera's path in {align}, scale {float(S_truth_scene.scale):.4f}")
+        say(f"placed by the camera's path in {align}, scale {float(S_truth_scene.scale):.4f}")
     print_table(score_rows(scores), ["", "recall", "precision", "more"])
     for missed in scores["missed"]:
-        print(f"missed: {missed['label']} ({missed['id']})")
+        say(f"missed: {missed['label']} ({missed['id']})")
     identities = scores["identities"]
     if identities is not None:
-        print(
-            f"{identities['switches']} id switches of {identities['objects']} things in {identities['frames']} frames"
-        )
+        say(f"{identities['switches']} id switches of {identities['objects']} things in {identities['frames']} frames")
         labels = {int(e["id"]): e.get("label") for e in true["instances"]}
         for k, several in identities["several_ids"].items():
-            print(f"several ids: {labels.get(k)} ({k}) was {', '.join(map(str, several))}")
+            say(f"several ids: {labels.get(k)} ({k}) was {', '.join(map(str, several))}")
 
 
 def _identities(

@@ -19,6 +19,7 @@ from list3r.cli.measure.options import (
     save_picture,
     share,
 )
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.evaluation.revisits import RevisitScores
@@ -111,8 +112,8 @@ def _check_clock(path: Path, frame: Any, time_s: Any, times: dict[int, float]) -
 
 def _print_revisits(scores: RevisitScores, frames: int, chunks: int) -> None:
     s = scores.settings
-    print(f"{frames} frames, {chunks} chunks, {scores.candidates} candidates")
-    print(
+    say(f"{frames} frames, {chunks} chunks, {scores.candidates} candidates")
+    say(
         f"revisit: each frame sees {100 * s.least:g} % of the other's surface; different: below {100 * s.different:g} %"
     )
     rows = [
@@ -120,12 +121,12 @@ def _print_revisits(scores: RevisitScores, frames: int, chunks: int) -> None:
         for name, a in (("pairs of chunks", scores.chunks), ("proposed frame pairs", scores.frames))
     ]
     print_table(rows, ["", "true", "accepted", "right", "open", "precision", "recall"])
-    print(f"pairs of chunks that were proposed: recall {share(scores.proposed_recall)}")
+    say(f"pairs of chunks that were proposed: recall {share(scores.proposed_recall)}")
     cues = {k: r for k, r in scores.rankings.items() if k.startswith("s_")} or {
         k: r for k, r in scores.rankings.items() if k == "cosine"
     }
     if cues:
-        print(f"\nranked by one score: recall at precision {s.precision:g}")
+        say("", f"ranked by one score: recall at precision {s.precision:g}")
         print_table(
             [
                 [
@@ -140,9 +141,9 @@ def _print_revisits(scores: RevisitScores, frames: int, chunks: int) -> None:
             ["score", "pairs of chunks", "frame pairs", "from", "average precision"],
         )
     for u, v, a, b in scores.wrong:
-        print(f"wrong: chunks {u} and {v} were joined by frames {a} and {b}")
+        say(f"wrong: chunks {u} and {v} were joined by frames {a} and {b}")
     if scores.missed:
         most = 12
         shown = ", ".join(f"{u}-{v}" for u, v in scores.missed[:most])
         more = f" and {len(scores.missed) - most} more" if len(scores.missed) > most else ""
-        print(f"not joined: chunks {shown}{more}")
+        say(f"not joined: chunks {shown}{more}")

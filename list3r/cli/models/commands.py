@@ -14,6 +14,7 @@ from list3r.cli.build import model_options as mod
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import looking, show
 from list3r.cli.common import JsonOption, note, print_json, print_table, spread
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.frames.base import SourceInfo
@@ -91,7 +92,7 @@ def fetch_model(
         done.append({"weights": cached.name, "folder": str(cached.folder), "bytes": cached.size_bytes})
         if not json:
             said = "was there" if before is not None and before.commit == cached.commit else "fetched"
-            print(f"{cached.name}  {cached.size_bytes / 1e6:.1f} MB  {said}: {cached.folder}")
+            say(f"{cached.name}  {cached.size_bytes / 1e6:.1f} MB  {said}: {cached.folder}")
     if json:
         print_json(done)
 
@@ -125,11 +126,11 @@ def precompute(
     if json:
         print_json({"folder": str(out), **report})
         return
-    print(
+    say(
         f"{out}  {report['files']} files, {report['bytes'] / 1e6:.1f} MB, {report['posed']} of {report['frames']} posed"
     )
     for line in report["notes"]:
-        print(f"note: {line}")
+        say(f"note: {line}")
 
 
 def _write_all(

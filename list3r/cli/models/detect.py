@@ -12,6 +12,7 @@ import typer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import show
 from list3r.cli.common import JsonOption, MemoryArgument, print_json, print_table, spread
+from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.frames.options import SourceOptions
@@ -76,7 +77,7 @@ def detect(
     if json:
         print_json({"memory": str(memory), **report.as_dict()})
         return
-    print(f"{report.detector} looked at {report.frames} pictures and found {report.boxes} boxes")
+    say(f"{report.detector} looked at {report.frames} pictures and found {report.boxes} boxes")
     print_table(sorted(report.labels.items()), ["id", "label"])
 
 

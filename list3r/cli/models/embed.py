@@ -8,6 +8,7 @@ import typer
 
 from list3r.cli.build.model_options import LicenceProfile
 from list3r.cli.common import JsonOption, MemoryArgument, print_json
+from list3r.cli.terminal import say
 
 
 def register(app: typer.Typer) -> None:
@@ -44,6 +45,6 @@ def embed(
     if json:
         print_json(vars(report))
         return
-    print(f"{report.instances} things have a vector in {report.space}")
+    say(f"{report.instances} things have a vector in {report.space}")
     if report.without_picture:
-        print(f"{report.without_picture} are shown by no stored picture")
+        say(f"{report.without_picture} are shown by no stored picture")

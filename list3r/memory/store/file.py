@@ -71,7 +71,7 @@ def connected(path: Path, mode: str, *, alone: bool = False) -> sqlite3.Connecti
 
     With `alone` it asks for the file for itself until it is told otherwise.
     """
-    uri = f"file:{quote(str(path.resolve()))}?mode={mode}"
+    uri = f"file:{quote(os.fsencode(path.resolve()))}?mode={mode}"
     database = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_WAIT_S, check_same_thread=False)
     try:
         if alone:

@@ -1,0 +1,79 @@
+"""The one way to the terminal: a line is a line, and shows what it is given without obeying it.
+
+Labels, descriptions, reasons and names of files come from strangers. Control characters, line ends and marks that turn
+the direction of text are shown escaped, so that nothing forges a row, moves the cursor or hides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+
+from list3r.memory.errors import List3rError
+
+_FULL = "standard output cannot be written"
+
+
+class OutputError(List3rError):
+    """Standard output that takes no more; what was asked for is done."""
+
+
+def shown(text: object) -> str:
+    """Return a text as one line of printable characters; all others are escaped as in `\\x1b`."""
+    line = str(text)
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in line)
+
+
+def say(*lines: object) -> None:
+    """Print lines on standard output. Raises `OutputError` where they cannot be written."""
+    write("".join(f"{shown(line)}\n" for line in lines))
+
+
+def write(text: str) -> None:
+    """Print what is made to be printed as it is, such as JSON. Raises `OutputError`."""
+    try:
+        sys.stdout.write(text)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{_FULL} ({error.strerror}); what was asked for is done") from error
+
+
+def flush() -> None:
+    """See to it that what was printed is written. Raises `OutputError`."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{_FULL} ({error.strerror}); what was asked for is done") from error
+
+
+def tell(*lines: object) -> None:
+    """Print lines on standard error; where nobody listens, or nothing fits any more, that is no failure."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write("".join(f"{shown(line)}\n" for line in lines))
+        sys.stderr.flush()
+
+
+def mute() -> None:
+    """Give up standard output, so that what is left in its buffer fails nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def prepare_streams() -> None:
+    """Give closed streams a place to go, so that no file is opened in theirs; letters they cannot show are escaped."""
+    for descriptor, mode in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.dup2(os.open(os.devnull, mode), descriptor)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")

@@ -1,0 +1,119 @@
+"""What is printed is shown and not obeyed; what cannot be printed loses nothing and is said."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from list3r.cli.app import run
+from list3r.cli.terminal import shown
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge, MergeDecision
+from list3r.memory.store.store import Store
+from tests.conftest import write_small_room
+
+Make = Callable[..., Path]
+EVIL = "mug\x1b[2J\x1b]0;owned\x07\n9  forged  row\r\u202eleft\x9b31m"
+COMMANDS = [
+    ["list"],
+    ["list", "--structure"],
+    ["show", "2"],
+    ["show", "3"],
+    ["info"],
+    ["info", "--loops"],
+    ["merges"],
+    ["verify"],
+    ["query", "find", "mug"],
+    ["query", "nearest", "--id", "3"],
+    ["query", "within", "--view", "3"],
+    ["query", "seen", "2"],
+    ["query", "relations"],
+    ["query", "path", "3", "1"],
+    ["query", "changes"],
+]
+
+
+def evil_memory(path: Path) -> Path:
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+        store._database.execute("UPDATE instances SET label = ?, description = ?", (EVIL, EVIL))
+        store._database.execute("UPDATE sessions SET source = ?", (EVIL,))
+        store._database.execute("UPDATE relations SET predicate = predicate || ? WHERE subject = 4", (EVIL,))
+        store.add_log_entry(1, MergeDecision("merge", EVIL, EVIL, {}, EVIL))
+        store.add_edges([Edge(1, 1, "loop", Sim3.identity(), 0.5, 0.0, 0, 0.0, False, EVIL, {}, None)])
+    return path
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_no_text_of_a_memory_reaches_the_terminal_raw(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = evil_memory(tmp_path / "evil\x1b[31m\nname.l3r")
+    place = 2 if command[0] == "query" else 1
+    run([*command[:place], str(path), *command[place:]])
+    told = capsys.readouterr()
+    for text in (told.out, told.err):
+        assert all(line.isprintable() for line in text.split("\n")), repr(text)
+        assert not any(line.strip().startswith("9  forged") for line in text.split("\n"))
+
+
+def test_printable_text_is_shown_as_it_is() -> None:
+    assert shown("Café 杯子 🫖") == "Café 杯子 🫖"
+    assert shown("a\tb\x00\udcff") == "a\\tb\\x00\\udcff"
+
+
+def program(*arguments: str | Path | bytes, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "list3r", *arguments]
+    return subprocess.run(  # type: ignore[call-overload,no-any-return]
+        command, text=True, errors="backslashreplace", timeout=60, check=False, stdin=subprocess.DEVNULL, **options
+    )
+
+
+def test_letters_that_the_terminal_lacks_are_escaped(make_memory: Make) -> None:
+    path = make_memory()
+    assert run(["label", str(path), "2", "Café"]) == 0
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    for command in (["list", path], ["query", "find", path, "Café"]):
+        told = program(*command, env=environment, capture_output=True)
+        assert told.returncode == 0 and "Caf\\xe9" in told.stdout, told.stderr
+
+
+def test_a_path_that_is_no_text_is_a_path(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"r\xffom.l3r")
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+    for command in (["list", path], ["label", path, "2", "mug"], ["show", path, "2"], ["verify", path]):
+        told = program(*command, capture_output=True)
+        assert (told.returncode, told.stderr) == (0, "")
+    for command in (["show", path, "77"], ["list", tmp_path / os.fsdecode(b"n\xff")]):
+        told = program(*command, capture_output=True)
+        assert told.returncode == 2 and told.stderr.count("\n") == 1 and "Traceback" not in told.stderr
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+@pytest.mark.parametrize("state", ["closed", "full"])
+def test_output_that_cannot_be_written_is_said_where_it_can(stream: str, state: str, make_memory: Make) -> None:
+    path = make_memory()
+    descriptor = 1 if stream == "stdout" else 2
+    where = f"{descriptor}>&-" if state == "closed" else f"{descriptor}>/dev/full"
+    command = f"{sys.executable} -m list3r label {path} 2 mug {where}"
+    told = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
+    assert "Traceback" not in told.stderr and "Exception" not in told.stderr
+    assert told.returncode == (1 if (stream, state) == ("stdout", "full") else 0)
+    if told.returncode:
+        assert "cannot be written" in told.stderr and "is done" in told.stderr
+    with Store.open(path) as store:
+        assert store.instance(2).label == "mug"
+
+
+def test_links_that_lead_to_themselves_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    loop = tmp_path / "loop.l3r"
+    loop.symlink_to(loop)
+    for command in (["list", str(loop)], ["repair", str(loop)], ["build", str(tmp_path), "-m", str(loop)]):
+        assert run(command) == 2
+        assert capsys.readouterr().err.count("\n") == 1
