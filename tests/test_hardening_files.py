@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 import sqlite3
@@ -15,7 +14,6 @@ from list3r.cli.app import run
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.maintenance import edits
 from list3r.memory.maintenance.repair import repair
-from list3r.memory.store.connection import Connection
 from list3r.memory.store.lock import WriterLock, lock_path
 from list3r.memory.store.store import Store
 
@@ -206,16 +204,3 @@ def test_what_a_reader_kept_in_the_log_is_told_and_folded_in(
     assert not Path(f"{path}-wal").exists()
     with Store.open(path) as store:
         assert store.instance(2).label == "mug" and store.beside() is None
-
-
-# ------------------------------------------------------------------------------------------- handles
-
-
-def test_a_writer_that_is_dropped_lets_go(make_memory: Make, tmp_path: Path) -> None:
-    path = make_memory()
-    store: Connection | None = Store.open(path, writable=True)
-    assert store is not None and lock_path(path).exists()
-    del store
-    gc.collect()
-    Store.open(path, writable=True).close()
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]

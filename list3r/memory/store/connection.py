@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from traceback import walk_tb
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.checksums import Sums
@@ -50,6 +50,7 @@ class Connection:
         self.path = path
         self._database = database
         self._lock = lock
+        self._process = os.getpid()
         self._committed = None if lock is None else Committed(path)
         self._sums = None if lock is None else Sums(database)
         self._followers = () if self._sums is None else (WordIndex(database), self._sums)
@@ -146,7 +147,7 @@ class Connection:
             version = identified(path, database)
             if version < SCHEMA_VERSION:
                 migrate(database, version)
-            use_write_ahead_log(database)
+            use_write_ahead_log(path, database)
             opened = cls(path, database, lock)
             if not up_to_date(database):
                 with opened.transaction():
@@ -170,7 +171,9 @@ class Connection:
 
         Where a reader is amid a snapshot the log stays, beside the file, for the next that writes to fold in.
         """
-        if self._lock is not None and self._committed is not None:
+        if isinstance(self._database, _Closed):
+            return
+        if self._lock is not None and self._committed is not None and os.getpid() == self._process:
             with contextlib.suppress(sqlite3.Error):
                 if any(follower.pending for follower in self._followers):
                     with self.transaction():
@@ -178,6 +181,7 @@ class Connection:
             self._committed.close()
             fold_in(self._database, _LAST_WAIT_MS)
         self._database.close()
+        self._database = cast(sqlite3.Connection, _Closed(self.path))
         if self._lock is not None:
             self._lock.release()
         self._lock = None
@@ -202,6 +206,7 @@ class Connection:
     def transaction(self) -> Iterator[None]:
         """All that is written inside is written together or not at all. Not re-entrant."""
         with self._guard:
+            self._check_process()
             try:
                 self._database.execute("BEGIN IMMEDIATE")
                 self._writing = True
@@ -283,12 +288,18 @@ class Connection:
         self._database.execute("DELETE FROM memory WHERE key = ?", (key,))
 
     def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        self._check_process()
         try:
             rows = self._database.execute(query, arguments).fetchall()
             self._refuse(self._checks.found())
             return rows
         except FAILURES as error:
             raise MemoryFileError(explained(self.path, error)) from error
+
+    def _check_process(self) -> None:
+        """Raise `MemoryFileError` in a forked child: the locks of the file are those of its parent."""
+        if os.getpid() != self._process:
+            raise MemoryFileError(f"{self.path} was opened by the process that this one was forked from; open it again")
 
     def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
@@ -304,6 +315,16 @@ class Connection:
     def _sound(self, table: str, keys: Iterable[int]) -> None:
         """Check what rows with these first keys stand in, where the table is not checked as a whole."""
         self._refuse(self._checks.found_in_parts(table, keys))
+
+
+class _Closed:
+    """What stands in the place of the file once it is closed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __getattr__(self, name: str) -> Any:
+        raise MemoryFileError(f"{self._path} is closed; open it again")
 
 
 def _is_ours(trace: TracebackType | None) -> bool:

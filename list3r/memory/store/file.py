@@ -26,6 +26,8 @@ _CACHE_KIB = 65536
 """Pages that a connection keeps to read;"""
 _WRITER_CACHE_KIB = 16384
 """and one that writes, which touches little at a time."""
+_READERS_WAIT_S = 8.0
+"""How long a new writer waits until nobody is amid a reading; those that begin while it writes are not in its way."""
 _WAIT_S = 30.0
 """How long one process waits for what another holds only for a moment."""
 
@@ -173,19 +175,42 @@ def _umask() -> int:
     return mask
 
 
-def use_write_ahead_log(database: sqlite3.Connection) -> None:
-    """Readers may hold the file for a moment as the journal changes; that is waited for."""
-    end = time.monotonic() + _WAIT_S
+def use_write_ahead_log(path: Path, database: sqlite3.Connection) -> None:
+    """Readers may hold the file for a moment as the journal changes; that is waited for.
+
+    Raises `MemoryFileError` naming who reads and does not let go.
+    """
+    end = time.monotonic() + _READERS_WAIT_S
+    database.execute("PRAGMA busy_timeout=0").fetchall()
     while True:
         try:
             database.execute("PRAGMA journal_mode=WAL").fetchall()
             break
         except sqlite3.OperationalError as error:
-            if "locked" not in str(error) or time.monotonic() > end:
+            if "locked" not in str(error):
                 raise
+            if time.monotonic() > end:
+                raise MemoryFileError(
+                    f"{path} is being read by {_readers(path.resolve())} and cannot be written until that lets go of it"
+                ) from error
             time.sleep(0.01)
+    database.execute(f"PRAGMA busy_timeout={round(1000 * _WAIT_S)}").fetchall()
     database.execute("PRAGMA synchronous=NORMAL")
     database.execute(f"PRAGMA cache_size=-{_WRITER_CACHE_KIB}")
+
+
+def _readers(path: Path) -> str:
+    """Who holds a lock on a file, in words, as far as the system tells."""
+    inode = f":{path.stat().st_ino}"
+    held: set[int] = set()
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/locks").read_text().splitlines():
+            words = line.split()
+            if "->" not in words and words[5].endswith(inode):
+                held.add(int(words[4]))
+    if os.getpid() in held:
+        return "this process itself, in a snapshot,"
+    return f"process {', '.join(map(str, sorted(held)))} (is it stopped?)" if held else "another process"
 
 
 def migrated_copy(path: Path, source: sqlite3.Connection) -> sqlite3.Connection:
