@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from list3r.evaluation.cloud import Array, near_order
+from list3r.frames.files import check_ordinary
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.geometry import Sim3
 
@@ -71,7 +72,11 @@ def read_cloud(path: str | Path) -> PointCloud:
     return PointCloud(points[good], normals, f"{good.sum():,} points of {words}{dropped}")
 
 
+_MAX_BYTES = 16 * 2**30
+
+
 def _read(path: Path, ending: str) -> tuple[Any, Any, str]:
+    check_ordinary(path.stat(), path, _MAX_BYTES)
     if ending == ".npy":
         table = np.load(path, allow_pickle=False)
         return *_columns(table, path), "an array"

@@ -14,6 +14,7 @@ from list3r.evaluation.boxes import transform_box, upright
 from list3r.evaluation.instances import InstanceErrors, evaluate_instances
 from list3r.evaluation.relations import RelationErrors, evaluate_relations
 from list3r.evaluation.trajectory import Trajectory, align, associate
+from list3r.frames.files import read_file
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz
 
@@ -21,10 +22,10 @@ from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz
 def read_scene(path: str | Path) -> dict[str, Any]:
     """Read a scene JSON or a `truth.json`. Raises `SourceError` for a file that is neither."""
     try:
-        scene = json.loads(Path(path).read_text(encoding="utf-8"))
+        scene = json.loads(read_file(Path(path)).decode("utf-8"))
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SourceError(f"{path} is not JSON ({error}); want a scene graph of `list3r export --to json`") from error
     if not isinstance(scene, dict) or not isinstance(scene.get("instances"), list):
         raise SourceError(f"{path} has no list of instances; want a scene graph of `list3r export --to json`")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
-from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.files import MAX_PIXELS, read_file, too_many_pixels
 from list3r.frames.stored import CodedArray, Stored
 from list3r.memory.errors import FrameError
 
@@ -67,7 +69,7 @@ def read_raw_depth(path: Stored | CodedArray) -> NDArray[Any]:
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[..., 0]
     if raw.ndim != 2:
-        raise FrameError(f"{path.name} has {raw.shape[-1]} channels; depth has one")
+        raise FrameError(f"{path.name} has the shape {raw.shape}; depth has (height, width)")
     return raw
 
 
@@ -91,7 +93,7 @@ def clean_depth(raw: NDArray[Any], scale: float, max_depth_m: float | None) -> N
 def _decode(path: Stored, flags: int) -> NDArray[Any]:
     """Decode a file with OpenCV, and refuse one whose end is missing, which OpenCV would fill with grey."""
     try:
-        data = path.read_bytes()
+        data = _bytes(path)
     except FileNotFoundError:
         raise FrameError(f"{path.name} is missing") from None
     except OSError as error:
@@ -100,13 +102,22 @@ def _decode(path: Stored, flags: int) -> NDArray[Any]:
         raise FrameError(f"{path.name} is empty")
     if _cut_off(data):
         raise FrameError(f"{path.name} is cut off")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
+    image = decode_picture(data, flags, path.name)
     if image is None:
         raise FrameError(f"{path.name} cannot be decoded")
-    return np.asarray(image)
+    return image
+
+
+def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR, name: str = "the picture") -> NDArray[Any] | None:
+    """Return what OpenCV makes of a picture, None where it is damaged. Raises `FrameError` for too large a one."""
+    size = too_many_pixels(data)
+    if size is not None:
+        raise FrameError(f"{name} claims {size[0]}x{size[1]} pixels; at most {MAX_PIXELS >> 20} megapixels are read")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:
+        image = None
+    return None if image is None else np.asarray(image)
 
 
 def _cut_off(data: bytes) -> bool:
@@ -125,13 +136,19 @@ def _scan_start(data: bytes) -> int:
     return at
 
 
+def _bytes(stored: Stored) -> bytes:
+    return read_file(stored) if isinstance(stored, Path) else stored.read_bytes()
+
+
 def _load_npy(path: Stored) -> NDArray[Any]:
     try:
-        array = np.load(BytesIO(path.read_bytes()), allow_pickle=False)
+        array = np.load(io.BytesIO(_bytes(path)), allow_pickle=False)
     except FileNotFoundError:
         raise FrameError(f"{path.name} is missing") from None
-    except (OSError, ValueError, EOFError) as error:
-        raise FrameError(f"{path.name} cannot be read ({error})") from None
+    except (OSError, ValueError, EOFError, MemoryError) as error:
+        raise FrameError(f"{path.name} cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    if not isinstance(array, np.ndarray):
+        raise FrameError(f"{path.name} is an archive; depth is one array of shape (height, width)")
     if array.dtype.kind not in "uif":
         raise FrameError(f"{path.name} holds {array.dtype}, not depth")
     return np.asarray(array)

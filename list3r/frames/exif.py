@@ -7,8 +7,11 @@ calibration and not a calibration.
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
+
+from list3r.frames.files import check_ordinary
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405
@@ -25,10 +28,13 @@ def exif_focal(path: Path) -> float | None:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
-            width, height = image.size
-            tags: dict[int, Any] = dict(image.getexif().get_ifd(_EXIF_IFD))
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError):
+        check_ordinary(path.stat(), path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as image:
+                width, height = image.size
+                tags: dict[int, Any] = dict(image.getexif().get_ifd(_EXIF_IFD))
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, Image.DecompressionBombError):
         return None
     if _cropped(tags, width, height):
         return None

@@ -29,6 +29,7 @@ _LATER = ("start_s", "end_s", "sharpest", "max_side", "topics")
 """Options that came later: unsaid, they leave the fingerprints of older memories as they were."""
 _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
+_POSES_TRIED = 50
 
 
 class FolderSource:
@@ -181,11 +182,31 @@ class FolderSource:
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
 
     def _doubts(self) -> tuple[str, ...]:
-        """What looks wrong with the depth scale."""
+        """What looks wrong with depth, poses and times."""
+        return (*self._depth_doubts(), *self._pose_doubts(), *self._time_doubts())
+
+    def _depth_doubts(self) -> tuple[str, ...]:
         typical_m = self._typical_raw / self._rig.depth_scale
-        if not self._has_depth or typical_m == 0 or _LEAST_M <= typical_m <= _MOST_M:
+        if not self._has_depth or _LEAST_M <= typical_m <= _MOST_M:
             return ()
+        if typical_m == 0:
+            return ("the depth that was looked at is unknown everywhere (all 0, or all of the largest value)",)
         return (f"depth is {typical_m:.3g} m in the middle of its range, hardly indoors: --depth-scale may be wrong",)
+
+    def _pose_doubts(self) -> tuple[str, ...]:
+        """Of poses that are given, spread over the source, those that are no rigid motion."""
+        given = [f for f in self._layout.files if f.pose is not None]
+        some = given[:: max(1, len(given) // _POSES_TRIED)]
+        wrong = sum(self._pose(f) is None for f in some)
+        if not wrong:
+            return ()
+        return (f"{wrong} of {len(some)} poses looked at are no rigid motion (mirrored, stretched or not finite)",)
+
+    def _time_doubts(self) -> tuple[str, ...]:
+        times = [f.time_s for f in self._layout.files if f.time_s is not None]
+        if self._clock or len(times) < 2:
+            return ()
+        return (f"the time stamps do not ascend; {self._fps:g} frames a second are assumed (--fps)",)
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig

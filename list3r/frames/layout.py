@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
 from list3r.frames.stored import CodedArray, Stored
 from list3r.memory.errors import OptionError, SourceError
 
+MAX_LENGTH_M = 1e6
+"""No camera stands further from where its numbers begin; single precision is 6 cm there."""
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
@@ -99,15 +102,17 @@ def read_numbers(path: Path) -> list[list[float]]:
 def read_text(path: Path) -> str:
     """The text of a file. Raises `SourceError`."""
     try:
-        return path.read_text(encoding="utf-8", errors="replace")
+        return read_file(path, MAX_TEXT_BYTES).decode("utf-8", "replace")
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
 
 
 def pose_matrix(values: Iterable[float]) -> NDArray[np.float64] | None:
-    """A 4x4 rigid pose of 12 or 16 numbers row by row, None when they are no rigid motion (NaN, zeros)."""
+    """A 4x4 rigid pose of 12 or 16 numbers row by row, None when they are no rigid motion (NaN, zeros, mirrored)."""
     v = np.array(list(values), dtype=np.float64)
-    if len(v) not in (12, 16) or not np.isfinite(v).all():
+    if len(v) not in (12, 16) or not np.isfinite(v).all() or np.abs(v).max() > MAX_LENGTH_M:
+        return None
+    if not np.allclose(v[12:], [0.0, 0.0, 0.0, 1.0][: len(v) - 12], atol=1e-3):
         return None
     matrix = np.eye(4)
     matrix[:3] = v.reshape(-1, 4)[:3]
@@ -147,5 +152,6 @@ def read_json(path: Path) -> object:
     """Parsed JSON. Raises `SourceError`."""
     try:
         return json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise SourceError(f"{path} is not JSON (line {error.lineno}); mend or remove it") from None
+    except (ValueError, RecursionError) as error:
+        where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "too deep or too large a number"
+        raise SourceError(f"{path} is not JSON ({where}); mend or remove it") from None

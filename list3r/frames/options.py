@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import OptionError
 
 KINDS = (
@@ -133,10 +134,15 @@ def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intri
     return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))
 
 
+_MOST_DISTORTION = 100.0
+
+
 def check_distortion(values: Sequence[float]) -> tuple[float, ...]:
     """OpenCV's k1, k2, p1, p2, k3, filled up with zeros; empty when all are zero. Raises `OptionError`."""
     if len(values) > 5 or not all(math.isfinite(v) for v in values):
         raise OptionError(f"distortion {_show(values)}: up to five numbers k1,k2,p1,p2,k3 are needed")
+    if any(abs(v) > _MOST_DISTORTION for v in values):
+        raise OptionError(f"distortion {_show(values)}: no lens has more than {_MOST_DISTORTION:g}")
     full = tuple(float(v) for v in values) + (0.0,) * (5 - len(values))
     return full if any(full) else ()
 
@@ -227,7 +233,7 @@ def _file_text(text: str) -> str | None:
         return None
     try:
         path = Path(text)
-        return path.read_text(encoding="utf-8") if path.is_file() else None
+        return read_file(path, MAX_TEXT_BYTES).decode("utf-8") if path.is_file() else None
     except (OSError, ValueError):
         return None
 

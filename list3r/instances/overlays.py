@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.edges import MeasuredEdge
 from list3r.frames.base import Camera, Frame
+from list3r.frames.decode import decode_picture
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
@@ -149,7 +150,7 @@ def _dots(
 
 
 def _decoded(jpeg: bytes) -> NDArray[np.uint8] | None:
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    image = decode_picture(jpeg)
     return None if image is None else np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
 
 

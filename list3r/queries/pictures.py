@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.files import too_many_pixels
 from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import ChunkRow, Instance, MaskTrack, Observation
@@ -122,6 +123,9 @@ def decode_picture(jpeg: bytes) -> NDArray[np.uint8]:
     """Return the RGB picture of JPEG bytes, shape (H, W, 3). Raises `MemoryFileError` where they are none."""
     from PIL import Image, UnidentifiedImageError
 
+    size = too_many_pixels(jpeg)
+    if size is not None:
+        raise MemoryFileError(f"a stored picture claims {size[0]}x{size[1]} pixels; the file is damaged or hostile")
     try:
         return np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"))
     except (OSError, UnidentifiedImageError) as error:

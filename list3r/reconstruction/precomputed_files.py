@@ -17,11 +17,14 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from list3r.frames.files import check_ordinary
 from list3r.memory.errors import OptionError
 
 MANIFEST = "precomputed.json"
 FORMAT = "list3r-precomputed"
 VERSION = 1
+_FREE_BYTES, _MOST_RATIO = 64 * 2**20, 200
+"""What an archive may claim: so much, and so many times its own size; depth and points shrink to a tenth at best."""
 MAX_BYTES = 8 * 2**30
 """No file unpacks to more: 1,000 frames of 1,000 x 1,000 pixels."""
 _MAX_MANIFEST = 2**20
@@ -166,10 +169,12 @@ def _checked_frames(frames: NDArray[Any], path: Path) -> NDArray[np.int64]:
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """The named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
     try:
+        check_ordinary(path.stat(), path, MAX_BYTES)
         with zipfile.ZipFile(path) as archive:
             entries = {e.filename.removesuffix(".npy"): e for e in archive.infolist()}
-            if sum(e.file_size for e in entries.values()) > MAX_BYTES:
-                raise OptionError(f"{path} claims more than {MAX_BYTES >> 30} GiB; it is damaged or hostile")
+            claimed = sum(e.file_size for e in entries.values())
+            if claimed > min(MAX_BYTES, _FREE_BYTES + _MOST_RATIO * path.stat().st_size):
+                raise OptionError(f"{path} claims {claimed >> 20} MiB; it is damaged or hostile")
             return {name: _array(archive, entries[name]) for name in names if name in entries}
     except OptionError:
         raise

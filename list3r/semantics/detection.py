@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame, FrameSource
+from list3r.frames.decode import decode_picture
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
 from list3r.memory.library.labels import LabelSettings, Votes, apply_labels, put_votes
@@ -142,7 +143,7 @@ def _pictures(
     """Frame.index and picture of the frames to look at, of the `own` ones (index to seconds)."""
     if source is None:
         for keyframe in store.keyframes(chunk.chunk_id):
-            image = cv2.imdecode(np.frombuffer(keyframe.jpeg, np.uint8), cv2.IMREAD_COLOR) if keyframe.jpeg else None
+            image = decode_picture(keyframe.jpeg)
             if image is not None and keyframe.frame_index in own:
                 yield keyframe.frame_index, _fitting(np.asarray(image[..., ::-1]), chunk)
         return

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import OptionError, SourceError
+from list3r.frames.decode import decode_picture
+from list3r.frames.files import read_file
+from list3r.memory.errors import FrameError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.semantics.embedding import stored_words
 
@@ -74,10 +76,13 @@ def _read(path: str | Path) -> NDArray[np.uint8]:
     import cv2
 
     try:
-        data = np.fromfile(path, np.uint8)
+        data = read_file(Path(path))
     except OSError as error:
         raise SourceError(f"{path} cannot be read: {error.strerror}") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    try:
+        picture = decode_picture(data, cv2.IMREAD_COLOR, str(path))
+    except FrameError as error:
+        raise SourceError(f"{error}; make it smaller") from error
     if picture is None:
         raise SourceError(f"{path} is not a picture; give a JPEG or PNG file")
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)

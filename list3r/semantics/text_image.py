@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.decode import decode_picture
 from list3r.memory.errors import OptionError
 from list3r.models.images import HALF, InputShape, network_input
 from list3r.models.pretrained import load_pretrained, pick_device, space_name
@@ -113,7 +113,7 @@ def square_crop(picture: NDArray[np.uint8], box: Sequence[float], margin: float 
 
 def decode_jpeg(data: bytes) -> NDArray[np.uint8] | None:
     """The RGB picture (H, W, 3) of a JPEG, None when it is damaged."""
-    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    found = decode_picture(data)
     return None if found is None else np.ascontiguousarray(found[..., ::-1])
 
 

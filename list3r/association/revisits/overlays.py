@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.frames.decode import decode_picture
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, Keyframe
 
@@ -98,7 +99,7 @@ def _picture(keyframe: Keyframe, camera: Camera) -> tuple[Image, int]:
     """The keyframe's picture, at least 320 px wide, and its magnification."""
     color = None
     if keyframe.jpeg:
-        color = cv2.imdecode(np.frombuffer(keyframe.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        color = decode_picture(keyframe.jpeg)
     if color is None or color.shape[:2] != (camera.height, camera.width):
         color = np.full((camera.height, camera.width, 3), 96, np.uint8)
     zoom = max(1, round(320 / camera.width))

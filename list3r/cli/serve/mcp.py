@@ -74,4 +74,4 @@ def ask_config(
         print_json({"client": client, "file": file, "text": text})
         return
     note(f"for {file}:")
-    print(text)
+    write(f"{text}\n")

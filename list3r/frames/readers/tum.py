@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_calibration, read_numbers, read_text
+from list3r.frames.layout import (
+    MAX_LENGTH_M,
+    FolderLayout,
+    FrameFile,
+    Optics,
+    read_calibration,
+    read_numbers,
+    read_text,
+)
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
 from list3r.memory.errors import SourceError
 
@@ -128,6 +136,7 @@ def _poses(path: Path, times_s: NDArray[np.float64]) -> list[NDArray[np.float64]
     if not path.is_file():
         return [None] * len(times_s)
     rows = [row for row in read_numbers(path) if len(row) >= 8 and all(math.isfinite(v) for v in row[:8])]
+    rows = [row for row in rows if max(map(abs, row[1:4])) <= MAX_LENGTH_M]
     table = np.array([row[:8] for row in rows if sum(v * v for v in row[4:8]) > 0.5]).reshape(-1, 8)
     if not len(table):
         return [None] * len(times_s)

@@ -17,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from list3r.frames.decode import decode_picture
 from list3r.instances.carving.carved_surfaces import (
     Bools,
     CarvedSurfaces,
@@ -272,7 +273,7 @@ class _Maker:
 def _picture(keyframe: Keyframe) -> NDArray[np.uint8] | None:
     if not keyframe.jpeg:
         return None
-    decoded = cv2.imdecode(np.frombuffer(keyframe.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    decoded = decode_picture(keyframe.jpeg)
     return None if decoded is None else np.asarray(decoded[:, :, ::-1], np.uint8)
 
 

@@ -1,0 +1,88 @@
+"""Files that strangers wrote: only ordinary ones of a sane size are read, and pictures that fit in memory."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import struct
+from pathlib import Path
+
+MAX_FILE_BYTES = 512 * 2**20
+"""Of one picture or array; a frame of 134 megapixels with 16 bits a pixel has 256 MiB."""
+MAX_TEXT_BYTES = 64 * 2**20
+"""Of one list, calibration or set of options; a list of a million frames has about 60 MiB."""
+MAX_PIXELS = 2**27
+"""Of one picture: 134 megapixels."""
+
+
+def read_file(path: Path, most_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Return what an ordinary file holds. Raises `OSError` for a device, a pipe, and for one that is too large.
+
+    A pipe that nobody writes would keep whoever opens it waiting, and a device need never end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:  # noqa: PTH123 - it closes the descriptor
+        check_ordinary(os.fstat(descriptor), path, most_bytes)
+        return file.read(most_bytes + 1)
+
+
+def check_ordinary(found: os.stat_result, path: Path, most_bytes: int = MAX_FILE_BYTES) -> None:
+    """Raise `OSError` for what is no ordinary file, and for one that is too large."""
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "it is a device or pipe, no ordinary file", str(path))
+    if found.st_size > most_bytes:
+        text = f"it has {found.st_size >> 20} MiB; at most {most_bytes >> 20} are read"
+        raise OSError(errno.EFBIG, text, str(path))
+
+
+def too_many_pixels(data: bytes) -> tuple[int, int] | None:
+    """Return the width and height that a picture claims where they are more than `MAX_PIXELS`, else None."""
+    size = _claimed_size(data)
+    return size if size is not None and size[0] * size[1] > MAX_PIXELS else None
+
+
+def _claimed_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height by the head of a PNG, JPEG or other picture; None where it says nothing that is understood."""
+    if data.startswith(b"\x89PNG") and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_size(data)
+    return _size_of_others(data)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """The largest frame that any header before the first scan claims (ITU-T T.81, B.2.2)."""
+    at, found = 2, None
+    while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:
+            at += 2
+        else:
+            if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+                height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+                found = max(found or (0, 0), (width, height), key=lambda s: s[0] * s[1])
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return found
+
+
+def _size_of_others(data: bytes) -> tuple[int, int] | None:
+    import io
+    import warnings
+
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                return image.size
+        except Image.DecompressionBombError:
+            return 2**16, 2**16
+        except Exception:  # whatever the readers of thirty formats raise: no picture that they know
+            return None

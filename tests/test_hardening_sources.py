@@ -1,0 +1,169 @@
+"""What a source of a stranger may hold: pipes and devices, pictures and archives that unfold, wrong numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.cli.app import run
+from list3r.frames.decode import read_color, read_raw_depth
+from list3r.frames.files import too_many_pixels
+from list3r.frames.source import SourceOptions, open_source
+from list3r.memory.errors import FrameError, OptionError
+from list3r.reconstruction.precomputed_files import read_piece
+from tests.frames_scenes import write_png, write_replica, write_seven_scenes, write_tum
+
+LIMIT_BYTES = 1500 * 2**20
+"""Of address space, of which the libraries take up to 900 MB before anything is read."""
+
+
+def picture_bomb(width: int, height: int, *, gray16: bool = False) -> bytes:
+    """A PNG that unfolds to width x height, a thousandth as large itself."""
+
+    def part(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    line = 1 + width * (2 if gray16 else 3)
+    packer = zlib.compressobj(9)
+    zeros = bytes(line * max(1, 2**20 // line))
+    data = b"".join(packer.compress(zeros) for _ in range(min(40, line * height // len(zeros)))) + packer.flush()
+    head = struct.pack(">IIBBBBB", width, height, 16 if gray16 else 8, 0 if gray16 else 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", data) + part(b"IEND", b"")
+
+
+def jpeg_bomb() -> bytes:
+    frame = b"\xff\xc0\x00\x11\x08" + struct.pack(">HH", 65500, 65500) + b"\x03\x01\x11\x00\x02\x11\x00\x03\x11\x00"
+    return b"\xff\xd8\xff\xe0\x00\x04ab" + frame + b"\xff\xda\x00\x02" + bytes(64) + b"\xff\xd9"
+
+
+@pytest.mark.parametrize("data", [picture_bomb(20000, 20000), picture_bomb(30000, 30000, gray16=True), jpeg_bomb()])
+def test_pictures_that_unfold_are_refused_by_their_heads(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / ("a.jpg" if data[:2] == b"\xff\xd8" else "a.png")
+    path.write_bytes(data)
+    for read in (read_color, read_raw_depth):
+        with pytest.raises(FrameError, match="megapixels"):
+            read(path)
+
+
+def test_what_is_of_use_is_read_whatever_its_kind(tmp_path: Path) -> None:
+    for ending in (".png", ".bmp", ".tiff", ".ppm", ".webp", ".jpg"):
+        write_png(tmp_path / f"a{ending}", np.full((48, 64, 3), 90, np.uint8))
+        assert too_many_pixels((tmp_path / f"a{ending}").read_bytes()) is None
+        assert read_color(tmp_path / f"a{ending}").shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "a picture", "a depth picture", "groundtruth.txt"])
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_pipes_and_devices_of_a_source_are_not_waited_for(kind: str, name: str, tmp_path: Path) -> None:
+    root = write_tum(tmp_path / "tum")
+    place = {"a picture": next((root / "rgb").iterdir()), "a depth picture": next((root / "depth").iterdir())}.get(
+        name, root / name
+    )
+    place.unlink(missing_ok=True)
+    if kind == "pipe":
+        os.mkfifo(place)
+    else:
+        place.symlink_to("/dev/zero")
+    assert run(["inspect", str(root)]) in (0, 2)
+
+
+def archive_bomb(path: Path) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, frames=np.arange(2), depth=np.zeros((4, 4000, 4000)))
+
+
+def test_an_archive_that_unfolds_is_refused(tmp_path: Path) -> None:
+    archive_bomb(tmp_path / "a.npz")
+    with pytest.raises(OptionError, match="claims"):
+        read_piece(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"camera": ' * 5000, "1" * 10_000, '{"camera": {"fx": "a"}}', "\x00"])
+def test_strange_json_beside_a_source_is_wrong_input(text: str, tmp_path: Path) -> None:
+    root = write_replica(tmp_path / "replica")
+    (root / "cam_params.json").write_text(text)
+    assert run(["inspect", str(root)]) == 2
+
+
+@pytest.mark.parametrize("array", [np.array(1.0), np.zeros(4), np.zeros((2, 3, 4)), np.zeros((0, 0)), np.array(["a"])])
+def test_depth_of_another_shape_is_refused(array: np.ndarray, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(FrameError):
+        found = read_raw_depth(tmp_path / "a.npy")
+        if not found.size:
+            raise FrameError("nothing")
+
+
+def notes(root: Path, **options: object) -> str:
+    info = open_source(root, SourceOptions(**options)).info  # type: ignore[arg-type]
+    return json.dumps([*info.notes, *info.missing])
+
+
+WRONG: dict[str, Callable[[np.ndarray], None]] = {
+    "mirrored": lambda T: T.__setitem__((slice(3), 0), -T[:3, 0]),
+    "stretched": lambda T: T.__setitem__((slice(3), slice(3)), 1.3 * T[:3, :3]),
+    "far": lambda T: T.__setitem__((0, 3), 1e200),
+    "last row": lambda T: T.__setitem__((3, 3), 2.0),
+    "not finite": lambda T: T.__setitem__((1, 1), np.nan),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_poses_that_are_none_are_noted(case: str, tmp_path: Path) -> None:
+    root = write_seven_scenes(tmp_path / "seven")
+    assert "rigid" not in notes(root)
+    for path in root.rglob("*.pose.txt"):
+        T = np.eye(4)
+        WRONG[case](T)
+        np.savetxt(path, T)
+    assert "4 of 4 poses looked at are no rigid motion" in notes(root)
+
+
+@pytest.mark.parametrize("value", [0, 65535, 1, 40000])
+def test_depth_that_cannot_be_is_noted(value: int, tmp_path: Path) -> None:
+    root = write_seven_scenes(tmp_path / "seven")
+    for path in root.rglob("*.depth.png"):
+        write_png(path, np.full((480, 640), value, np.uint16))
+    assert ("unknown everywhere" if value in (0, 65535) else "hardly indoors") in notes(root)
+
+
+def test_times_that_stand_still_are_noted(tmp_path: Path) -> None:
+    root = write_tum(tmp_path / "tum")
+    for name in ("rgb.txt", "depth.txt"):
+        lines = (root / name).read_text().splitlines()
+        same = [line if line.startswith("#") else f"1.0 {line.split()[1]}" for line in lines]
+        (root / name).write_text("\n".join(same) + "\n")
+    (root / "depth.txt").unlink()
+    shutil.rmtree(root / "depth")
+    assert "do not ascend" in notes(root, intrinsics=(70.0, 70.0, 39.5, 29.5))
+
+
+def test_distortion_that_no_lens_has_is_refused(tmp_path: Path) -> None:
+    root = write_seven_scenes(tmp_path / "seven")
+    assert run(["inspect", str(root), "--distortion", "1e10,0,0,0"]) == 2
+
+
+def test_bombs_take_no_memory(tmp_path: Path) -> None:
+    """Within bounded address space, so that what unfolds would end in an error of memory."""
+    root = tmp_path / "images"
+    root.mkdir()
+    for n in range(3):
+        (root / f"{n}.png").write_bytes(picture_bomb(20000, 20000))
+    command = [sys.executable, "-m", "list3r", "inspect", str(root)]
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
+
+    told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, preexec_fn=limit)
+    assert told.returncode == 2 and "megapixels" in told.stderr, told.stderr
