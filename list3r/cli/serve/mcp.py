@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from list3r.cli import terminal
 from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
 
 TOKEN_VARIABLE = "LIST3R_MCP_TOKEN"
@@ -74,4 +75,4 @@ def ask_config(
         print_json({"client": client, "file": file, "text": text})
         return
     note(f"for {file}:")
-    write(f"{text}\n")
+    terminal.write(f"{text}\n")
