@@ -26,9 +26,8 @@ from list3r.cli.models import commands as model_commands
 from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
 from list3r.cli.serve import mcp as mcp_commands
-from list3r.memory.errors import List3rError, naming_extras
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
-from list3r.memory.errors import List3rError
+from list3r.memory.errors import List3rError, naming_extras
 
 app = typer.Typer(
     name="list3r",
@@ -92,8 +91,6 @@ def run(arguments: list[str]) -> int:
     try:
         with naming_extras():
             status = command.main(arguments, prog_name="list3r", standalone_mode=False)
-        sys.stdout.flush()
-        status = command.main(arguments, prog_name="list3r", standalone_mode=False)
         flush()
         if status == _INTERRUPTED:
             raise KeyboardInterrupt
