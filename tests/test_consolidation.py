@@ -14,7 +14,7 @@ from list3r.memory.library.consolidation import ConsolidationReport, consolidate
 from list3r.memory.library.identities import assign_ids
 from list3r.memory.library.rules import ConsolidationSettings, settings_of
 from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary
-from list3r.memory.relations.scene import RelationSettings
+from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.search.graphs import merge_graph, relation_graph
 from list3r.memory.store.store import Store
 from tests.conftest import chunk_result, local_instance

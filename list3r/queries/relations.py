@@ -10,7 +10,7 @@ import numpy as np
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.predicates import PREDICATES
-from list3r.memory.relations.scene import RelationSettings
+from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera

@@ -173,7 +173,7 @@ class ChangeMatching:
         if self._counts[place]:
             frames = p.frames_in(place, session)
             reason = f"its surface was found at its place in {frames} frames"
-            sure = frames / (frames + 4.0)
+            sure = frames / (frames + self._s.half_sure_frames)
             self._record(
                 thing,
                 Change(self._first(thing), session, kind, before, after, p.evidence(place, session), sure, reason),
@@ -193,7 +193,7 @@ class ChangeMatching:
         box = self._p.box(thing.now, session, before=True)
         reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
         self._record(
-            thing, Change(self._first(thing), session, "removed", box, None, found.frames, _sure(found), reason)
+            thing, Change(self._first(thing), session, "removed", box, None, found.frames, self._sure(found), reason)
         )
 
     def _add(self, place: int, session: int, found: Look) -> None:
@@ -203,7 +203,7 @@ class ChangeMatching:
         seen = f"{len(found.frames)} frames of an earlier session see through its place"
         known = found.verdict == "gone"
         reason = seen if known else "it stands where something else stood that is gone"
-        sure = _sure(found) if known else 0.5
+        sure = self._sure(found) if known else 0.5
         self._record(
             thing,
             Change(self._first(thing), session, "added", None, box, self._p.evidence(place, session), sure, reason),
@@ -217,13 +217,18 @@ class ChangeMatching:
         reason = f"gone from its place and found {distance:.2f} m away, of the same look and size"
         scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
         self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
-        sure = _sure(found) * move.chance
+        sure = self._sure(found) * move.chance
         self._record(
             thing, Change(self._first(thing), session, "moved", old, new, p.evidence(place, session), sure, reason)
         )
         thing.places.append(place)
         thing.now, thing.state = place, "moved"
         del self._thing[place]
+
+    def _sure(self, found: Look) -> float:
+        """How certain it is that what frames see through is gone."""
+        frames = len(found.frames)
+        return float(max(found.free, self._s.least_sure) * frames / (frames + 1.0))
 
     def _first(self, thing: _PlacedInstance) -> Key:
         return self._p.groups[thing.places[0]][0]
@@ -274,11 +279,6 @@ class ChangeMatching:
                 states[keys[0]] = thing.state
         events = tuple(replace(c, first=names[n]) for n, c in self._events if n in names)
         return Changes(sorted(groups), current, states, events, self._decisions)
-
-
-def _sure(found: Look) -> float:
-    frames = len(found.frames)
-    return float(max(found.free, 0.3) * frames / (frames + 1.0))
 
 
 def _chance(cost: Array, i: int, j: int, none: float) -> float:

@@ -66,6 +66,10 @@ class ChangeSettings:
     """Share of its surface inside the box of a larger thing of the same fate from which it is a scrap of that."""
     least_frames: int = 12
     """Frames in which a thing must have been seen for its absence or presence to be an event."""
+    half_sure_frames: float = 4.0
+    """Frames that make it half certain that an instance was seen again,"""
+    least_sure: float = 0.3
+    """and the least certainty, frames aside, that one is gone."""
     most_structure: float = 0.5
     """Share of its members flagged as structure up to which a thing can come and go."""
     points: int = 200

@@ -34,12 +34,26 @@ class DeriveSettings:
     """Surface points kept for boxes and relations."""
     trim: float = 0.01
     """Share of points outside the box at either end of each axis."""
+    ends: float = 0.1
+    """Share of the points left out at either end, as it is measured how flat it is."""
     flat: float = 0.15
     """Thickness over the second longest extent of what is flat."""
     confirmed: float = 0.25
     """Share of the members that must have a surface at a point of a small thing of at least four whole views."""
     small_m: float = 0.5
     """Diagonal of a small thing; of a larger one each chunk sees another part."""
+    whole_views: int = 4
+    """Whole views from which members vote on points,"""
+    whole_share: float = 0.7
+    """where this share of the members are whole views;"""
+    least_kept: float = 0.3
+    """nothing is dropped where less than this share of the points would be kept."""
+    seen_share: float = 0.6
+    """Weight of the frames in the certainty; the rest is that of the chunks that found it on their own."""
+    cut: float = 0.25
+    """Weight of a view that the image's border cuts, as the best one is chosen."""
+    hidden: float = 0.2
+    """Weight of a view in which hardly anything of it is visible."""
     border_px: float = 3.0
     """A box that comes this near to the border of what is seen is cut by it."""
 
@@ -206,7 +220,7 @@ def _confirmed(
     whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
     need = int(np.ceil(s.confirmed * whole.sum()))
     size = float(np.median([m.shapes.size[m.at] / m.shapes.unit for m in members]))
-    if whole.sum() < 4 or whole.mean() < 0.7 or need < 2 or size > s.small_m:
+    if whole.sum() < s.whole_views or whole.mean() < s.whole_share or need < 2 or size > s.small_m:
         return np.arange(len(points))
     grain = 2.0 * members[0].shapes.grain * float(members[0].S_world_chunk.scale)
     cells = np.floor((points - points.min(axis=0)) / grain).astype(np.int64) + 1
@@ -219,7 +233,7 @@ def _confirmed(
     held, count = np.unique(seen[whole[seen % len(members)]] // len(members), return_counts=True)
     at = np.minimum(np.searchsorted(held, flat), len(held) - 1)
     keep = np.flatnonzero((held[at] == flat) & (count[at] >= need))
-    return keep if len(keep) >= 0.3 * len(points) else np.arange(len(points))
+    return keep if len(keep) >= s.least_kept * len(points) else np.arange(len(points))
 
 
 _NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
@@ -232,7 +246,7 @@ def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Arra
         return None
     center = np.median(points, axis=0)
     axes = np.linalg.svd(points - center, full_matrices=False)[2]
-    extent = np.ptp(np.quantile((points - center) @ axes.T, [0.1, 0.9], axis=0), axis=0)
+    extent = np.ptp(np.quantile((points - center) @ axes.T, [s.ends, 1.0 - s.ends], axis=0), axis=0)
     if extent[2] > s.flat * extent[1]:
         return None
     toward = np.sum([m.S_world_chunk.rotation @ m.shapes.plane[m.at, :3] for m in flat], axis=0)
@@ -249,7 +263,7 @@ def _certainty(frames: int, stability: float, members: Sequence[Member], s: Deri
     chunks = len({m.shapes.chunk_id for m in members})
     seen = frames / (frames + s.half_frames)
     agreed = 1.0 - 0.5**chunks
-    return float(np.clip(stability, 0.0, 1.0)) * (0.6 * seen + 0.4 * agreed)
+    return float(np.clip(stability, 0.0, 1.0)) * (s.seen_share * seen + (1.0 - s.seen_share) * agreed)
 
 
 def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:
@@ -262,7 +276,8 @@ def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:
             continue
         seen = m.shapes.seen
         cut = (b[:, :2] <= seen[:2] + s.border_px).any(axis=1) | (b[:, 2:] >= seen[2:] - s.border_px).any(axis=1)
-        score = m.shapes.areas_px[m.at] * np.where(cut, 0.25, 1.0) * (0.2 + 0.8 * m.shapes.visible_fraction[m.at])
+        visible = s.hidden + (1.0 - s.hidden) * m.shapes.visible_fraction[m.at]
+        score = m.shapes.areas_px[m.at] * np.where(cut, s.cut, 1.0) * visible
         n = int(np.argmax(score))
         rank = (-float(score[n]), m.shapes.session_id, int(m.shapes.frames[m.at][n]))
         if best is None or rank < best:

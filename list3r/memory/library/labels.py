@@ -19,6 +19,8 @@ from list3r.memory.store.store import Store
 
 _CLASSES = "label classes"
 """Key of the classes that each source knows; there as soon as one has voted."""
+_SCORES = (0.02, 0.98)
+"""No score of a discoverer is taken for less or more than this."""
 PRIOR_ODDS = math.log(0.02 / 0.98)
 """Log odds that a thing is of a given class before anything is seen: some fifty kinds of things stand in rooms."""
 
@@ -106,7 +108,7 @@ def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
     looks = 0.0
     for name, score in names:
         looks += 0.5
-        p = min(max(score, 0.02), 0.98)
+        p = min(max(score, _SCORES[0]), _SCORES[1])
         classes[name] = _plus(classes.get(name, (0.0, 0.0)), (0.5, 0.5 * (math.log(p / (1.0 - p)) - PRIOR_ODDS)))
     return Votes(0.0, classes, looks)
 

@@ -20,7 +20,7 @@ from list3r.memory.overlap.planes import place_planes
 from list3r.memory.overlap.summaries import Summaries, cameras_of, light_of, sample_of, world_unit
 from list3r.memory.overlap.voxels import ShapeSettings
 from list3r.memory.records import ChunkRow
-from list3r.memory.relations.scene import RelationSettings
+from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.relations.structure import StructureSettings
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store

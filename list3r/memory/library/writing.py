@@ -192,7 +192,7 @@ class Writer:
         """Height that 90 % of the cameras that saw an instance lie below; without cameras everything is below."""
         rows = [self._region.settled_chunk(k) for k in dict.fromkeys(k for k, _ in self._group_of(geometry.id))]
         heights = cameras_of(self._store, rows).translation[:, 2]
-        return float(np.quantile(heights, 0.9)) if len(heights) else np.inf
+        return float(np.quantile(heights, self._s.structure.eye_level)) if len(heights) else np.inf
 
     def relate(self, touched: Mapping[int, Array]) -> None:
         """Find the relations of what changed and of what is near it again, among all that is near those."""

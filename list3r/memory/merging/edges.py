@@ -37,6 +37,8 @@ _REASON = (
     "two pieces of one plane that touch",
 )
 _APART_IOU = 0.02
+_PART_SCORE, _PLANE_SCORE, _BY_COVER = 0.3, 0.2, 0.2
+"""Scores of partial views and of pieces of planes, all below 0.5, which two whole views begin with."""
 
 
 @dataclass(frozen=True)
@@ -162,15 +164,17 @@ def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
     coplanar = u.coplanar(a, b, s.max_angle_deg, v)
     both_structure, one_structure = u.structure[a] & v.structure[b], u.structure[a] ^ v.structure[b]
     same = (low >= s.min_overlap) & (high >= s.min_containment) & (~one_structure | (low >= 0.5) & coplanar)
-    same |= one_mask & alike & (high >= 0.2) & ~one_structure
+    same |= one_mask & alike & (high >= s.same_mask_containment) & ~one_structure
     same &= across | (low >= s.min_containment)
     cut = np.where(p.i_on_j >= p.j_on_i, u.truncated[a], v.truncated[b])
     color = np.linalg.norm((u.lab[a] - v.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
     part = (high >= s.part_containment) & (color <= s.max_part_color) & ~one_structure & across
     part &= (cut >= s.min_truncated) | (coplanar & (smaller / np.maximum(larger, 1e-12) >= s.min_part_size))
-    piece = both_structure & coplanar & (high >= 0.05)
+    piece = both_structure & coplanar & (high >= s.piece_containment)
     base = np.sqrt(low * high)
-    score = np.where(same, 0.5 + 0.5 * base, np.where(part, 0.3 + 0.2 * high, 0.2 + 0.2 * high))
+    score = np.where(
+        same, 0.5 + 0.5 * base, np.where(part, _PART_SCORE + _BY_COVER * high, _PLANE_SCORE + _BY_COVER * high)
+    )
     score += np.where(one_mask & alike, 0.5 * p.frame_iou, 0.0)
     wanted = (same | part | piece) & (cosine >= s.min_cosine) & ~(apart & ~both_structure)
     kind = np.where(wanted, np.where(same, SAME, np.where(part, PART, PLANE)), NONE).astype(np.int8)
@@ -286,7 +290,7 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
     x, y = left[compared], right[compared]
     smaller, larger = np.minimum(t.size[x], t.size[y]), np.maximum(t.size[x], t.size[y])
     offset = np.linalg.norm(t.center[x] - t.center[y], axis=1)
-    apart = (overlaps.of(x, y) < 0.1) & (offset > s.max_center_offset * smaller)
+    apart = (overlaps.of(x, y) < s.apart_overlap) & (offset > s.max_center_offset * smaller)
     apart &= larger < s.max_size_ratio * smaller
     if apart.sum() > s.max_conflicts * len(compared):
         return f"{int(apart.sum())} of {len(compared)} pairs of whole views lie apart"

@@ -29,6 +29,8 @@ class MovingSettings:
     """Frames of two chunks in which both see it."""
     same_mask_iou: float = 0.5
     """Mean IoU of the boxes in those frames."""
+    apart_iou: float = 0.1
+    """Mean IoU of the boxes in those frames below which two are seen side by side."""
     same_place: float = 0.4
     """Distance of the places in those frames, in shares of the larger diagonal."""
     max_size_ratio: float = 2.5
@@ -280,7 +282,7 @@ class _Scene:
             return False
         boxes_a = self._shapes[a[0]].boxes_xyxy[self.at(a)][at_a].astype(float)
         boxes_b = self._shapes[b[0]].boxes_xyxy[self.at(b)][at_b].astype(float)
-        return bool(np.mean(np.diagonal(box_iou(boxes_a, boxes_b))) < 0.1)
+        return bool(np.mean(np.diagonal(box_iou(boxes_a, boxes_b))) < self._s.apart_iou)
 
     def now(self, nodes: Sequence[_Node]) -> Mover:
         """Where a thing is: where it was put down, or where its last track ends."""

@@ -17,6 +17,12 @@ class MergeSettings:
     """Of a smaller one inside a larger one, for a partial view."""
     min_truncated: float = 0.5
     """Share of its frames in which the image's border must cut a partial view."""
+    same_mask_containment: float = 0.2
+    """Of the better covered one, for two views whose masks agree in shared frames."""
+    piece_containment: float = 0.05
+    """Of the better covered one, for two pieces of one plane."""
+    apart_overlap: float = 0.1
+    """Of the less covered one, below which two whole views may lie apart."""
     max_part_color: float = 22.0
     """Between the median colours of a part and of the whole, CIE L*a*b* with lightness at half weight."""
     min_part_size: float = 0.3

@@ -50,6 +50,8 @@ class ShapeSettings:
     """Support points in an occupied cell, on average, that a grid must have to be filled by the points."""
     max_points: int = 250
     """Representative points of one instance, one from each occupied cell."""
+    trim: float = 0.02
+    """Share of the points outside the extents at either end of each axis."""
     border_px: float = 3.0
     """A box that comes this near to the border of what is seen is cut by it."""
     blind: float = 0.1
@@ -154,7 +156,7 @@ def chunk_shapes(
         p = node.support.points.astype(np.float64)
         if len(p) == 0:
             continue
-        low, high = np.quantile(p, [0.02, 0.98], axis=0)
+        low, high = np.quantile(p, [s.trim, 1.0 - s.trim], axis=0)
         center[n], size[n] = (low + high) / 2, float(np.linalg.norm(high - low))
         level[n], occupied, first = _own_grid(p, grain, s.crowd, at_least=2 if node.structure else 0)
         count[n] = len(occupied)

@@ -22,7 +22,8 @@ import numpy as np
 
 from list3r.memory.records import Relation
 from list3r.memory.relations.instance_geometry import InstanceGeometry, neighbours_of
-from list3r.memory.relations.scene import Found, PairMeasures, RelationScene, RelationSettings, certainty, wall_touched
+from list3r.memory.relations.scene import Found, PairMeasures, RelationScene, certainty, wall_touched
+from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.relations.support import containments, on_hidden_feet, supports
 
 INVERSE = {
@@ -116,14 +117,15 @@ def _over(scene: RelationScene, a: int, b: int) -> tuple[float, float, float] | 
     """How far a is over b: (share of the smaller footprint where it is, share of the lower one's points
     that it covers, clearance there), None where it is nowhere.
     """
-    upper, lower = scene.plan(a), scene.plan(b)
-    reach = max(0.03 * scene.unit, 1.5 * max(upper.spacing, lower.spacing))
+    s, upper, lower = scene.s, scene.plan(a), scene.plan(b)
+    reach = max(s.over_m * scene.unit, s.over_spacings * max(upper.spacing, lower.spacing))
     covered = float((neighbours_of(lower.points[:, :2], upper.tree)[0][:, 0] < reach).mean())
     back, under = neighbours_of(upper.points[:, :2], lower.tree)
     hit = back[:, 0] < reach
     if not hit.any():
         return None
-    gap = float(np.quantile(upper.points[hit, 2], 0.1) - np.quantile(lower.points[under[hit, 0], 2], 0.9))
+    bottom = np.quantile(upper.points[hit, 2], s.trim)
+    gap = float(bottom - np.quantile(lower.points[under[hit, 0], 2], 1.0 - s.trim))
     return max(covered, float(hit.mean())), covered, gap
 
 
@@ -175,4 +177,4 @@ def _side_by_side(scene: RelationScene, a: int, b: int) -> bool:
     low = max(scene.foot[a], scene.foot[b])
     high = min(scene.high[a, 2], scene.high[b, 2])
     shorter = min(scene.high[a, 2] - scene.foot[a], scene.high[b, 2] - scene.foot[b])
-    return bool(high - low >= 0.3 * shorter - scene.s.noise_m * scene.unit)
+    return bool(high - low >= scene.s.side_by_side * shorter - scene.s.noise_m * scene.unit)

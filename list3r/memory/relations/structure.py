@@ -34,6 +34,16 @@ class StructureSettings:
     """Share of the points before and behind a bounding surface that may lie just behind it."""
     under_ceiling: float = 0.02
     """Share of the points near a ceiling that may lie above it."""
+    trim: float = 0.1
+    """Share of the points at either side of a surface that noise may misplace, as its thickness is measured."""
+    eye_level: float = 0.9
+    """Share of the cameras that lie below eye level."""
+    above_eyes_m: float = 0.2
+    """A ceiling is higher than the cameras by this."""
+    over_ceiling_m: float = 0.1
+    """What is higher than a ceiling by this lies above it."""
+    behind_m: float = 0.15
+    """What lies further behind a surface than this, and nearer than `depth_m`, lies just behind it."""
     near_m: float = 3.0
     """What lies further from a surface has no say."""
 
@@ -46,7 +56,7 @@ def classify_structure(
     settings: StructureSettings | None = None,
     around: Sequence[InstanceGeometry] | None = None,
 ) -> list[str | None]:
-    """floor, ceiling, wall, plane or None for each body; z must be up.
+    """floor, ceiling, wall, plane or None for each instance; z must be up.
 
     `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
     saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level and lies at the
@@ -76,20 +86,20 @@ def flagged_only(instances: Sequence[InstanceGeometry]) -> list[str | None]:
 
 
 def _classify(
-    body: InstanceGeometry,
+    instance: InstanceGeometry,
     floor_height: float | None,
     eye_level: Callable[[InstanceGeometry], float],
     cloud: Array,
     unit: float,
     s: StructureSettings,
 ) -> str | None:
-    if body.normal is None:
+    if instance.normal is None:
         return None
-    along = body.points @ body.normal
-    thickness = float(np.ptp(np.quantile(along, [0.1, 0.9])))
-    edges = np.sort(body.box.size)
-    height, most = float(np.median(body.points[:, 2])), max(s.thickness_m * unit, s.thickness * edges[1])
-    level = abs(body.normal[2]) > np.cos(np.radians(s.level_deg))
+    along = instance.points @ instance.normal
+    thickness = float(np.ptp(np.quantile(along, [s.trim, 1.0 - s.trim])))
+    edges = np.sort(instance.box.size)
+    height, most = float(np.median(instance.points[:, 2])), max(s.thickness_m * unit, s.thickness * edges[1])
+    level = abs(instance.normal[2]) > np.cos(np.radians(s.level_deg))
     low = level and floor_height is not None and abs(height - floor_height) < s.floor_band_m * unit
     most = max(most, s.floor_band_m * unit) if low else most
     if thickness > most or edges[1] * edges[2] < s.min_area_m2 * unit**2:
@@ -97,26 +107,26 @@ def _classify(
     if level:
         if low:
             return "floor"
-        above = body.normal[2] < 0 and height > eye_level(body) + 0.2 * unit
-        if above and (cloud[:, 2] > height + 0.1 * unit).mean() < s.under_ceiling:
+        above = instance.normal[2] < 0 and height > eye_level(instance) + s.above_eyes_m * unit
+        if above and (cloud[:, 2] > height + s.over_ceiling_m * unit).mean() < s.under_ceiling:
             return "ceiling"
         return None
-    if not _bounds(body, cloud, unit, s):
+    if not _bounds(instance, cloud, unit, s):
         return None
-    if abs(body.normal[2]) < np.sin(np.radians(s.level_deg)):
-        wide = float(max(body.box.size[0], body.box.size[1]))
-        tall = float(body.box.size[2])
+    if abs(instance.normal[2]) < np.sin(np.radians(s.level_deg)):
+        wide = float(max(instance.box.size[0], instance.box.size[1]))
+        tall = float(instance.box.size[2])
         if tall >= s.wall_height_m * unit and wide >= s.wall_width_m * unit:
             return "wall"
-    return "plane" if body.flagged > 0.5 else None
+    return "plane" if instance.flagged > 0.5 else None
 
 
-def _bounds(body: InstanceGeometry, cloud: Array, unit: float, s: StructureSettings) -> bool:
+def _bounds(instance: InstanceGeometry, cloud: Array, unit: float, s: StructureSettings) -> bool:
     """Whether (nearly) nothing stands just behind the surface; what lies further back may be another room."""
-    assert body.normal is not None
-    depth = float(np.median(body.points @ body.normal)) - cloud @ body.normal
-    just_behind = (depth > 0.15 * unit) & (depth < s.depth_m * unit)
-    across = cloud - np.outer(cloud @ body.normal, body.normal)
-    own = body.points - np.outer(body.points @ body.normal, body.normal)
+    assert instance.normal is not None
+    depth = float(np.median(instance.points @ instance.normal)) - cloud @ instance.normal
+    just_behind = (depth > s.behind_m * unit) & (depth < s.depth_m * unit)
+    across = cloud - np.outer(cloud @ instance.normal, instance.normal)
+    own = instance.points - np.outer(instance.points @ instance.normal, instance.normal)
     inside = np.all((across >= own.min(axis=0)) & (across <= own.max(axis=0)), axis=1)
     return float((just_behind & inside).sum()) <= s.behind * max(float(inside.sum()), 1.0)

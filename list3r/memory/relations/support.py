@@ -20,23 +20,24 @@ from list3r.memory.relations.scene import (
     spacing_of,
     wall_touched,
 )
+from list3r.memory.relations.settings import SupportSettings
 
 # ---------------------------------------------------------------------------------------------- on
 
 
 def supports(scene: RelationScene, taken: set[int]) -> list[Found]:
     """Each thing on at most one other: the one whose surface it touches best."""
-    out = []
+    s, out = scene.s.on, []
     holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.instances], dtype=bool)
     for a, instance in enumerate(scene.instances):
         if a in taken or instance.structure is not None:
             continue
         best: Held | None = None
-        reach = contact_of(scene, a) + 0.05 * scene.unit
+        reach = contact_of(scene, a) + s.reach_m * scene.unit
         middle = instance.points[:, :2].mean(axis=0)
         aside = np.maximum(scene.low[:, :2] - middle, middle - scene.high[:, :2]).max(axis=1)
         near = holds & (scene.box_gap[a] <= reach) & (scene.low[:, 2] <= scene.low[a, 2] + reach)
-        near &= aside <= 0.25 * scene.unit
+        near &= aside <= s.aside_m * scene.unit
         near[a] = False
         for b in np.flatnonzero(near).tolist():
             found = scene.measure("on", a, b, _stands_on)
@@ -64,14 +65,14 @@ def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
         gaps = []
         for b in floors:
             aside = np.maximum(scene.low[b, :2] - middle, middle - scene.high[b, :2]).max()
-            if np.isfinite(scene.box_gap[a, b]) and aside <= 0.25 * scene.unit:
+            if np.isfinite(scene.box_gap[a, b]) and aside <= s.on.aside_m * scene.unit:
                 plan = scene.plan(b)
                 near = neighbours_of(instance.box.center[None, :2], plan.tree, min(12, len(plan.points)))[1]
-                gaps.append((float(np.quantile(z, 0.01) - np.median(plan.points[near[0], 2])), b))
-        gaps += [(gap, b) for gap, b in _beneath(scene, a) if gap < 0.25 * scene.unit]
+                gaps.append((float(np.quantile(z, s.on.lowest) - np.median(plan.points[near[0], 2])), b))
+        gaps += [(gap, b) for gap, b in _beneath(scene, a) if gap < s.on.aside_m * scene.unit]
         if gaps and 0.0 <= min(gaps)[0] < limit:
             gap, b = min(gaps)
-            out.append((a, b, 0.8 * (1.0 - 0.5 * gap / limit), limit - gap))
+            out.append((a, b, s.on.hidden * (1.0 - 0.5 * gap / limit), limit - gap))
     return out
 
 
@@ -79,9 +80,10 @@ def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
     """(clearance, position) of the things wholly below a that have a surface under its middle and are wide enough to
     bear it.
     """
-    middle, bottom = scene.instances[a].box.center[:2], float(np.quantile(scene.instances[a].points[:, 2], 0.01))
+    s, middle = scene.s.on, scene.instances[a].box.center[:2]
+    bottom = float(np.quantile(scene.instances[a].points[:, 2], s.lowest))
     below = scene.thing & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
-    slack = 0.25 * scene.unit
+    slack = s.aside_m * scene.unit
     below &= np.all((scene.low[:, :2] - slack <= middle) & (scene.high[:, :2] + slack >= middle), axis=1)
     base = float(np.prod(scene.instances[a].box.size[:2]))
     out = []
@@ -90,37 +92,38 @@ def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
         if float(np.prod(scene.instances[b].box.size[:2])) < 0.5 * base:
             continue
         distance, at = neighbours_of(middle[None], plan.tree, min(6, len(plan.points)))
-        if distance[0, 0] < max(0.05 * scene.unit, 3.0 * plan.spacing):
+        if distance[0, 0] < max(s.beneath_m * scene.unit, s.beneath_spacings * plan.spacing):
             out.append((bottom - float(np.max(plan.points[at[0], 2])), b))
     return out
 
 
 def _stands_on(scene: RelationScene, a: int, b: int) -> Sure | None:
     """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
-    subject, other = scene.instances[a], scene.instances[b]
+    s, subject, other = scene.s.on, scene.instances[a], scene.instances[b]
     z = subject.points[:, 2]
-    bottom, tolerance = float(np.quantile(z, 0.01)), contact_of(scene, a)
+    bottom, tolerance = float(np.quantile(z, s.lowest)), contact_of(scene, a)
     sink = scene.s.contact_m * scene.unit + 0.5 * scene.s.contact_per_height * min(float(np.ptp(z)), scene.unit)
     layer = other.points[(other.points[:, 2] > bottom - tolerance) & (other.points[:, 2] < bottom + sink)]
     if len(layer) < 3:
         return None
     middle = subject.points[:, :2].mean(axis=0)
     aside = np.maximum(layer[:, :2].min(axis=0) - middle, middle - layer[:, :2].max(axis=0)).max()
-    if aside > 0.25 * scene.unit:
+    if aside > s.aside_m * scene.unit:
         return None
     spacing = spacing_of(layer)
-    hold = max(0.02 * scene.unit, min(spacing, 0.25 * scene.unit))
+    hold = max(s.hold_m * scene.unit, min(spacing, s.aside_m * scene.unit))
     outside, area = hull_under(middle, layer[:, :2])
     if outside > hold or area < scene.s.least_base * float(np.prod(subject.box.size[:2])):
         return None
-    radius = 0.5 * float(np.linalg.norm(subject.box.size[:2])) + max(0.06 * scene.unit, 2.0 * spacing)
+    border = max(s.around_m * scene.unit, s.around_spacings * spacing)
+    radius = 0.5 * float(np.linalg.norm(subject.box.size[:2])) + border
     around = layer[np.linalg.norm(layer[:, :2] - middle, axis=1) < radius]
     if len(around) < 3:
         return None
     distance = neighbours_of(around[:, :2], cKDTree(subject.points[:, :2]))[0][:, 0]
     close = around[np.argsort(distance, kind="stable")[:24]]
     surface = float(np.median(close[:, 2]))
-    if float((z > surface - 0.7 * sink).mean()) < 0.6:
+    if float((z > surface - s.sunk * sink).mean()) < s.above:
         return None
     gap = bottom - surface
     margin = tolerance - gap if gap >= 0 else sink + gap
@@ -128,17 +131,17 @@ def _stands_on(scene: RelationScene, a: int, b: int) -> Sure | None:
         return None
     noise = scene.s.noise_m * scene.unit
     below = float((other.points[:, 2] <= float(np.median(z))).mean()) if other.structure is None else 1.0
-    confidence = certainty(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, around)
+    confidence = certainty(margin, noise) * (0.5 + 0.5 * min(1.0, below * 2.0)) * _steady(subject, around, s)
     return confidence, margin
 
 
-def _steady(subject: InstanceGeometry, around: Array) -> float:
+def _steady(subject: InstanceGeometry, around: Array, s: SupportSettings) -> float:
     """1 where the surface is seen all round the thing's middle, less where only on one side of it: what lies beside
     a thing on a table is as high as the table, to the noise, but does not go round it.
     """
     away = around[:, :2] - subject.points[:, :2].mean(axis=0)
     sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 8).astype(int) % 8)
-    return 0.6 + 0.4 * min(1.0, len(sectors) / 7)
+    return s.beside + (1.0 - s.beside) * min(1.0, len(sectors) / s.sectors)
 
 
 # ---------------------------------------------------------------------------------------------- in
@@ -154,7 +157,7 @@ def containments(scene: RelationScene) -> list[Found]:
         holders = [
             (float(np.prod(scene.instances[b].box.size)), b)
             for b in np.flatnonzero(scene.thing & (scene.box_gap[a] == 0.0)).tolist()
-            if a != b and volume <= 0.7 * float(np.prod(scene.instances[b].box.size))
+            if a != b and volume <= scene.s.within.most_volume * float(np.prod(scene.instances[b].box.size))
         ]
         for _, b in sorted(holders):
             found = scene.measure("in", a, b, _held_inside)
@@ -170,7 +173,7 @@ def _held_inside(scene: RelationScene, a: int, b: int) -> Sure | None:
     """
     subject, holder = scene.instances[a], scene.instances[b]
     local = (subject.points - holder.box.center) @ holder.box.rotation
-    inside = float(np.all(np.abs(local) <= holder.box.size / 2 + 0.01 * scene.unit, axis=1).mean())
+    inside = float(np.all(np.abs(local) <= holder.box.size / 2 + scene.s.within.slack_m * scene.unit, axis=1).mean())
     sides = _sides_round(scene, a, b)
     width = float(np.min(subject.box.size[:2]))
     if inside >= scene.s.inside:
@@ -179,11 +182,11 @@ def _held_inside(scene: RelationScene, a: int, b: int) -> Sure | None:
             return inside * (1.0 - sides.open_rad / (4 * np.pi)), 0.5 * (enclosed - sides.open_rad) * width
         covered = _between_boards(scene, a, b, walled=sides.share > 0.5 and sides.open_rad < np.pi)
         if covered is not None:
-            return 0.9 * inside, covered
+            return scene.s.within.boards * inside, covered
     if sides.share < scene.s.around and _is_hollow(scene, b):
         sides = _sides_round(scene, a, b, sunk=True)
     if sides.share >= scene.s.around and sides.uneven < scene.s.uneven and _down_in(scene, a, b):
-        return 0.5 + 0.5 * min(sides.share, 0.8), (sides.share - scene.s.around) * width
+        return 0.5 + 0.5 * min(sides.share, scene.s.within.sure_sides), (sides.share - scene.s.around) * width
     return None
 
 
@@ -205,14 +208,14 @@ def _sides_round(scene: RelationScene, a: int, b: int, *, sunk: bool = False) ->
     Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too, of which
     the farthest are the rim.
     """
-    subject, holder = scene.instances[a], scene.instances[b]
-    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
-    noise = 2.5 * scene.s.noise_m * scene.unit
-    brim = low - noise if sunk else low + max(0.3 * (high - low), noise)
+    s, subject, holder = scene.s.within, scene.instances[a], scene.instances[b]
+    low, high = _heights(scene, a)
+    noise = s.side_noises * scene.s.noise_m * scene.unit
+    brim = low - noise if sunk else low + max(s.side_height * (high - low), noise)
     z = holder.points[:, 2]
-    sides = holder.points[(z > brim) & (z < max(high, brim) + 0.3 * (high - low))]
+    sides = holder.points[(z > brim) & (z < max(high, brim) + s.side_height * (high - low))]
     away = sides[:, :2] - subject.points[:, :2].mean(axis=0)
-    away = away[np.linalg.norm(away, axis=1) > 0.25 * float(np.min(subject.box.size[:2]))]
+    away = away[np.linalg.norm(away, axis=1) > s.clear * float(np.min(subject.box.size[:2]))]
     if len(away) == 0:
         return _Sides(0.0, np.inf, 2 * np.pi)
     angle = np.sort(np.arctan2(away[:, 1], away[:, 0]) % (2 * np.pi))
@@ -234,18 +237,26 @@ def _within(scene: RelationScene, b: int) -> float | None:
     """Share of the surface over the middle of b that lies well below its rim; None where hardly any is seen."""
     holder = scene.instances[b]
     aside = np.abs((holder.points - holder.box.center) @ holder.box.rotation)[:, :2]
-    z = holder.points[np.all(aside < 0.3 * holder.box.size[:2], axis=1), 2]
-    depth = max(2.0 * scene.s.noise_m * scene.unit, 0.25 * float(holder.box.size[2]))
+    z = holder.points[np.all(aside < scene.s.within.middle * holder.box.size[:2], axis=1), 2]
+    depth = max(2.0 * scene.s.noise_m * scene.unit, scene.s.within.depth * float(holder.box.size[2]))
     return float((z < _rim(scene, b) - depth).mean()) if len(z) >= 10 else None
 
 
 def _rim(scene: RelationScene, b: int) -> float:
-    return float(np.quantile(scene.instances[b].points[:, 2], 0.97))
+    return _heights(scene, b)[1]
+
+
+def _heights(scene: RelationScene, n: int) -> tuple[float, float]:
+    """Height of the lowest and of the highest points of an instance."""
+    trim = scene.s.within.trim
+    low, high = np.quantile(scene.instances[n].points[:, 2], [trim, 1.0 - trim])
+    return float(low), float(high)
 
 
 def _rests_on(scene: RelationScene, a: int, b: int) -> bool:
-    low, high = np.quantile(scene.instances[a].points[:, 2], [0.03, 0.97])
-    return int((scene.instances[b].points[:, 2] < low + 0.3 * (high - low)).sum()) >= 3
+    low, high = _heights(scene, a)
+    limit = low + scene.s.within.side_height * (high - low)
+    return int((scene.instances[b].points[:, 2] < limit).sum()) >= 3
 
 
 def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> float | None:
@@ -255,7 +266,7 @@ def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> fl
     rises behind a pillow.
     """
     subject, holder = scene.instances[a], scene.instances[b]
-    low, high = np.quantile(subject.points[:, 2], [0.03, 0.97])
+    low, high = _heights(scene, a)
     noise = 2.0 * scene.s.noise_m * scene.unit
     aside = np.abs((holder.points - subject.box.center) @ subject.box.rotation)[:, :2]
     half = subject.box.size[:2] / 2
@@ -273,11 +284,11 @@ def _down_in(scene: RelationScene, a: int, b: int) -> bool:
     width, noise = float(np.max(subject.box.size[:2])), scene.s.noise_m * scene.unit
     footprints = float(np.prod(subject.box.size[:2])) / max(float(np.prod(holder.box.size[:2])), 1e-12)
     wide = float(np.max(holder.box.size[:2])) > scene.s.most_wider * width
-    if wide or footprints > 0.8 or holder.size > scene.s.open_m * scene.unit:
+    if wide or footprints > scene.s.within.most_footprint or holder.size > scene.s.open_m * scene.unit:
         return False
-    seen, bottom = _within(scene, b), float(np.quantile(subject.points[:, 2], 0.03))
-    deep = bottom <= _rim(scene, b) - max(noise, 0.25 * float(subject.box.size[2]))
+    seen, bottom = _within(scene, b), _heights(scene, a)[0]
+    deep = bottom <= _rim(scene, b) - max(noise, scene.s.within.depth * float(subject.box.size[2]))
     if not deep or bottom < scene.low[b, 2] - 2.0 * noise or (seen is not None and seen < scene.s.hollow):
         return False
     outside, _ = hull_under(subject.points[:, :2].mean(axis=0), holder.points[:, :2])
-    return outside <= 0.25 * width
+    return outside <= scene.s.within.depth * width

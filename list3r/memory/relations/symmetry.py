@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from list3r.memory.geometry import Array
+from list3r.memory.relations.settings import SymmetrySettings
 
 _LAYERS, _SAMPLE, _STEPS = 8, 200, 6
 
 
-def round_axis(points: Array, noise: float) -> Array | None:
-    """Where the vertical axis stands about which a thing is round, None for a thing that is not. z is up.
+def round_axis(points: Array, noise: float, settings: SymmetrySettings | None = None) -> Array | None:
+    """Return where the vertical axis stands about which an instance is round, None if it is not. z is up.
 
     Cut into level layers, the points of a round thing have one distance from the axis in each: balls, bowls, vases,
     baskets. The axis is the one for which those distances vary least (Gauss-Newton, weights for absolute deviations,
@@ -19,6 +20,7 @@ def round_axis(points: Array, noise: float) -> Array | None:
     lid or a bottom in sight does not; its outline is seen anyway.
     Shape (N, 3) -> (2,), world.
     """
+    s = settings or SymmetrySettings()
     p = points[:: -(-len(points) // _SAMPLE)]
     height = float(np.ptp(p[:, 2]))
     if len(p) < 5 * _LAYERS or height <= 0.0:
@@ -38,7 +40,7 @@ def round_axis(points: Array, noise: float) -> Array | None:
     _, off, radius = _around(xy, axis, layer, np.ones(len(xy)))
     spread = float(np.sqrt(np.mean(np.minimum(np.abs(off), 2.0 * noise) ** 2)))
     seen = 0.5 * float(np.ptp(xy, axis=0).max())
-    if spread > min(0.7 * noise, 0.13 * radius) or radius > 1.5 * seen:
+    if spread > min(s.most_noise * noise, s.most_uneven * radius) or radius > s.most_radius * seen:
         return None
     return np.asarray(axis + middle)
 

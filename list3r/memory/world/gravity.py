@@ -37,6 +37,10 @@ class GravitySettings:
     """Share of all other support points that may lie under the floor."""
     floor_depth_m: float = 0.1
     """What lies this much under it is under the floor: depth noise at the far end of a room is as large."""
+    floor_thickness_m: float = 0.08
+    """Level surfaces up to this much above the lowest one are the floor too: chunks do not lie alike."""
+    floor_low_cameras: float = 0.05
+    """Share of the cameras that may come nearer to the floor than `floor_camera_height_m`."""
     floor_camera_height_m: float = 0.8
     """A level surface that the cameras come nearer to than this is a table, not the floor."""
     settled_deg: float = 0.4
@@ -156,11 +160,11 @@ def floor_height(
     if not floor.any() or len(planes.points) == 0:
         return None
     heights = planes.center[floor] @ up
-    lowest = heights < heights.min() + 0.08 * unit
+    lowest = heights < heights.min() + s.floor_thickness_m * unit
     height = float(np.average(heights[lowest], weights=planes.area[floor][lowest]))
     others = ~np.isin(planes.owner, np.flatnonzero(floor)[lowest])
     below = float((planes.points[others] @ up < height - s.floor_depth_m * unit).mean()) if others.any() else 0.0
-    camera = float(np.quantile(camera_centers @ up, 0.05)) - height
+    camera = float(np.quantile(camera_centers @ up, s.floor_low_cameras)) - height
     if below > s.floor_below or camera < s.floor_camera_height_m * unit:
         return None
     return height
