@@ -31,7 +31,7 @@ from list3r.frames.chunking.pace import depth_step
 from list3r.frames.options import SourceOptions, parse_intrinsics
 from list3r.frames.source import open_source
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.mvs.stereo import dense_depth
+from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 
@@ -97,7 +97,7 @@ def compare_devices(frames: list[Frame], posed: NDArray[np.bool_], T: Poses, cam
     seconds, depths = {}, {}
     for device in ("cuda", "cpu", "cuda"):  # the first run loads the kernels
         begin = time.perf_counter()
-        depths[device], _ = dense_depth(frames, posed, T, camera, None, None, device)
+        depths[device], _ = dense_depth(PosedFrames(frames, posed, T, camera), None, device)
         torch.cuda.synchronize()
         seconds[device] = round((time.perf_counter() - begin) / len(frames), 4)
     both = (depths["cpu"] > 0) & (depths["cuda"] > 0)
@@ -129,7 +129,7 @@ def run(path: str, options: SourceOptions, words: argparse.Namespace) -> dict[st
             deep, used = frames[::every], camera
             posed, T = poses_of(deep, camera, words.poses)
             begin = time.process_time()
-            depth, confidence = dense_depth(deep, posed, T, camera)
+            depth, confidence = dense_depth(PosedFrames(deep, posed, T, camera))
         spent = time.process_time() - begin
         row = {"start": start, "frames": len(frames), "with_depth": len(deep), "posed": int(posed.sum())}
         row |= {"cpu_s": round(spent, 1), **against_sensor(depth, confidence, deep)}

@@ -16,7 +16,7 @@ from list3r.reconstruction.mvs.fill import fill_regions
 from list3r.reconstruction.mvs.fusion import DepthMap, fill_flat
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up, resized_camera
 from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepViewSettings
-from list3r.reconstruction.mvs.stereo import dense_depth, plane_residual, stereo_noise
+from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
 from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
@@ -49,7 +49,7 @@ def scene() -> tuple[tuple[Frame, ...], np.ndarray, np.ndarray]:
 @lru_cache(maxsize=1)
 def found() -> tuple[np.ndarray, np.ndarray]:
     frames, T, _ = scene()
-    return dense_depth(frames, np.ones(COUNT, bool), T, CAMERA)
+    return dense_depth(PosedFrames(frames, np.ones(COUNT, bool), T, CAMERA))
 
 
 def errors(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -87,18 +87,18 @@ def test_depth_scales_with_the_poses_and_sparse_points_only_bound_the_search() -
     xy = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
     sparse = [(xy, 10.0 * truth[k][v.ravel(), u.ravel()].astype(float)) for k in range(COUNT)]
     sparse[3] = None
-    depth, _ = dense_depth(frames, np.ones(COUNT, bool), larger, SMALL, sparse)
+    depth, _ = dense_depth(PosedFrames(frames, np.ones(COUNT, bool), larger, SMALL, sparse))
     assert (depth > 0).mean() > 0.85
     assert np.median(errors(depth, 10.0 * truth)) < 0.015
 
 
 def test_the_same_for_any_number_of_threads() -> None:
     frames, T, _ = (part[:8] for part in small_scene())
-    once = dense_depth(frames, np.ones(8, bool), T, SMALL)
+    once = dense_depth(PosedFrames(frames, np.ones(8, bool), T, SMALL))
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(before + 1)
-        again = dense_depth(frames, np.ones(8, bool), T, SMALL)
+        again = dense_depth(PosedFrames(frames, np.ones(8, bool), T, SMALL))
     finally:
         torch.set_num_threads(before)
     assert once[0].any()
@@ -112,7 +112,7 @@ def test_changing_exposure_does_not_matter() -> None:
         replace(f, color=np.clip(f.color * g + 8.0 * g, 0, 255).astype(np.uint8))
         for f, g in zip(frames, gain, strict=True)
     ]
-    depth, _ = dense_depth(changed, np.ones(COUNT, bool), T, SMALL)
+    depth, _ = dense_depth(PosedFrames(changed, np.ones(COUNT, bool), T, SMALL))
     assert (depth > 0).mean() > 0.8
     assert np.median(errors(depth, truth)) < 0.015
 
@@ -120,7 +120,7 @@ def test_changing_exposure_does_not_matter() -> None:
 def test_walls_without_texture_are_not_invented() -> None:
     T = walk(COUNT, speed=2.0)
     frames = list(map(shrunk, frames_along(T, seed=102, contrast=0.0)))
-    depth, confidence = dense_depth(frames, np.ones(COUNT, bool), T, SMALL)
+    depth, confidence = dense_depth(PosedFrames(frames, np.ones(COUNT, bool), T, SMALL))
     truth = np.stack([f.depth[::2, ::2] for f in frames_along(T, seed=102, contrast=0.0, noise=False)])
     error, sure = errors(depth, truth), confidence[depth > 0]
     assert (confidence > 0.3).mean() < 0.25
@@ -131,25 +131,27 @@ def test_turning_on_the_spot_gives_no_depth() -> None:
     T = walk(16)
     T[:, :3, 3] = 0.0
     T[:, :3, :3] = rotation_exp(np.outer(np.arange(16), [0.0, 0.02, 0.0]))
-    depth, confidence = dense_depth(list(map(shrunk, frames_along(T, seed=101))), np.ones(16, bool), T, SMALL)
+    depth, confidence = dense_depth(
+        PosedFrames(list(map(shrunk, frames_along(T, seed=101))), np.ones(16, bool), T, SMALL)
+    )
     assert not depth.any() and not confidence.any()
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_frames_give_no_depth(count: int) -> None:
     frames, T, _ = small_scene()
-    depth, _ = dense_depth(frames[:count], np.ones(count, bool), T[:count], SMALL)
+    depth, _ = dense_depth(PosedFrames(frames[:count], np.ones(count, bool), T[:count], SMALL))
     assert depth.shape == (count, SMALL.height, SMALL.width) and not depth.any()
 
 
 def test_black_frames_give_no_depth_and_frames_without_a_pose_stay_out() -> None:
     frames, T, truth = small_scene()
     dark = [black(f) for f in frames]
-    assert not dense_depth(dark, np.ones(COUNT, bool), T, SMALL)[0].any()
+    assert not dense_depth(PosedFrames(dark, np.ones(COUNT, bool), T, SMALL))[0].any()
     posed, lost = np.ones(COUNT, bool), T.copy()
     posed[7:11], lost[7:11] = False, np.nan
     mixed = [black(f) if 7 <= k < 11 else f for k, f in enumerate(frames)]
-    depth, _ = dense_depth(mixed, posed, lost, SMALL)
+    depth, _ = dense_depth(PosedFrames(mixed, posed, lost, SMALL))
     assert not depth[7:11].any()
     assert np.median(errors(depth[posed], truth[posed])) < 0.015
 
@@ -163,7 +165,7 @@ def test_what_moves_is_not_confidently_wrong() -> None:
         boxes = (BOXES[0], (tuple(low + shift), tuple(high + shift)), *BOXES[2:])
         frames.append(shrunk(render(pose, seed=101, boxes=boxes, index=k)))
         truth.append(render(pose, seed=101, boxes=boxes, index=k, noise=False).depth[::2, ::2])
-    depth, confidence = dense_depth(frames, np.ones(COUNT, bool), T, SMALL)
+    depth, confidence = dense_depth(PosedFrames(frames, np.ones(COUNT, bool), T, SMALL))
     error, sure = errors(depth, np.stack(truth)), confidence[depth > 0].astype(float)
     assert np.median(error) < 0.015
     assert ((error > 0.1) & (sure > 0.5)).mean() < 0.03
@@ -173,7 +175,7 @@ def test_odd_sizes_and_small_pictures() -> None:
     frames, T, truth = (part[:12] for part in scene())
     camera = Camera(141, 107, CAMERA.fx * 141 / 320, CAMERA.fy * 107 / 240, 70.0, 53.0)
     small = [replace(f, color=cv2.resize(f.color, (141, 107), interpolation=cv2.INTER_AREA)) for f in frames]
-    depth, _ = dense_depth(small, np.ones(12, bool), T, camera)
+    depth, _ = dense_depth(PosedFrames(small, np.ones(12, bool), T, camera))
     exact = np.stack([cv2.resize(t, (141, 107), interpolation=cv2.INTER_NEAREST) for t in truth])
     assert depth.shape == (12, 107, 141)
     assert np.median(errors(depth, exact)) < 0.02

@@ -11,7 +11,7 @@ from list3r.instances.settings import InstanceSettings
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary
 from list3r.reconstruction.base import DepthNoise, Reconstruction
-from list3r.reconstruction.mvs.stereo import dense_depth, stereo_noise
+from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, stereo_noise
 from tests.rgbd_scenes import BOXES, CAMERA, frames_along, walk
 
 COUNT = 24
@@ -20,7 +20,7 @@ COUNT = 24
 def reconstructed() -> tuple[list[Frame], np.ndarray, Reconstruction]:
     T = walk(COUNT, speed=2.0)
     frames = frames_along(T, seed=101)
-    depth, confidence = dense_depth(frames, np.ones(COUNT, bool), T, CAMERA)
+    depth, confidence = dense_depth(PosedFrames(frames, np.ones(COUNT, bool), T, CAMERA))
     reconstruction = Reconstruction(
         frame_indices=np.arange(COUNT),
         posed=np.ones(COUNT, bool),

@@ -122,21 +122,10 @@ _MODELS_EXTRA = "pip install 'list3r[models]'"
 _GIT = "pip install git+https://github.com"
 
 
-def _hub(
-    name: str,
-    part: str,
-    repository: str,
-    licence: Licence,
-    about: str,
-    *,
-    gated: bool = False,
-    revision: str = UNPINNED,
-    also: tuple[str, ...] = (),
-) -> ModelCard:
-    """A model that the package transformers runs, with the help of other packages."""
-    weights = (Weights(repository, licence, gated, revision),)
+def _hub(name: str, part: str, weights: Weights, about: str, also: tuple[str, ...] = ()) -> ModelCard:
+    """Return the card of a model that the package transformers runs, with the help of other packages."""
     install = " ".join((_MODELS_EXTRA, *also))
-    return ModelCard(name, part, APACHE, weights, (*_TRANSFORMERS, *also), install, about=about)
+    return ModelCard(name, part, APACHE, (weights,), (*_TRANSFORMERS, *also), install, about=about)
 
 
 DA3_SMALLER = MemoryFigures(2500, 600, "weights counted (0.14 G parameters); the rest as the giant's")
@@ -216,37 +205,47 @@ CARDS: tuple[ModelCard, ...] = (
         504 * 378,
         "base and small weights are free for any use",
     ),
-    _hub("eomt", "discovery", "tue-mps/coco_panoptic_eomt_large_640", MIT, "masks, query embeddings and labels"),
-    _hub("mask2former", "discovery", "facebook/mask2former-swin-tiny-coco-panoptic", OTHER, "masks and labels"),
-    _hub("sam2", "discovery", "facebook/sam2.1-hiera-tiny", APACHE, "masks of everything", revision=SAM2_COMMIT),
-    _hub("sam3", "discovery", "facebook/sam3", SAM_LICENCE, "masks of everything", gated=True, revision=SAM3_COMMIT),
-    _hub("sam2", "tracking", "facebook/sam2.1-hiera-tiny", APACHE, "video tracker", revision=SAM2_COMMIT),
-    _hub("sam3", "tracking", "facebook/sam3", SAM_LICENCE, "video tracker", gated=True, revision=SAM3_COMMIT),
-    _hub("edgetam", "tracking", "yonigozlan/EdgeTAM-hf", APACHE, "small video tracker", also=("timm",)),
+    _hub(
+        "eomt", "discovery", Weights("tue-mps/coco_panoptic_eomt_large_640", MIT), "masks, query embeddings and labels"
+    ),
+    _hub(
+        "mask2former", "discovery", Weights("facebook/mask2former-swin-tiny-coco-panoptic", OTHER), "masks and labels"
+    ),
+    _hub(
+        "sam2", "discovery", Weights("facebook/sam2.1-hiera-tiny", APACHE, revision=SAM2_COMMIT), "masks of everything"
+    ),
+    _hub(
+        "sam3",
+        "discovery",
+        Weights("facebook/sam3", SAM_LICENCE, gated=True, revision=SAM3_COMMIT),
+        "masks of everything",
+    ),
+    _hub("sam2", "tracking", Weights("facebook/sam2.1-hiera-tiny", APACHE, revision=SAM2_COMMIT), "video tracker"),
+    _hub("sam3", "tracking", Weights("facebook/sam3", SAM_LICENCE, gated=True, revision=SAM3_COMMIT), "video tracker"),
+    _hub("edgetam", "tracking", Weights("yonigozlan/EdgeTAM-hf", APACHE), "small video tracker", also=("timm",)),
     _hub(
         "dinov2",
         "features",
-        "facebook/dinov2-small",
-        APACHE,
+        Weights("facebook/dinov2-small", APACHE, revision="150c8e7bb7cef2d30ec31b13a517af14840ee3f7"),
         "appearance",
-        revision="150c8e7bb7cef2d30ec31b13a517af14840ee3f7",
     ),
-    _hub("dinov3", "features", "facebook/dinov3-vits16-pretrain-lvd1689m", DINOV3_LICENCE, "appearance", gated=True),
+    _hub(
+        "dinov3",
+        "features",
+        Weights("facebook/dinov3-vits16-pretrain-lvd1689m", DINOV3_LICENCE, gated=True),
+        "appearance",
+    ),
     _hub(
         "siglip2",
         "text",
-        "google/siglip2-base-patch16-224",
-        APACHE,
+        Weights("google/siglip2-base-patch16-224", APACHE, revision="75de2d55ec2d0b4efc50b3e9ad70dba96a7b2fa2"),
         "free words in find and nearest",
-        revision="75de2d55ec2d0b4efc50b3e9ad70dba96a7b2fa2",
     ),
     _hub(
         "clip",
         "text",
-        "openai/clip-vit-base-patch32",
-        MIT,
+        Weights("openai/clip-vit-base-patch32", MIT, revision="3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268"),
         "free words in find and nearest",
-        revision="3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268",
     ),
     ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of things"),
     ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", about="learned local features"),

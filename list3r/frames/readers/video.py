@@ -142,18 +142,12 @@ class VideoSource:
                 stream.thread_type = "AUTO"
             if stamp is not None and not _sought(container, stream, stamp):
                 return
-            count, last = 0, -1
-            for packet in packets(container, stream):
-                try:
-                    images = packet.decode()
-                except av.FFmpegError:
-                    continue
-                for image in images:
-                    number = self._stamps.number(image, count, last)
-                    count += 1
-                    if number is not None:
-                        last = number
-                        yield number, image
+            last = -1
+            for count, image in enumerate(_decodable(container, stream)):
+                number = self._stamps.number(image, count, last)
+                if number is not None:
+                    last = number
+                    yield number, image
 
     def _time_s(self, number: int) -> float:
         return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
@@ -195,6 +189,16 @@ class VideoSource:
             image_size=rig.color_size,
             camera_guess=None if guess is None else centred_camera(guess, rig),
         )
+
+
+def _decodable(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.VideoFrame]:
+    """Yield the pictures of a stream from where it stands; what cannot be decoded is left out."""
+    for packet in packets(container, stream):
+        try:
+            images = packet.decode()
+        except av.FFmpegError:
+            continue
+        yield from images
 
 
 def _sought(container: Any, stream: Any, stamp: int) -> bool:

@@ -146,10 +146,10 @@ def calibrate(
     assumed = _assumed(fit, source)
     if fit.count < settings.least_edges or fit.frames < settings.groups:
         reason = f"only {fit.count} edge pixels in {fit.frames} frames: too few steps in depth to see an offset"
-        return _result(fit, ("undetermined", reason), assumed, assumed, {}, depth_intrinsics, positions)
+        return _result(fit, ("undetermined", reason), assumed, (assumed, {}), depth_intrinsics, positions)
     best, std = _search(fit, settings)
     verdict = _judge(fit, best, std, settings)
-    return _result(fit, verdict, assumed, best, std, depth_intrinsics, positions)
+    return _result(fit, verdict, assumed, (best, std), depth_intrinsics, positions)
 
 
 def _search(fit: EdgeFit, settings: DepthCalibrationSettings) -> tuple[Array, dict[str, float]]:
@@ -199,11 +199,12 @@ def _result(
     fit: EdgeFit,
     verdict: tuple[str, str],
     assumed: Array,
-    v: Array,
-    std: dict[str, float],
+    found: tuple[Array, dict[str, float]],
     depth_intrinsics: Intrinsics,
     positions: list[int],
 ) -> DepthCalibration:
+    """Return the result; `found` is the best camera and its deviations."""
+    v, std = found
     T_color_depth = np.eye(4)
     T_color_depth[:3, :3] = Rotation.from_rotvec(v[7:]).as_matrix()
     T_color_depth[:3, 3] = v[2:5]

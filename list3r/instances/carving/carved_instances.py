@@ -74,7 +74,8 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         if not clusters:
             continue
         frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
-        maker = _Maker(chunk, keyframes[chunk.chunk_id], own, frames, unit, upright, s)
+        pictures = [_picture(k) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
+        maker = _Maker(chunk, list(zip(own, pictures, strict=True)), frames, unit, upright, s)
         in_chunk = unit / float(chunk.S_world_chunk.scale)
         following = 1 + max((n.local_id for n in nodes), default=-1)
         for cluster in clusters:
@@ -188,18 +189,15 @@ class _Maker:
     def __init__(
         self,
         chunk: ChunkRow,
-        keyframes: Sequence[Keyframe],
-        views: Sequence[DepthView],
+        shown: Sequence[tuple[DepthView, NDArray[np.uint8] | None]],
         frames: Sequence[FrameRow],
         unit: float,
         upright: bool,
         settings: ChangedPlaceSettings,
     ) -> None:
+        """`shown` are the chunk's keyframes as views, with their pictures where they were kept."""
         self._chunk, self._s, self._unit = chunk, settings, unit
-        kept = [k for k in keyframes if k.depth_small.size]
-        self._pictures = [_picture(k) for k in kept]
-        self._views = list(views)
-        self._frames = list(frames)
+        self._shown, self._frames = shown, frames
         R = chunk.S_world_chunk.rotation
         self._up = R.T @ np.array([0.0, 0.0, 1.0]) if upright else np.array([0.0, -1.0, 0.0])
 
@@ -208,7 +206,7 @@ class _Maker:
         tree = cKDTree(cluster)
         reach = 1.5 * self._s.voxel_m * self._unit
         points, rgb, masks = [], [], {}
-        for view, picture in zip(self._views, self._pictures, strict=True):
+        for view, picture in self._shown:
             lifted, row, column = lift(view)
             low, high = cluster.min(axis=0) - reach, cluster.max(axis=0) + reach
             near = np.flatnonzero(((lifted > low) & (lifted < high)).all(axis=1))
@@ -234,7 +232,7 @@ class _Maker:
         size = self._chunk.image_size
         full = {k: _fill(_enlarge(m, size)) for k, m in masks.items()}
         order = sorted(full)
-        keys = sorted(v.frame_index for v in self._views)
+        keys = sorted(v.frame_index for v, _ in self._shown)
         for f in self._frames:
             n = int(np.searchsorted(keys, f.frame_index))
             around = keys[max(0, n - 1) : n + 1]

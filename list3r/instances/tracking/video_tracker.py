@@ -7,7 +7,7 @@ found on a later anchor is followed backwards in a second sweep. Ids are handed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,14 +96,25 @@ class VideoTracker:
                 found = state.step(picture, position, things.shape, reverse=not forwards)
                 prompts = things.prompts(position, found, forwards=forwards)
                 if prompts:
-                    live = {**{k: v > 0 for k, v in found.items() if (v > 0).any()}, **prompts}
-                    if len(state.objects | prompts.keys()) > self._tracker.most_live:
-                        state = _State(self._new_session(frames), self._network)
-                        prompts = things.most_wanted(live)
+                    state, prompts = self._with_room(state, prompts, found, things, frames)
                     state.prompt(prompts, position, self._shape)
                     found = state.step(picture, position, things.shape, reverse=not forwards)
                 state.forget(position)
                 yield position, found
+
+    def _with_room(
+        self,
+        state: _State,
+        prompts: dict[int, NDArray[np.bool_]],
+        found: Mapping[int, NDArray[np.float32]],
+        things: _Things,
+        frames: Sequence[Frame],
+    ) -> tuple[_State, dict[int, NDArray[np.bool_]]]:
+        """Return the session that follows the prompts too, and the prompts: a new one where there would be too many."""
+        if len(state.objects | prompts.keys()) <= self._tracker.most_live:
+            return state, prompts
+        live = {**{k: v > 0 for k, v in found.items() if (v > 0).any()}, **prompts}
+        return _State(self._new_session(frames), self._network), things.most_wanted(live)
 
     def _new_session(self, frames: Sequence[Frame]) -> Any:
         import transformers

@@ -195,17 +195,21 @@ def _together(tracks: list[Followed], s: FollowSettings) -> list[Followed]:
     """Tracks that keep beside each other in most frames of the shorter one are parts of one thing and its track."""
     out: list[Followed] = []
     for track in sorted(tracks, key=lambda t: (-len(t.blobs), t.blobs[0].position)):
-        for whole in out:
-            by_frame = {b.position: n for n, b in enumerate(whole.blobs)}
-            shared = [(b, by_frame[b.position]) for b in track.blobs if b.position in by_frame]
-            beside = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
-            if shared and len(shared) >= 0.6 * len(track.blobs) and len(beside) >= 0.6 * len(shared):
-                for blob, n in shared:
-                    whole.blobs[n] = _union(whole.blobs[n], blob)
-                break
-        else:
+        if not any(_took_in(whole, track, s) for whole in out):
             out.append(track)
     return sorted(out, key=lambda t: t.blobs[0].position)
+
+
+def _took_in(whole: Followed, track: Followed, s: FollowSettings) -> bool:
+    """Add a track to one beside which it keeps; whether it does."""
+    by_frame = {b.position: n for n, b in enumerate(whole.blobs)}
+    shared = [(b, by_frame[b.position]) for b in track.blobs if b.position in by_frame]
+    beside = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
+    if not shared or len(shared) < s.together * len(track.blobs) or len(beside) < s.together * len(shared):
+        return False
+    for blob, n in shared:
+        whole.blobs[n] = _union(whole.blobs[n], blob)
+    return True
 
 
 def _union(a: Blob, b: Blob) -> Blob:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.motion.settings import MoverSettings
 from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register, steps_without
-from list3r.reconstruction.rgbd.settings import RegistrationSettings
+from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
 Mask = NDArray[np.bool_]
@@ -106,14 +106,13 @@ def find_mover(
     view: WorkingFrame,
     T_guess: Pose,
     found: FrameRegistration,
-    registration: RegistrationSettings,
-    settings: MoverSettings,
-    noise: SensorNoise,
+    odometry: OdometrySettings,
 ) -> tuple[Mask, FrameRegistration] | None:
-    """The surface that moves of its own most plainly, and the view registered without it; None where nothing does."""
+    """Return the surface that moves of its own most plainly, and the view registered without it; None without one."""
+    registration, settings, noise = odometry.registration, odometry.movers, odometry.noise
     best: tuple[float, Mask] | None = None
     few = _every(model, settings.check_stride)
-    for mask in suspects(model, view, found, registration, settings, noise):
+    for mask in suspects(model, view, found, odometry):
         rest = register(few, without(view, mask), T_guess, registration, noise)
         if rest is None:
             continue
@@ -136,15 +135,9 @@ def find_mover(
     return None if rest is None else (best[1], rest)
 
 
-def suspects(
-    model: Samples,
-    view: WorkingFrame,
-    found: FrameRegistration,
-    registration: RegistrationSettings,
-    settings: MoverSettings,
-    noise: SensorNoise,
-) -> list[Mask]:
-    """Surfaces that one more step without them would shift by more than noise."""
+def suspects(model: Samples, view: WorkingFrame, found: FrameRegistration, odometry: OdometrySettings) -> list[Mask]:
+    """Return the surfaces that one more step without them would shift by more than noise."""
+    registration, settings, noise = odometry.registration, odometry.movers, odometry.noise
     few = _every(model, settings.suspect_stride)
     cost, pixel = pixel_costs(few, view, found.T_model_cam, settings, noise)
     masks = [m for m in surfaces(view, settings, noise) if (m & view.valid).mean() >= 0.5 * settings.least_share]

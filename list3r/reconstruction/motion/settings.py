@@ -110,3 +110,5 @@ class FollowSettings:
     moved_share: float = 0.35
     """and in shares of its own width."""
     most_tracks: int = 200
+    together: float = 0.6
+    """Share of its frames in which a track must be beside another to be part of the same thing."""

@@ -119,6 +119,8 @@ class MatchTrustSettings:
     """Matching cost above which a match is none (ZNCC 0.3)."""
     least_margin: float = 0.02
     """A different depth must cost this much more, or it may be that one."""
+    sure_margin: float = 0.15
+    """... and this much for a match that leaves no doubt, by which the span of depths is found."""
     least_texture: float = 0.5
     """Variance of the window over that of noise below which there is nothing to match."""
     half_sigma: float = 0.02

@@ -33,7 +33,7 @@ from list3r.reconstruction.mvs.settings import (
     MatchTrustSettings,
     MvsSettings,
 )
-from list3r.reconstruction.mvs.sweep import DepthMatch, SweepReference, coarse_match, refine
+from list3r.reconstruction.mvs.sweep import CoarseDepth, DepthMatch, SweepReference, coarse_match, refine
 from list3r.reconstruction.mvs.views import (
     ViewPairs,
     choose_keyframes,
@@ -43,7 +43,7 @@ from list3r.reconstruction.mvs.views import (
     plane_depths,
 )
 
-__all__ = ["MvsSettings", "Sparse", "dense_depth", "stereo_noise"]
+__all__ = ["MvsSettings", "PosedFrames", "Sparse", "dense_depth", "stereo_noise"]
 
 Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Places (N, 2) in px and depths (N,) of a frame's triangulated points."""
@@ -67,32 +67,38 @@ class _Chunk:
     settings: MvsSettings
 
 
-def dense_depth(
-    frames: Sequence[Frame],
-    posed: NDArray[np.bool_],
-    T_chunk_cam: Poses,
-    camera: Camera,
-    sparse: Sequence[Sparse | None] | None = None,
-    settings: MvsSettings | None = None,
-    device: str = "cpu",
-) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
-    """Depth along z, chunk units, 0 where unknown, and confidence in [0, 1] of every frame. Shape (F, H, W) each.
+@dataclass(frozen=True)
+class PosedFrames:
+    """Frames of one camera with their poses."""
 
-    `posed` (F,) says whose pose in `T_chunk_cam` (F, 4, 4) means something; the others get no depth. `sparse` holds
-    the triangulated points of each frame where there are some: they tell between which depths to look. Confidence is
-    1 / (1 + (sigma / half_sigma)^2) of the deviation that is expected.
+    frames: Sequence[Frame]
+    posed: NDArray[np.bool_]
+    """Frames whose pose means something; the others get no depth. Shape (F,)."""
+    T_chunk_cam: Poses
+    """Shape (F, 4, 4)."""
+    camera: Camera
+    sparse: Sequence[Sparse | None] | None = None
+    """Triangulated points of each frame where there are some: they tell between which depths to look."""
+
+
+def dense_depth(
+    given: PosedFrames, settings: MvsSettings | None = None, device: str = "cpu"
+) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
+    """Return depth along z, chunk units, 0 where unknown, and confidence of every frame. Shape (F, H, W) each.
+
+    Confidence in [0, 1] is 1 / (1 + (sigma / half_sigma)^2) of the deviation that is expected.
     """
-    settings = settings or MvsSettings()
+    frames, camera = given.frames, given.camera
     shape = (len(frames), camera.height, camera.width)
     depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float16)
-    if int(posed.sum()) < 3:
+    if int(given.posed.sum()) < 3:
         return depth, confidence
     with torch.inference_mode(), _one_thread():
-        chunk = _prepare(frames, posed, T_chunk_cam, camera, sparse, settings, device)
+        chunk = _prepare(given, settings or MvsSettings(), device)
         if chunk is None:
             return depth, confidence
         maps = {row: _filled(chunk, row, seen, frames) for row, seen in _keyframe_maps(chunk).items()}
-        for position in np.flatnonzero(posed).tolist():
+        for position in np.flatnonzero(given.posed).tolist():
             small = _frame_map(chunk, maps, position)
             if small is None:
                 continue
@@ -148,17 +154,10 @@ def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.floa
     return np.where(n > 0.67, np.sqrt(np.maximum(ww - explained, 0.0)), np.nan)
 
 
-def _prepare(
-    frames: Sequence[Frame],
-    posed: NDArray[np.bool_],
-    T_chunk_cam: Poses,
-    camera: Camera,
-    sparse: Sequence[Sparse | None] | None,
-    settings: MvsSettings,
-    device: str,
-) -> _Chunk | None:
-    """None where the cameras do not move."""
-    T = np.where(posed[:, None, None], T_chunk_cam, np.eye(4))
+def _prepare(given: PosedFrames, settings: MvsSettings, device: str) -> _Chunk | None:
+    """What every step looks at; None where the cameras do not move."""
+    frames, posed, camera, sparse = given.frames, given.posed, given.camera, given.sparse
+    T = np.where(posed[:, None, None], given.T_chunk_cam, np.eye(4))
     coarse = make_pictures(frames, camera, min(settings.sweep.coarse_width_px, camera.width), device)
     fine = make_pictures(frames, camera, min(settings.sweep.width_px, camera.width), device)
     sharp = np.array([sharpness(gray) for gray in fine.gray.cpu().numpy()])
@@ -224,12 +223,12 @@ def _probed(chunk: _Chunk, row: int) -> NDArray[np.float64]:
     swept = _coarse(chunk, row)
     if swept is None:
         return np.zeros(0)
-    inverse, margin, _, _ = swept
-    return (1.0 / inverse[margin > 0.15]).cpu().numpy().astype(np.float64)
+    found, _ = swept
+    return (1.0 / found.inverse[found.margin > chunk.settings.trust.sure_margin]).cpu().numpy().astype(np.float64)
 
 
-def _coarse(chunk: _Chunk, row: int) -> tuple[Tensor, Tensor, float, list[int]] | None:
-    """Inverse depth and margin at the coarse width, spacing of the planes, sources; None without parallax."""
+def _coarse(chunk: _Chunk, row: int) -> tuple[CoarseDepth, list[int]] | None:
+    """Depth at the coarse width and the sources; None without parallax."""
     settings, key = chunk.settings.sweep, chunk.keyframes[row]
     sources = choose_sources(row, chunk.pairs, chunk.T_chunk_cam, chunk.sharp, key, chunk.settings.views)
     if not sources:
@@ -245,7 +244,7 @@ def _coarse(chunk: _Chunk, row: int) -> tuple[Tensor, Tensor, float, list[int]] 
         torch.from_numpy(planes).to(chunk.device),
         settings,
     )
-    return float(planes[0]) + place * spacing, margin, spacing, sources
+    return CoarseDepth(float(planes[0]) + place * spacing, margin, spacing), sources
 
 
 def _parallax_px(chunk: _Chunk, row: int, sources: list[int], camera: Camera) -> float:
@@ -264,13 +263,13 @@ def _sweep(chunk: _Chunk, row: int) -> SweptDepth | None:
     swept = _coarse(chunk, row)
     if swept is None:
         return None
-    inverse, margin, spacing, sources = swept
+    coarse, sources = swept
     settings, trust, key = chunk.settings.sweep, chunk.settings.trust, chunk.keyframes[row]
     gray = chunk.fine.gray[key]
-    start, margin = (_resized(image, gray.shape) for image in (inverse, margin))
+    start = CoarseDepth(_resized(coarse.inverse, gray.shape), _resized(coarse.margin, gray.shape), coarse.spacing)
     reference = SweepReference.of(gray, settings.radius_px, settings.image_noise)
     warps = _warps(chunk, key, sources, chunk.fine.camera)
-    match = refine(reference, [chunk.fine.gray[k] for k in sources], warps, start, margin, spacing, settings)
+    match = refine(reference, [chunk.fine.gray[k] for k in sources], warps, start, settings)
     known = (match.cost < trust.most_cost) & (match.margin > trust.least_margin) & (match.texture > trust.least_texture)
     return SweptDepth(match.inverse_depth, _match_sigma(chunk, row, sources, match), known & ~match.doubt)
 

@@ -28,6 +28,18 @@ class DepthMatch:
 
 
 @dataclass(frozen=True)
+class CoarseDepth:
+    """What the planes tell of a keyframe."""
+
+    inverse: Tensor
+    """Inverse depth, 1 / chunk units. Shape (h, w)."""
+    margin: Tensor
+    """Cost of the best different depth less that of the chosen one. Shape (h, w)."""
+    spacing: float
+    """Inverse depth from one plane to the next."""
+
+
+@dataclass(frozen=True)
 class SweepReference:
     """A keyframe with its window sums, ready to be compared."""
 
@@ -183,12 +195,11 @@ def refine(
     reference: SweepReference,
     sources: Sequence[Tensor],
     warps: Sequence[Warp],
-    start: Tensor,
-    margin: Tensor,
-    spacing: float,
+    coarse: CoarseDepth,
     settings: SweepSettings,
 ) -> DepthMatch:
-    """Better inverse depths near `start` (h, w): windows bend with the depth found so far, so slopes are no bias."""
+    """Return better inverse depths: windows bend with the depth found so far, so slopes are no bias."""
+    start, spacing = coarse.inverse, coarse.spacing
     inverse, doubt = choose_at_edges(reference.gray, sources, warps, start, spacing, settings)
     least = 0.02 * spacing
     offsets = torch.arange(-2, 3, device=start.device, dtype=torch.float32)[:, None, None]
@@ -203,7 +214,7 @@ def refine(
         inverse = _median(inverse)
         cost = raw.gather(0, plane[None])[0]
     texture = reference.spread / settings.image_noise**2 - 1.0
-    return DepthMatch(inverse, cost, margin, texture, doubt)
+    return DepthMatch(inverse, cost, coarse.margin, texture, doubt)
 
 
 def _median(inverse: Tensor) -> Tensor:

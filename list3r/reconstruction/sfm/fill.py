@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -105,7 +104,7 @@ def pose_of(
     lens, px = make_lens(camera, ""), xy.astype(np.float64) + 0.5
     gate = settings.pose_error_px * pixel_unit(camera)
     if start is not None:
-        found = _refined(px, points, lens, camera, start, np.ones(len(px), bool), gate)
+        found = _refined(px, points, camera, start, np.ones(len(px), bool), gate)
         if found is not None and found[1].mean() > 0.6:
             return found
     options = pycolmap.AbsolutePoseEstimationOptions()
@@ -114,20 +113,19 @@ def pose_of(
     if guess is None or guess["num_inliers"] < settings.least_matches:
         return None
     T = inverse(matrix_of(guess["cam_from_world"]))
-    found = _refined(px, points, lens, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
+    found = _refined(px, points, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
     return found if found is not None and found[1].mean() > 0.3 else None
 
 
 def _refined(
     px: NDArray[np.float64],
     points: NDArray[np.float64],
-    lens: Any,
     camera: Camera,
     start: Poses,
     rows: NDArray[np.bool_],
     gate: float,
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
-    T_cam_map = inverse(start)
+    T_cam_map, lens = inverse(start), make_lens(camera, "")
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.loss_function_scale, options.gradient_tolerance = 0.5 * pixel_unit(camera), 1e-3
     for _ in range(2):

@@ -243,7 +243,7 @@ def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: Mapp
     count = 0
     for (a, b), rows in sorted(problem.pairs.items()):
         matched = (a, b) in problem.matched
-        found = _two_view(problem.views[a], problem.views[b], rows, lens, camera, free_camera, settings, matched)
+        found = _two_view(problem, (a, b), lens, camera, free_camera, settings)
         wanted = max(settings.least_matches, settings.matched_share * len(rows) if matched else 0.0)
         if found is not None and len(found.inlier_matches) >= wanted:
             database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
@@ -257,26 +257,20 @@ def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: Mapp
 
 
 def _two_view(
-    a: KeyframeView,
-    b: KeyframeView,
-    rows: NDArray[np.int64],
-    lens: Any,
-    camera: Camera,
-    free_camera: str,
-    settings: MappingSettings,
-    matched: bool = False,
+    problem: MapProblem, pair: tuple[int, int], lens: Any, camera: Camera, free_camera: str, settings: MappingSettings
 ) -> Any:
+    rows = problem.pairs[pair]
     if len(rows) < settings.least_matches:
         return None
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers, options.detect_watermark = settings.least_matches, False
     options.ransac.max_error = settings.pair_error_px * pixel_unit(camera) * (2.0 if free_camera else 1.0)
     options.ransac.random_seed, options.ransac.num_threads = settings.seed, 1
-    if matched:
+    if pair in problem.matched:
         options.min_E_F_inlier_ratio, options.ransac.min_inlier_ratio = 0.0, settings.matched_share
     calibrated, free = pycolmap.estimate_calibrated_two_view_geometry, pycolmap.estimate_two_view_geometry
     estimate = free if free_camera == "focal" else calibrated
-    one, two = (view.xy.astype(np.float64) + 0.5 for view in (a, b))
+    one, two = (view.xy.astype(np.float64) + 0.5 for view in (problem.views[pair[0]], problem.views[pair[1]]))
     return estimate(lens, one, lens, two, rows.astype(np.uint32), options)
 
 

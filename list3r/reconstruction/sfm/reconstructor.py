@@ -21,7 +21,7 @@ from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
-from list3r.reconstruction.mvs.stereo import dense_depth, stereo_noise
+from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, stereo_noise
 from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
@@ -163,7 +163,7 @@ class SfmReconstructor:
             kept = np.flatnonzero(used).tolist()
             frames, sparse = [frames[k] for k in kept], [sparse[k] for k in kept]
             indices, posed, T = indices[used], posed[used], T[used]
-        depth, confidence = dense_depth(frames, posed, T, camera, sparse, self.settings.dense, self.device)
+        depth, confidence = dense_depth(PosedFrames(frames, posed, T, camera, sparse), self.settings.dense, self.device)
         keyframes = select_keyframes(T, posed, list(depth), self.settings.keyframes)
         return Reconstruction(
             frame_indices=indices,
