@@ -1,6 +1,6 @@
 """Local instances of all chunks to the global library (paper 3.3): group, keep ids, derive, relate, log.
 
-There is one path. What has to be derived anew is a set of chunks (`DirtySet`): the one that came in and those that
+There is one path (decision 0020). What has to be derived anew is a set of chunks (`DirtySet`): the one that came in and those that
 moved, or all of them where something changed that holds for the whole memory. What lies further away need not be
 looked at:
 

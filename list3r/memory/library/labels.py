@@ -55,10 +55,8 @@ class LabelSettings:
     min_confidence: float = 0.5
     """Probability of the class."""
     likeness: float = 0.4
-    """Correlation of what a detector says in two pictures of one thing: n pictures say as much as n / (1 + likeness
-    (n - 1)) of different things would, never more than 1 / likeness. Chosen on redkitchen: from 0.25 to 0.5 mugs, table
-    and four chairs keep their names, the fifth chair and one magazine come and go.
-    """
+    """Correlation of what a detector says in two pictures of one instance: n pictures say as much as n / (1 + likeness
+    (n - 1)) of different ones would, never more than 1 / likeness (decision 0024)."""
     always_wrong: float = 0.03
     """A detector may be wrong in the same way in every picture; no label is surer than one less this."""
 

@@ -8,10 +8,8 @@ estimated. Inverses are relations of their own, so that a reader never has to kn
 stand side by side (they share heights). Size is the longest edge; bounds in metres stand in the settings. Neither is
 said of structure, nor of two things of which one holds the other, nor where it is hardly likelier than not.
 
-The gap is that of the nearest points, without readings amidst an edge, and with the backs of round things
-(`roundness`). What was tried on the simulated homes 101 to 119, wrong and missed pairs of 345 (now 4 and 16): making it
-smaller by the sides that may be hidden is 3 cm too near where nothing is hidden; convex hulls of level slices, the
-third nearest points and averages over neighbours are no better and fail where things are sparsely seen.
+The gap is that of the nearest points, without readings amidst an edge, and with the backs of round things (decision
+0021).
 """
 
 from __future__ import annotations
