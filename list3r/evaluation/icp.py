@@ -20,7 +20,12 @@ class IcpSettings:
     reach_m: float = 0.3
     """Greatest distance of matched points in the first round; it shrinks to `least_reach_m`."""
     least_reach_m: float = 0.05
+    shrink: float = 0.85
+    """Factor on that distance from round to round."""
+    least_stiffness: float = 1e-5
+    """Least eigenvalue of the motion's information, as a share of the greatest: below, the surfaces leave it open."""
     rounds: int = 60
+    """Most rounds."""
     points: int = 20_000
     """Points of the estimate that are matched."""
     least_share: float = 0.1
@@ -50,16 +55,16 @@ def register(
                 f"{near.sum()} of {len(p)} points lie within {reach:.2f} m of the truth: ICP needs clouds that nearly "
                 "lie right; align by --align TRAJECTORY first"
             )
-        step = _step(moved[near], q[row[near]], n[row[near]], reach, with_scale)
+        step = _step(moved[near], q[row[near]], n[row[near]], reach, with_scale, settings.least_stiffness)
         S = step @ S
         still = float(np.abs(step.log()).max()) < 1e-6
         if still and reach <= settings.least_reach_m:
             break
-        reach = max(settings.least_reach_m, reach * 0.85)
+        reach = max(settings.least_reach_m, reach * settings.shrink)
     return S
 
 
-def _step(moved: Array, target: Array, normal: Array, reach: float, with_scale: bool) -> Sim3:
+def _step(moved: Array, target: Array, normal: Array, reach: float, with_scale: bool, least_stiffness: float) -> Sim3:
     """One Gauss-Newton step on distances to planes under Tukey's weights."""
     middle = moved.mean(axis=0)
     arm = moved - middle
@@ -74,7 +79,7 @@ def _step(moved: Array, target: Array, normal: Array, reach: float, with_scale: 
     units = np.array([1.0] * 3 + [extent] * (jacobian.shape[1] - 3))
     scaled = hessian / np.outer(units, units)
     values = np.linalg.eigvalsh(scaled)
-    if values[0] < 1e-5 * values[-1]:
+    if values[0] < least_stiffness * values[-1]:
         raise DegenerateError("the surfaces leave a motion open (one plane, or a tube): ICP cannot align these clouds")
     x = np.zeros(7)
     x[: jacobian.shape[1]] = -np.linalg.solve(hessian, jacobian.T @ (weight * residual))

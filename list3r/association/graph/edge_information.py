@@ -37,6 +37,8 @@ class WeightSettings:
     """Deviation of a chunk's frame, as its edges see it, from its own cameras, in the same units as `bend`. It does not
     weigh edges: it is part of what a chunk's covariance states, once for the chunk and once for the first chunk, which
     everything is relative to. Chosen on four simulated videos (seed 101)."""
+    least_confidence: float = 0.01
+    """Confidence, in [0, 1], that an edge without a covariance is taken to have at least."""
     unmeasured: float = 0.02
     """The same for the error of an edge without a covariance at confidence 1."""
 
@@ -108,7 +110,7 @@ def _lever(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
 def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
     """Covariance of an edge that states none. Shape (7, 7)."""
     lever = _lever(edge, metric, settings) or settings.lever_m
-    deviation = settings.unmeasured / np.sqrt(max(edge.confidence, 1e-2))
+    deviation = settings.unmeasured / np.sqrt(max(edge.confidence, settings.least_confidence))
     unit = np.array([lever] * 3 + [1.0] * 4)
     return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bend**2)))
 

@@ -17,12 +17,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra
 from scipy.stats import chi2
 
+from list3r.association.graph.loop_trust import NO_TRUST
 from list3r.association.graph.pose_graph import (
     GraphResult,
     GraphSettings,
     across,
     check,
     contradicted,
+    deviations_of,
     information_of,
     optimize,
     problem_of,
@@ -73,14 +75,14 @@ def extend(
         poses = problem.solve(poses, np.ones(len(active)), 5)
     squares = problem.squares(poses)
     covariance = _hanging(placed.covariances[here], active[first], here, weights[first])
-    if len(active) > 1 and float(squares.max()) > chi2.ppf(0.95, problem.size):
+    if len(active) > 1 and float(squares.max()) > chi2.ppf(chosen.fits_quantile, problem.size):
         started = replace(placed, S_graph_chunk=ChainMap({new: start}, _under(placed.S_graph_chunk)))
         moved = _moved(new, here, edges, started, metric, chosen)
         placed = replace(placed, S_graph_chunk=ChainMap(moved[0], _under(placed.S_graph_chunk)))
         return _with(placed, new, moved[0][new], placed.components[here], moved[1], covariance)
     out = list(edges)
     for n, k in enumerate(mine):
-        scores = {**edges[k].scores, "graph_residual": float(np.sqrt(squares[n] / 3.0))}
+        scores = {**edges[k].scores, "graph_residual": deviations_of(squares[n])}
         scores |= {"trust": 1.0, "variance_factor": float(factors[loop[n]])}
         out[k] = replace(edges[k], scores=scores)
     return _with(placed, new, unstack(poses, ids)[new], placed.components[here], out, covariance)
@@ -119,13 +121,13 @@ def _moved(
     for _ in range(3):
         poses = problem.solve(poses, trust, 1)
         squares = problem.squares(poses)
-        after = np.where(fresh & (squares > limit), 1e-9, 1.0)
+        after = np.where(fresh & (squares > limit), NO_TRUST, 1.0)
         if (after == trust).all():
             break
         trust = after
     out = list(edges)
     for n in np.flatnonzero(own):
-        edge, deviations = active[n], float(np.sqrt(squares[n] / 3.0))
+        edge, deviations = active[n], deviations_of(squares[n])
         scores = {**edge.scores, "graph_residual": deviations, "trust": (limit / (float(squares[n]) + limit)) ** 2}
         scores["variance_factor"] = float(factors[loop[n]])
         believed = bool(trust[n] == 1.0)

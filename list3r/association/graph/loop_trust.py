@@ -1,4 +1,4 @@
-"""Which edges the graph believes: false loops are switched off instead of bending the map.
+"""Decide which edges the graph believes: false loops are switched off instead of bending the map.
 
 A Geman-McClure kernel tightened from convex (graduated non-convexity: Yang et al., "Graduated non-convexity for robust
 spatial perception", 2020), on Mahalanobis distances. False loops that agree with each other, as those between twin
@@ -22,7 +22,7 @@ from list3r.memory.geometry import Sim3
 Array = NDArray[np.float64]
 
 
-_NONE = 1e-9
+NO_TRUST = 1e-9
 """What edges that are not believed weigh, so that what hangs on them alone stays put."""
 
 
@@ -51,6 +51,9 @@ class TrustSettings:
     """Largest factor by which the chain may have drifted more than stated (deviations, not squares)."""
     prior_freedom: float = 10.0
     """Degrees of freedom that speak for the stated errors of edges."""
+    anneal_step: float = 1.6
+    """Factor by which the kernel tightens from stage to stage of the annealing; larger ones lose true edges, see
+    docs/decisions/0042."""
     rounds: int = 8
     """Most times that errors are scaled and edges judged anew."""
     iterations: int = 20
@@ -99,13 +102,13 @@ def judge(
         scaled = problem.scaled(factors[kinds])
         if judged_anew:
             poses, trust = _harden(scaled, poses, limit, robust, settings)
-        known, squares = marginals(scaled, poses, np.maximum(trust, _NONE)), scaled.squares(poses)
+        known, squares = marginals(scaled, poses, np.maximum(trust, NO_TRUST)), scaled.squares(poses)
         before = factors
         factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, before, settings.prior_freedom)
         if np.abs(np.log(factors / before)).max() < _SETTLED:
             break
     scaled = problem.scaled(factors[kinds])
-    known = marginals(scaled, poses, np.maximum(trust, _NONE))
+    known = marginals(scaled, poses, np.maximum(trust, NO_TRUST))
     return Believed(poses, trust, scaled.squares(poses), limit, factors, freedom, known)
 
 
@@ -148,7 +151,7 @@ def _first(
     found = []
     held = np.where(loop, limit, np.inf)
     for first, kernel in ((ones, limit), (ones, held), (within.astype(np.float64), limit)):
-        poses = start if first.all() else problem.solve(start, np.maximum(first, _NONE), settings.iterations)
+        poses = start if first.all() else problem.solve(start, np.maximum(first, NO_TRUST), settings.iterations)
         poses, _ = _anneal(problem, poses, kernel, settings, gated=not first.all())
         poses, trust = _harden(problem, poses, limit, True, settings)
         cost = float(np.minimum(problem.squares(poses), limit).sum())
@@ -167,12 +170,12 @@ def _anneal(
     steps = settings.iterations // 4
     trust = (mu / (problem.squares(poses) / limit + mu)) ** 2 if gated else np.ones(len(limit))
     while True:
-        poses = problem.solve(poses, np.maximum(trust, _NONE), steps, _ROUGHLY)
+        poses = problem.solve(poses, np.maximum(trust, NO_TRUST), steps, _ROUGHLY)
         share = problem.squares(poses) / limit
         trust = (mu / (share + mu)) ** 2
         if mu == 1.0:
             return poses, trust
-        mu = max(1.0, min(mu / 1.6, 2.0 * float(share.max())))
+        mu = max(1.0, min(mu / settings.anneal_step, 2.0 * float(share.max())))
 
 
 def _harden(
@@ -182,7 +185,7 @@ def _harden(
     inside = problem.squares(poses) <= limit if robust else np.ones(len(limit), bool)
     seen: set[bytes] = set()
     while True:
-        poses = problem.solve(poses, np.where(inside, 1.0, _NONE), settings.iterations, _CLOSELY)
+        poses = problem.solve(poses, np.where(inside, 1.0, NO_TRUST), settings.iterations, _CLOSELY)
         seen.add(inside.tobytes())
         after = problem.squares(poses) <= limit if robust else inside
         if after.tobytes() in seen or len(seen) == 6:

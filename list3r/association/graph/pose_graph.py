@@ -39,6 +39,9 @@ class GraphSettings:
     trust: TrustSettings = field(default_factory=TrustSettings)
     least_weight: float = 1e-5
     """Loops of less information than this share of the strongest edge's are dropped (deviations 300 times larger)."""
+    fits_quantile: float = 0.95
+    """A new chunk fits where all its edges' errors lie inside this quantile of what they state; otherwise its
+    neighbourhood moves."""
     most_moved: int = 150
     """Chunks near a new loop that move before the end of the session, where the way that it closes is no longer."""
 
@@ -260,7 +263,7 @@ def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
 
 def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int) -> Edge:
     """The edge with its weight in the graph, and what the graph thinks of it."""
-    deviations = float(np.sqrt(square / 3.0))
+    deviations = deviations_of(square)
     trusted = bool(found.trust[n] > 0.5)
     trust = float((found.limit[n] / (square + found.limit[n])) ** 2)
     factor = float(found.factors[int(edge.kind != "adjacent")])
@@ -270,6 +273,11 @@ def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int)
     already = "trust" in edge.scores and not edge.accepted
     reason = contradicted(edge, deviations)
     return replace(edge, weight=0.0, accepted=False, scores=scores, reason=edge.reason if already else reason)
+
+
+def deviations_of(square: float) -> float:
+    """Return a squared Mahalanobis distance as deviations along one axis of three."""
+    return float(np.sqrt(square / 3.0))
 
 
 def contradicted(edge: Edge, deviations: float) -> str:

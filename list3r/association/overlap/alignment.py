@@ -46,6 +46,13 @@ class AlignmentSettings:
     """Standard deviation of an angle beyond which the rotation counts as open."""
     most_scale_sigma: float = 0.35
     """Standard deviation of the log scale beyond which the scale counts as open."""
+    least_width: float = 1e-4
+    """Second extent of the points as a share of the first, below which they lie on one line."""
+    line_noise: float = 0.25
+    """Points lie on one line beside their noise where their second extent (squared) is below this share of the noise
+    and"""
+    line_share: float = 0.01
+    """below this share of the first extent (squared)."""
     bending_gain: float = 10.0
     """Variance added for bending, in units of what the shared frames' own walk shows. In simulation 10 holds where the
     bending goes together over a tenth to a third of the shared frames; what bends more slowly than the frames that
@@ -108,7 +115,7 @@ def align(
     scale, back = float(S_v_u.scale), S_v_u.inverse().apply(pairs.v)
     fitted = FittedPairs(pairs.u, back, pairs.weight, trust, limit / scale, pairs.group)
     known = measure_uncertainty(fitted, metric, chosen.bending_gain)
-    _check_extent(pairs.u, back, pairs.weight * trust)
+    _check_extent(pairs.u, back, pairs.weight * trust, chosen)
     _check_determined(known.covariance, metric, chosen)
     residual = np.full(len(every.u), np.inf)
     residual[used] = pairs.residual(S_v_u)
@@ -196,7 +203,7 @@ def _usable(every: _Pairs, settings: AlignmentSettings) -> tuple[_Pairs, NDArray
         spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(side.T, aweights=pairs.weight)), 0.0))
         if not spread[2] > 1e-9 * np.abs(side).max():
             raise DegenerateError("the points have no extent: neither rotation nor scale can be told")
-        if spread[1] < 1e-4 * spread[2]:
+        if spread[1] < settings.least_width * spread[2]:
             raise DegenerateError("the points lie on one line and leave the rotation about it open")
     return pairs, used
 
@@ -290,14 +297,14 @@ def _refine(
     return S_v_u, trust, limit
 
 
-def _check_extent(p: Array, q: Array, weight: Array) -> None:
+def _check_extent(p: Array, q: Array, weight: Array, settings: AlignmentSettings) -> None:
     """Raise `DegenerateError` for a line that only noise makes thick: both sides do not agree on what makes it so."""
     w = weight / weight.sum()
     dp, dq = p - w @ p, q - w @ q
     together = (w[:, None] * dp).T @ dq
     _, across, along = np.linalg.eigvalsh((together + together.T) / 2.0)
     noise = float(w @ ((dp - dq) ** 2).sum(axis=1)) / 3.0
-    if across < min(0.25 * noise, 0.01 * along):
+    if across < min(settings.line_noise * noise, settings.line_share * along):
         raise DegenerateError("beside their noise the points lie on one line and leave the rotation about it open")
 
 

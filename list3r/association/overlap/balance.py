@@ -20,6 +20,9 @@ from list3r.association.overlap.support import (
 )
 from list3r.frames.base import Camera
 
+_CHI2_MEDIAN = 0.455
+"""Median of chi^2 with one degree of freedom."""
+
 
 @dataclass(frozen=True)
 class BalancedSupport:
@@ -50,7 +53,7 @@ def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settin
     regions = divide(pairs, pairs.instance_u, camera, settings)
     off = relative_to_frame(pairs, static.S_v_u, usable) / np.maximum(pairs.cam_v[:, 2:], 1e-9)
     patch, count = _patches(pairs, regions, usable, camera, settings)
-    trust = _within_patch(off, patch, count, usable)
+    trust = _within_patch(off, patch, count, usable, settings)
     weight = _information(off, patch, regions, trust, settings)
     _, frame = np.unique(pairs.frame, return_inverse=True)
     weight = weight / np.maximum(np.bincount(frame.ravel(), weight), 1e-300)[frame.ravel()]
@@ -94,7 +97,7 @@ def _patches(
     return patch, len(values)
 
 
-def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask) -> Floats:
+def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: SupportSettings) -> Floats:
     """Trust in each pair: Tukey's biweight of how far along the ray it lies from its patch's median. Shape (N,)."""
     trust = np.zeros(len(off))
     rows = np.flatnonzero(usable)
@@ -108,7 +111,7 @@ def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask) -> Floats:
     low, high = np.minimum(start + (size - 1) // 2, last), np.minimum(start + size // 2, last)
     middle = (sorted_along[low] + sorted_along[high]) / 2.0
     away = np.abs(along - middle[patch])
-    limit = 8.0 * max(float(np.median(away)), 1e-9)
+    limit = settings.patch_kernel * max(float(np.median(away)), 1e-9)
     trust[rows] = np.maximum(0.0, 1.0 - (away / limit) ** 2) ** 2
     return trust
 
@@ -134,8 +137,9 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
     for k in range(len(regions.count)):
         mine, patches = told & (regions.of_pair == k), filled & (of_patch == k)
         n, m = int(mine.sum()), int(patches.sum())
-        s[k] = (n * _variance(within[mine]) + 20 * s_all) / (n + 20)
-        own = max(_variance(whole[patches]) - s[k] / max(median(number[patches]), 1.0), 0.05 * t_all) if m else 0.0
+        s[k] = (n * _variance(within[mine]) + settings.prior_pairs * s_all) / (n + settings.prior_pairs)
+        least = settings.least_region_share * t_all
+        own = max(_variance(whole[patches]) - s[k] / max(median(number[patches]), 1.0), least) if m else 0.0
         t[k] = (m * own + settings.prior_patches * t_all) / (m + settings.prior_patches)
     pair_t, pair_s = np.maximum(t, floor)[regions.of_pair], np.maximum(s, floor)[regions.of_pair]
     return np.asarray(trust / (number[patch] * pair_t + pair_s))
@@ -143,4 +147,4 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
 
 def _variance(squares: Floats) -> float:
     """Robust variance from squared deviations, which lie mostly along the ray: their median over that of chi^2_1."""
-    return median(squares) / 0.455 if len(squares) else 0.0
+    return median(squares) / _CHI2_MEDIAN if len(squares) else 0.0

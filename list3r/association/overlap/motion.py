@@ -26,6 +26,10 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
+_DEVIATIONS_AT_QUANTILE = 0.524
+"""The 0.4 quantile of the magnitude of Gaussian errors, in standard deviations."""
+
+
 @dataclass(frozen=True)
 class MotionSettings:
     """When an instance counts as moving."""
@@ -36,6 +40,9 @@ class MotionSettings:
     """Columns and rows of the depth grid of a frame."""
     deviations: float = 5.0
     """Robust deviations of the static part's depth beyond which a point is seen through."""
+    static_quantile: float = 0.4
+    """Quantile of the disagreement of two frames that tells the deviation of what stands still: things that move over
+    half of the picture do not reach it."""
     least_step: float = 0.03
     """Least share of the depth by which what lies behind must be farther."""
     footprint: float = 1.5
@@ -260,7 +267,8 @@ def _depth_steps(
         for a in range(size):
             mine = off[(used.place == a) & np.isfinite(off)]
             if a != k and len(mine) >= 20:
-                out[a, k] = max(settings.least_step, settings.deviations * float(np.quantile(mine, 0.4)) / 0.524)
+                deviation = float(np.quantile(mine, settings.static_quantile)) / _DEVIATIONS_AT_QUANTILE
+                out[a, k] = max(settings.least_step, settings.deviations * deviation)
     return out
 
 

@@ -65,6 +65,18 @@ class SupportSettings:
     """Fewer patches than this are taken apart into their pairs again."""
     budget: int = 6000
     """Most correspondences handed to the alignment."""
+    patch_kernel: float = 8.0
+    """Distance from its patch's median along the ray beyond which a pair has no say (Tukey's biweight), in medians of
+    that distance."""
+    prior_pairs: int = 20
+    """Pairs of a region that tell as much of the scatter within patches as all regions together do."""
+    least_region_share: float = 0.05
+    """Least variance of a region's patches, as a share of that of all regions."""
+    vote_quantile: float = 0.4
+    """Quantile of the regions' disagreement with a hypothesis that tells how well it can fit: what stands still is more
+    than this share."""
+    all_pairs_share: float = 0.98
+    """The hypothesis of all pairs is taken where its votes reach this share of the best one's."""
     least_deviation: float = 0.001
     """Disagreement, as a share of the depth, below which chunks are not told to disagree."""
 
@@ -277,9 +289,9 @@ def _best_hypothesis(
         raise failure
     if not vote.any():
         return found[0][0], np.zeros(len(pairs), bool)
-    scale = max(2.0 * min(_weighted_quantile(off, vote, 0.4) for _, off in found), 1e-6)
+    scale = max(2.0 * min(_weighted_quantile(off, vote, settings.vote_quantile) for _, off in found), 1e-6)
     scores = [float((vote / (1.0 + (np.nan_to_num(off, nan=1e6) / scale) ** 2)).sum()) for _, off in found]
-    best = 0 if scores[0] >= 0.98 * max(scores) else int(np.argmax(scores))
+    best = 0 if scores[0] >= settings.all_pairs_share * max(scores) else int(np.argmax(scores))
     doubted = found[best][1] > settings.factor * scale
     return found[best][0], sure & doubted[regions.of_pair]
 

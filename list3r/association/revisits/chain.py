@@ -30,6 +30,10 @@ class ChainSettings:
     turn_deg: float = 2.0
     log_scale: float = 0.03
     """Deviation of the logarithm of the scale; none where everything is metric."""
+    least_confidence: float = 0.05
+    """Confidence that an edge is taken to have at least when the surest path is chosen,"""
+    least_step_confidence: float = 0.2
+    """and when its deviations are widened by one over its confidence."""
     most_deviations: float = 4.5
     """Distance, in deviations, beyond which a relation is refused."""
 
@@ -88,7 +92,7 @@ def _order(edge: Edge) -> tuple[int, int, str, tuple[int, int]]:
 
 
 def _along(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings: ChainSettings) -> Prediction | None:
-    path = _path(near, u, v)
+    path = _path(near, u, v, settings)
     if path is None:
         return None
     S, covariance = Sim3.identity(), np.zeros((7, 7))
@@ -102,7 +106,7 @@ def _along(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings:
     return Prediction(S, covariance + 1e-12 * np.eye(7))
 
 
-def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int) -> list[Edge] | None:
+def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings: ChainSettings) -> list[Edge] | None:
     """The path with the least sum of 1 / confidence (Dijkstra)."""
     queue: list[tuple[float, int, int]] = [(0.0, u, u)]
     done: dict[int, int] = {}
@@ -116,7 +120,7 @@ def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int) -> list[Ed
         if here == v:
             break
         for other, edge in near.get(here, []):
-            new = so_far + 1.0 / max(edge.confidence, 0.05)
+            new = so_far + 1.0 / max(edge.confidence, settings.least_confidence)
             if other not in done and new < cost.get(other, np.inf):
                 cost[other], by[here, other] = new, edge
                 heapq.heappush(queue, (new, other, here))
@@ -135,7 +139,7 @@ def _step(edge: Edge, here: int, settings: ChainSettings) -> tuple[Sim3, Array]:
     spread_u = spread_v / float(edge.S_v_u.scale)
     forth = here == edge.u
     spread = spread_u if forth else spread_v
-    weak = 1.0 / max(edge.confidence, 0.2)
+    weak = 1.0 / max(edge.confidence, settings.least_step_confidence)
     deviation = np.array([settings.shift * spread] * 3 + [np.deg2rad(settings.turn_deg)] * 3 + [settings.log_scale])
     noise = np.diag((weak * deviation) ** 2)
     if edge.covariance is not None:

@@ -36,6 +36,9 @@ class CueSettings:
     """Instances compared of a chunk, those seen in most frames first."""
     sigma: float = 0.15
     """Difference of two log distances at which a pair of pairs counts 1/e."""
+    least_lean: float = 0.25
+    """Least height of a triple's normal over its area, in [0, 1], from which its turning direction seen from above
+    counts."""
     consistent: float = 0.37
     """Least score of a pair of pairs for both to belong to one layout (1/e: one sigma)."""
 
@@ -163,7 +166,7 @@ def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings
     known = np.isfinite(ratios)
     median = float(np.median(ratios[known]))
     likeness = float(np.where(known, np.exp(-np.abs(np.where(known, ratios - median, 0.0)) / sigmas), 0.0).mean())
-    turned = _orientation(u, v, pairs[chosen])
+    turned = _orientation(u, v, pairs[chosen], settings)
     number = 1.0 - 0.5 ** (len(chosen) - 2)
     return pairs[chosen], likeness * turned * number, median
 
@@ -218,7 +221,7 @@ def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]
     return best[1]
 
 
-def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints) -> float:
+def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> float:
     """2 f - 1, at least 0; f: share of triples that run the same way round seen from above. 1 where none tells."""
     if not u.up.any() or not v.up.any():
         return 1.0
@@ -229,7 +232,7 @@ def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints) -> float:
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
         lean = (normal @ side.up) / np.maximum(length, 1e-12)
-        signs.append(np.where(np.abs(lean) > 0.25, np.sign(lean), 0.0))
+        signs.append(np.where(np.abs(lean) > settings.least_lean, np.sign(lean), 0.0))
     told = signs[0] * signs[1]
     known = told != 0
     return max(0.0, float(told[known].mean())) if known.any() else 1.0

@@ -73,7 +73,7 @@ def _common_scale(a: Array, b: Array, settings: VerificationSettings) -> float |
     if len(a) < least:
         return None
     noise = settings.noise.sigma(a[:, 2].astype(np.float32)).astype(np.float64)
-    gate = np.maximum(settings.features.gate_least_m, settings.features.gate_sigmas * noise) * 1.5
+    gate = np.maximum(settings.features.gate_least_m, settings.features.gate_sigmas * noise) * settings.scale_gate
     triples = np.random.default_rng(len(a)).integers(0, len(a), (_TRIALS, 3))
     best, inside = -1.0, np.zeros(len(a), bool)
     for triple in triples:

@@ -42,9 +42,6 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 from list3r.memory.store.tables.chunks import LocalNode
 
-STRICT = 0.85
-"""s_det from which frame similarity alone is believed (VGGT-Long)."""
-
 
 @dataclass(frozen=True)
 class RevisitSettings:
@@ -54,6 +51,8 @@ class RevisitSettings:
     """False: frame similarity alone, at its strict threshold."""
     verified: bool = True
     """False: every relation that can be measured is accepted, as in VGGT-Long."""
+    strict: float = 0.85
+    """s_det, in [0, 1], from which frame similarity alone makes a candidate worth a try (VGGT-Long)."""
     lambda_: float = 0.5
     """Weight of frame similarity in s_loop (the paper gives none)."""
     least_score: float = 0.7
@@ -123,7 +122,7 @@ def find_loops(
     for scored in _ranked(candidates, look, chosen):
         accepted = [e for e in edges if e.accepted]
         c = scored.candidate
-        if c.s_det < STRICT and look.unlikely(scored):
+        if c.s_det < chosen.strict and look.unlikely(scored):
             who, name = ("frames and instances", "s_loop") if chosen.instance_cues else ("the frames", "s_det")
             edge = look.refused(scored, f"{who} are not alike enough ({name} {scored.score:.2f})")
         elif chosen.verified and any(e.u == c.u for e in accepted) and not look.wants_another(c.u, accepted):

@@ -44,6 +44,14 @@ class VerificationSettings:
     """Largest robust deviation of depth, in units of the sensor's noise."""
     residual_scale_m: float = 0.03
     """Residual at which a point counts 1/e in the edge's confidence (sigma_r), metres."""
+    least_depth_m: float = 0.1
+    """Depth from which a point lies before a camera."""
+    seen_through_m: float = 0.03
+    """A point is seen through where depth lies further behind it than this and"""
+    seen_through_sigmas: float = 3.0
+    """so many deviations of the sensor's noise."""
+    scale_gate: float = 1.5
+    """Gate of matched features while the common scale of two chunks is searched, in gates of the features."""
     noise: SensorNoise = field(default_factory=SensorNoise)
     errors: KeyframeErrorSettings = field(default_factory=KeyframeErrorSettings)
 
@@ -145,14 +153,20 @@ def _check(source: _Side, target: _Side, T_target_source: Pose, settings: Verifi
     z = np.maximum(p[:, 2], 1e-3)
     column = np.rint(p[:, 0] / z * camera.fx + camera.cx)
     row = np.rint(p[:, 1] / z * camera.fy + camera.cy)
-    inside = (p[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    inside = (
+        (p[:, 2] > settings.least_depth_m)
+        & (column >= 0)
+        & (row >= 0)
+        & (column < camera.width)
+        & (row < camera.height)
+    )
     pixel = (row[inside] * camera.width + column[inside]).astype(np.int64)
     known = view.valid.ravel()[pixel]
     points, pixel = p[inside][known], pixel[known]
     seen = view.points.reshape(-1, 3)[pixel]
     normal = view.normals.reshape(-1, 3)[pixel]
     distance = np.einsum("ij,ij->i", points - seen, normal)
-    limit = 0.03 + 3 * settings.noise.sigma(seen[:, 2])
+    limit = settings.seen_through_m + settings.seen_through_sigmas * settings.noise.sigma(seen[:, 2])
     hidden = points[:, 2] > seen[:, 2] + limit
     through = points[:, 2] < seen[:, 2] - limit
     near = np.abs(distance) < limit
