@@ -14,13 +14,14 @@ Array = NDArray[np.float64]
 
 
 def footprint(box: OrientedBox) -> Array:
-    """The corners of an upright box in the plane, counterclockwise. Shape (4, 2)."""
+    """Return the corners of an upright box in the plane, counterclockwise. Shape (4, 2)."""
     signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     return np.asarray(box.center[:2] + (signs * box.size[:2]) @ box.rotation[:2, :2].T)
 
 
 def clip_polygon(subject: Array, clip: Array) -> Array:
-    """Intersection of two convex counterclockwise polygons (Sutherland and Hodgman, 1974). (N, 2), (M, 2) -> (K, 2)."""
+    """Return the intersection of two convex counterclockwise polygons (Sutherland and Hodgman, 1974). (N, 2), (M, 2) ->
+    (K, 2)."""
     out = subject
     for a, b in zip(clip, np.roll(clip, -1, axis=0), strict=True):
         if len(out) == 0:
@@ -39,7 +40,7 @@ def clip_polygon(subject: Array, clip: Array) -> Array:
 
 
 def polygon_area(polygon: Array) -> float:
-    """Area of a counterclockwise polygon (N, 2)."""
+    """Return the area of a counterclockwise polygon (N, 2)."""
     if len(polygon) < 3:
         return 0.0
     x, y = (polygon - polygon[0]).T
@@ -47,7 +48,7 @@ def polygon_area(polygon: Array) -> float:
 
 
 def intersection_volume(a: OrientedBox, b: OrientedBox) -> float:
-    """Volume that two upright boxes share."""
+    """Return the volume that two upright boxes share."""
     low = max(a.center[2] - a.size[2] / 2, b.center[2] - b.size[2] / 2)
     high = min(a.center[2] + a.size[2] / 2, b.center[2] + b.size[2] / 2)
     reach = (np.linalg.norm(a.size[:2]) + np.linalg.norm(b.size[:2])) / 2
@@ -59,7 +60,7 @@ def intersection_volume(a: OrientedBox, b: OrientedBox) -> float:
 def box_overlaps(
     truth: Sequence[OrientedBox], estimate: Sequence[OrientedBox], is_round: Sequence[bool] = ()
 ) -> tuple[Array, Array]:
-    """IoU, and the share of each estimated box that lies in each true one. Two of shape (T, E).
+    """Return IoU, and the share of each estimated box that lies in each true one. Two of shape (T, E).
 
     A true box of which `is_round` says that its yaw means nothing is turned to that of the estimate.
     """
@@ -77,7 +78,7 @@ def box_overlaps(
 
 
 def upright(box: OrientedBox, tilt_deg: float = 1.0) -> OrientedBox:
-    """The box itself if one of its axes is vertical within the tilt, else the least upright box of its corners.
+    """Return the box itself if one of its axes is vertical within the tilt, else the least upright box of its corners.
 
     Axes are reordered so that the third one points up.
     """
@@ -92,6 +93,6 @@ def upright(box: OrientedBox, tilt_deg: float = 1.0) -> OrientedBox:
 
 
 def transform_box(S_a_b: Sim3, box: OrientedBox) -> OrientedBox:
-    """A box of frame b in frame a."""
+    """Return a box of frame b in frame a."""
     center = S_a_b.apply(box.center[None])[0]
     return OrientedBox(center, float(S_a_b.scale) * box.size, S_a_b.rotation @ box.rotation)

@@ -61,7 +61,7 @@ class Covisibility:
 def covisibility(
     depth: ArrayLike, T_world_cam: ArrayLike, camera: Camera, settings: CovisibilitySettings | None = None
 ) -> Shares:
-    """Shares (F, F) from depth maps (F, h, w) along z, 0 where unknown, poses (F, 4, 4) and the camera of the maps.
+    """Return shares (F, F) from depth maps (F, h, w) along z, 0 where unknown, poses (F, 4, 4) and camera of the maps.
 
     A point of frame i is seen in frame j when it lies in j's picture, seen from about the same side, and j's depth
     there agrees: within the tolerance of the span of the four pixels around it, so that a steep surface on a coarse
@@ -95,7 +95,7 @@ def covisibility(
 
 
 def _surface_points(depth: NDArray[Any], camera: Camera, count: int) -> Array:
-    """Points of a regular grid of pixels that have depth, camera coordinates. Shape (P, 3)."""
+    """Return points of a regular grid of pixels that have depth, camera coordinates. Shape (P, 3)."""
     step = max(1, int(np.sqrt(depth.size / count)))
     y, x = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step]
     z = depth[y, x].astype(np.float64)
@@ -105,7 +105,8 @@ def _surface_points(depth: NDArray[Any], camera: Camera, count: int) -> Array:
 
 
 def _spans(maps: NDArray[Any]) -> tuple[Shares, Shares]:
-    """Least and greatest known depth of each block of 2 x 2 pixels; inf and 0 where none is known. (F, h-1, w-1)."""
+    """Return the least and greatest known depth of each block of 2 x 2 pixels; inf and 0 where none is known. (F, h-1,
+    w-1)."""
     d = maps.astype(np.float32)
     d[~(np.isfinite(d) & (d > 0))] = 0.0
     corners = (d[:, :-1, :-1], d[:, :-1, 1:], d[:, 1:, :-1], d[:, 1:, 1:])

@@ -32,7 +32,7 @@ UPRIGHT: tuple[Array, str] = (np.eye(3)[:2], "seen along -z")
 
 
 def check_ending(path: str | Path) -> Path:
-    """The path of a picture. Raises `OptionError` for an ending that is no kind of picture that is written here."""
+    """Return path of a picture. Raises `OptionError` for an ending that is no kind of picture that is written here."""
     path = Path(path)
     if path.suffix.lower() not in ENDINGS:
         raise OptionError(f"--plot {path}: the picture must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
@@ -50,7 +50,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def page_axes(T_world_cam: Array) -> tuple[Array, str]:
-    """The page's right and up in the world for a view from above, shape (2, 3), and what it is seen along, in words.
+    """Return page's right and up in the world for a view from above, shape (2, 3), and what it is seen along, in words.
 
     What is up is told by the cameras: the axis of the world nearest to their mean up if it is within 30 degrees, else
     that mean.
@@ -71,7 +71,7 @@ def page_axes(T_world_cam: Array) -> tuple[Array, str]:
 
 
 def trajectory_figure(truth: Trajectory, moments: Array, positions: Array, errors: Array, title: str) -> Figure:
-    """The estimate over the truth from above, coloured by error, and the error over time beneath.
+    """Return the estimate over the truth from above, coloured by error, and the error over time beneath.
 
     `moments` (P,), aligned `positions` (P, 3) and `errors` (P,) are those of the associated poses, metres.
     """
@@ -109,7 +109,7 @@ def trajectory_figure(truth: Trajectory, moments: Array, positions: Array, error
 
 
 def _gaps(moments: Array) -> NDArray[np.bool_]:
-    """Which steps are gaps in which there are no poses: over three times the usual step. Shape (P-1,)."""
+    """Tell which steps are gaps in which there are no poses: over three times the usual step. Shape (P-1,)."""
     steps = np.diff(moments)
     return np.asarray(steps > 3 * np.median(steps))
 
@@ -158,7 +158,8 @@ def instances_figure(
     matches: Sequence[tuple[int, int, float]],
     title: str,
 ) -> Figure:
-    """A plan of boxes by id: true ones found green and missed red (filled), estimated ones outlined with their ids.
+    """Return a plan of boxes by id: true ones found green and missed red (filled), estimated ones outlined with their
+    ids.
 
     `matches` are (true id, estimated id, IoU). False and duplicate estimates are grey.
     """
@@ -202,7 +203,7 @@ def _tag(axis: Axes, xy: Array, text: str, color: str) -> None:
 
 
 def revisits_figure(frame: NDArray[np.int64], share: NDArray[np.float32], judged: Judgement, title: str) -> Figure:
-    """Covisibility of all pairs of frames in grey; above the diagonal the loop candidates by verdict and truth.
+    """Return covisibility of all pairs of frames in grey; above the diagonal the loop candidates by verdict and truth.
 
     `frame` (F,) and directed shares (F, F) as in `Covisibility`.
     """
@@ -243,7 +244,7 @@ def revisits_figure(frame: NDArray[np.int64], share: NDArray[np.float32], judged
 def _sheet(
     figsize: tuple[float, float], rows: int = 1, columns: int = 1, heights: tuple[float, ...] = (1.0,)
 ) -> tuple[Figure, Any]:
-    """A page without a window behind it, and its panels."""
+    """Return a page without a window behind it, and its panels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

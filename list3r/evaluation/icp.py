@@ -35,7 +35,8 @@ class IcpSettings:
 def register(
     truth: ArrayLike, truth_normals: ArrayLike, estimate: ArrayLike, *, with_scale: bool, settings: IcpSettings
 ) -> Sim3:
-    """S_truth_estimate by point-to-plane ICP (Chen and Medioni 1992), for clouds (M, 3), (N, 3) that nearly lie right.
+    """Return S_truth_estimate by point-to-plane ICP (Chen and Medioni 1992), for clouds (M, 3), (N, 3) that nearly lie
+    right.
 
     Raises `DegenerateError` when too few points have a partner, and when the surfaces leave a motion open.
     """
@@ -65,7 +66,7 @@ def register(
 
 
 def _step(moved: Array, target: Array, normal: Array, reach: float, with_scale: bool, least_stiffness: float) -> Sim3:
-    """One Gauss-Newton step on distances to planes under Tukey's weights."""
+    """Return one Gauss-Newton step on distances to planes under Tukey's weights."""
     middle = moved.mean(axis=0)
     arm = moved - middle
     columns = [normal, np.cross(arm, normal)]

@@ -29,7 +29,7 @@ class IdentityErrors:
     """Objects that carried more than one id, with the ids in the order in which they came."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+        """Return plain numbers for JSON."""
         return asdict(self)
 
 
@@ -61,7 +61,7 @@ def evaluate_identities(
 
 
 def _covered(labels: Labels, masks: Sequence[tuple[int, Mask]], least_iou: float) -> dict[int, list[int]]:
-    """Estimated ids that cover each true object well enough, the best first."""
+    """Return the estimated ids that cover each true object well enough, the best first."""
     if labels.size == 0:
         return {}
     areas = np.bincount(labels.ravel())

@@ -44,12 +44,12 @@ class InstanceErrors:
     """(row of the truth, row of the estimate, IoU)."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+        """Return plain numbers for JSON."""
         return asdict(self)
 
 
 def match_boxes(iou: Array, threshold: float) -> list[tuple[int, int]]:
-    """One-to-one pairs (truth, estimate) with IoU at or above the threshold: most pairs first, then most IoU.
+    """Return one-to-one pairs (truth, estimate) with IoU at or above the threshold: most pairs first, then most IoU.
 
     `iou` has shape (T, E).
     """

@@ -35,13 +35,13 @@ class PointCloud:
     """Where they come from, for people."""
 
     def moved(self, S_a_b: Sim3) -> PointCloud:
-        """The cloud of frame b in frame a."""
+        """Return the cloud of frame b in frame a."""
         normals = None if self.normals is None else self.normals @ S_a_b.rotation.T
         return PointCloud(S_a_b.apply(self.points), normals, self.words)
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Points of a PLY, PCD or mesh file, of a table of x y z ... lines, or of an array (N, 3 or more) in `.npy`.
+    """Return points of a PLY, PCD or mesh file, of a table of x y z ... lines, or of an array (N, 3 or more) in `.npy`.
 
     The faces of a mesh become points about 1 cm apart. Points that are not finite are left out. Raises `SourceError`
     for what is none of these, or holds no point.
@@ -122,7 +122,7 @@ def _read_mesh(path: Path) -> tuple[Any, Any, str]:
 
 
 def thinned(cloud: PointCloud, voxel_m: float, most: int | None = None) -> PointCloud:
-    """One point for each occupied cell of a grid: the mean of its points and of their normals; then at most so many.
+    """Return one point for each occupied cell of a grid: mean of its points and of their normals; then at most so many.
 
     The mean hides no error larger than the cell, and makes two clouds of different density comparable.
     """
@@ -143,7 +143,7 @@ def thinned(cloud: PointCloud, voxel_m: float, most: int | None = None) -> Point
 
 
 def _cells(points: Array, voxel_m: float) -> NDArray[np.int64]:
-    """Number of the cell of each point. Shape (N,). Raises `OptionError` when the grid would be beyond counting."""
+    """Return number of cell of each point. Shape (N,). Raises `OptionError` when the grid would be beyond counting."""
     grid = np.floor(points / voxel_m)
     grid -= grid.min(axis=0)
     size = grid.max(axis=0) + 1
@@ -161,7 +161,8 @@ def _means(values: Array, owner: NDArray[np.int64], count: NDArray[np.int64]) ->
 
 
 def estimate_normals(points: ArrayLike, neighbours: int = 24) -> Array:
-    """Unit normals, either way round, of the planes through each point's nearest neighbours. Shape (N, 3) -> (N, 3)."""
+    """Return the unit normals, either way round, of the planes through each point's nearest neighbours. Shape (N, 3) ->
+    (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
     k = min(neighbours, len(p))
     if k < 3:

@@ -34,7 +34,7 @@ class RelationErrors:
     """True but not claimed."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+        """Return plain numbers for JSON."""
         return asdict(self)
 
 

@@ -67,7 +67,7 @@ class Candidates:
 
     @staticmethod
     def of_edges(edges: Iterable[Edge]) -> Candidates:
-        """The loop edges of a memory that know their frames."""
+        """Return the loop edges of a memory that know their frames."""
         loops = [e for e in edges if e.kind == "loop" and e.frames is not None]
         names = sorted({name for e in loops for name in e.scores})
         return Candidates(
@@ -142,7 +142,7 @@ class RevisitScores:
     """True pairs of chunks that no accepted candidate joins."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+        """Return plain numbers for JSON."""
         return asdict(self)
 
 
@@ -176,7 +176,7 @@ def judge(
 def frame_labels(
     share: ArrayLike, settings: RevisitTruthSettings | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which frame pairs are revisits and which see different places, by directed shares (F, F); NaN is neither."""
+    """Tell which frame pairs are revisits and which see different places, by directed shares (F, F); NaN is neither."""
     chosen = settings or RevisitTruthSettings()
     s = np.asarray(share)
     return np.minimum(s, s.T) >= chosen.least, np.maximum(s, s.T) < chosen.different
@@ -212,7 +212,8 @@ def score(judgements: Sequence[Judgement], settings: RevisitTruthSettings | None
 def recall_at_precision(
     scores: ArrayLike, labels: ArrayLike, total: int, precision: float
 ) -> tuple[float | None, float | None]:
-    """Greatest recall, of `total` true ones, of a choice `scores >= threshold` that is precise enough; its threshold.
+    """Return the greatest recall, of `total` true ones, of a choice `scores >= threshold` that is precise enough; its
+    threshold.
 
     `labels` are TRUE, FALSE or OPEN; open ones count neither way, and claims without a score are never chosen. Claims
     of one score are taken together. (None, None) when there is nothing to find, (0, None) when no choice is precise
@@ -231,7 +232,7 @@ def recall_at_precision(
 
 
 def average_precision(scores: ArrayLike, labels: ArrayLike, total: int) -> float | None:
-    """Mean over all `total` true ones of the precision at which each is found, 0 for those that are never found."""
+    """Return mean over all `total` true ones of precision at which each is found, 0 for those that are never found."""
     if total <= 0:
         return None
     _, right, chosen = _cumulative(scores, labels)
@@ -240,7 +241,8 @@ def average_precision(scores: ArrayLike, labels: ArrayLike, total: int) -> float
 
 
 def _cumulative(scores: ArrayLike, labels: ArrayLike) -> tuple[Array, Array, Array]:
-    """Distinct scores from the best down, and the true and the chosen claims at or above each. Three of shape (T,)."""
+    """Return the distinct scores from the best down, and the true and the chosen claims at or above each. Three of
+    shape (T,)."""
     s, label = np.asarray(scores, dtype=np.float64), np.asarray(labels)
     keep = np.isfinite(s) & (label != OPEN)
     levels, at = np.unique(-s[keep], return_inverse=True)
@@ -289,7 +291,7 @@ def _agreement(labels: NDArray[np.int8], true_count: int) -> Agreement:
 
 
 def _wrong(judgement: Judgement) -> list[tuple[int, int, int, int]]:
-    """Accepted candidates between chunks that see different places throughout."""
+    """Return the accepted candidates between chunks that see different places throughout."""
     c = judgement.candidates
     bad = c.accepted & (judgement.chunk_labels == FALSE)
     return [(int(u), int(v), int(a), int(b)) for (u, v), (a, b) in zip(c.chunks[bad], c.frames[bad], strict=True)]
@@ -302,7 +304,7 @@ def _chunk_pairs(
     spans: Mapping[int, tuple[int, int]],
     neighbours: set[tuple[int, int]],
 ) -> tuple[set[tuple[int, int]], set[tuple[int, int]]]:
-    """Pairs of chunks that are revisits, and those that see different places throughout."""
+    """Return pairs of chunks that are revisits, and those that see different places throughout."""
     rows = {k: np.flatnonzero((frame >= first) & (frame <= last)) for k, (first, last) in spans.items()}
     true_pairs, false_pairs = set(), set()
     ids = sorted(spans)
@@ -329,7 +331,7 @@ def _sharing(spans: Mapping[int, tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _nearest_rows(frame: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row of the nearest known frame, -1 where it is further away than the greatest step between known frames."""
+    """Return row of nearest known frame, -1 where it is further away than the greatest step between known frames."""
     if not len(frame):
         return np.full(len(wanted), -1, dtype=np.int64)
     right = np.clip(np.searchsorted(frame, wanted), 0, len(frame) - 1)

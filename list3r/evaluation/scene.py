@@ -33,7 +33,7 @@ def read_scene(path: str | Path) -> dict[str, Any]:
 
 
 def scene_boxes(scene: Mapping[str, Any], S_truth_scene: Sim3 | None = None) -> dict[int, OrientedBox]:
-    """Upright boxes by id, of all that is no structure and not gone, moved into the frame of the truth."""
+    """Return the upright boxes by id, of all that is no structure and not gone, moved into the frame of the truth."""
     move = S_truth_scene or Sim3.identity()
     out = {}
     for entry in scene["instances"]:
@@ -44,12 +44,12 @@ def scene_boxes(scene: Mapping[str, Any], S_truth_scene: Sim3 | None = None) -> 
 
 
 def scene_relations(scene: Mapping[str, Any]) -> list[tuple[int, str, int]]:
-    """Triples (subject, predicate, object) of a scene or truth."""
+    """Return triples (subject, predicate, object) of a scene or truth."""
     return [(int(r["subject"]), str(r["predicate"]), int(r["object"])) for r in scene.get("relations", [])]
 
 
 def alignment_of(truth: Trajectory, estimate: Trajectory, *, with_scale: bool, tolerance_s: float = 0.01) -> Sim3:
-    """S_truth_scene from the camera's path in both frames of reference. Raises as `align` does."""
+    """Return S_truth_scene from the camera's path in both frames of reference. Raises as `align` does."""
     rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
     if len(rows) < 3:
         raise OptionError(f"{len(rows)} poses within {tolerance_s} s of each other; both need one clock")
@@ -90,7 +90,8 @@ def _evaluate_by_id(
 def evaluate_scene(
     scene: Mapping[str, Any], truth: Mapping[str, Any], S_truth_scene: Sim3 | None = None, min_px: int = 150
 ) -> dict[str, Any]:
-    """Everything at once, as plain numbers: instances at IoU 0.25 and 0.5, relations over those matched at 0.25.
+    """Evaluate everything at once, as plain numbers: instances at IoU 0.25 and 0.5, relations over those matched at
+    0.25.
 
     `S_truth_scene` takes the scene's world to that of the truth (see `alignment_of`); None when they are the same.
     `matched_ids` lists (true id, scene id, IoU), `missed` the true things without a match.
@@ -113,7 +114,7 @@ def evaluate_scene(
 def relations_of_matches(
     scene: Mapping[str, Any], truth: Mapping[str, Any], matched: list[tuple[int, int, float]]
 ) -> RelationErrors:
-    """Relations over pairs (true id, scene id, IoU)."""
+    """Return relations over pairs (true id, scene id, IoU)."""
     truth_of = {scene_id: true_id for true_id, scene_id, _ in matched}
     return evaluate_relations(scene_relations(truth), scene_relations(scene), truth_of)
 

@@ -35,11 +35,11 @@ class Trajectory:
             raise OptionError(f"{len(self.time_s)} times with poses of shape {self.T_world_cam.shape}: want (F, 4, 4)")
 
     def positions(self) -> Array:
-        """Camera centres in the world. Shape (F, 3)."""
+        """Return the camera centres in the world. Shape (F, 3)."""
         return self.T_world_cam[:, :3, 3]
 
     def at(self, rows: NDArray[np.int64]) -> Trajectory:
-        """The poses of some rows."""
+        """Return the poses of some rows."""
         return Trajectory(self.time_s[rows], self.T_world_cam[rows])
 
 
@@ -126,7 +126,7 @@ class TrajectoryErrors:
     """Angle of the relative error."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
+        """Return plain numbers for JSON."""
         return asdict(self)
 
 
@@ -181,7 +181,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def associate(truth_time_s: Array, time_s: Array, tolerance_s: float = 0.01) -> tuple[NDArray[np.int64], ...]:
-    """Rows of truth and estimate that belong to one moment.
+    """Return rows of truth and estimate that belong to one moment.
 
     Each time of the shorter list takes the nearest one of the longer list, if it is within the tolerance, as evo does;
     times are ascending. Returns the row numbers of both, (P,) each.
@@ -204,7 +204,7 @@ def evaluate_trajectory(
     delta_frames: int = 1,
     delta: Delta | None = None,
 ) -> TrajectoryErrors:
-    """Errors of an estimate against the truth.
+    """Measure the errors of an estimate against the truth.
 
     RPE relates associated poses that lie `delta` apart (None: `delta_frames` frames), all of them, overlapping. Raises
     `OptionError` when the two share too few moments, `DegenerateError` when the positions do not determine an
@@ -232,7 +232,7 @@ def evaluate_trajectory(
 
 
 def associated(truth: Trajectory, estimate: Trajectory, tolerance_s: float = 0.01) -> tuple[Trajectory, Trajectory]:
-    """Truth and estimate at the moments that both have. Raises `OptionError` when these are fewer than three."""
+    """Return truth and estimate at the moments that both have. Raises `OptionError` when these are fewer than three."""
     rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
     if len(rows) < 3:
         raise OptionError(
@@ -243,7 +243,7 @@ def associated(truth: Trajectory, estimate: Trajectory, tolerance_s: float = 0.0
 
 
 def coverage(truth: Trajectory, estimate: Trajectory) -> Coverage:
-    """How much of the truth's time the estimate has poses for."""
+    """Return how much of the truth's time the estimate has poses for."""
     start, end = float(truth.time_s[0]), float(truth.time_s[-1])
     inside = estimate.time_s[(estimate.time_s >= start) & (estimate.time_s <= end)]
     if len(inside) < 2 or end <= start:
@@ -258,19 +258,19 @@ def coverage(truth: Trajectory, estimate: Trajectory) -> Coverage:
 
 
 def position_errors(truth: Trajectory, estimate: Trajectory, S_truth_estimate: Sim3) -> Array:
-    """Distances of aligned positions of two associated trajectories. Shape (P,)."""
+    """Return distances of aligned positions of two associated trajectories. Shape (P,)."""
     return np.asarray(np.linalg.norm(S_truth_estimate.apply(estimate.positions()) - truth.positions(), axis=1))
 
 
 def scaled_by(trajectory: Trajectory, scale: float) -> Trajectory:
-    """The same views from positions that are so many times further apart."""
+    """Return the same views from positions that are so many times further apart."""
     poses = trajectory.T_world_cam.copy()
     poses[:, :3, 3] *= scale
     return Trajectory(trajectory.time_s, poses)
 
 
 def align(truth: Trajectory, estimate: Trajectory, *, with_scale: bool) -> Sim3:
-    """S_truth_estimate from the positions of two trajectories of equal length (Umeyama 1991)."""
+    """Return S_truth_estimate from the positions of two trajectories of equal length (Umeyama 1991)."""
     try:
         return umeyama(estimate.positions(), truth.positions(), with_scale=with_scale)
     except DegenerateError as error:
@@ -278,7 +278,7 @@ def align(truth: Trajectory, estimate: Trajectory, *, with_scale: bool) -> Sim3:
 
 
 def delta_pairs(truth: Trajectory, delta: Delta) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the poses that lie `delta` apart, two of shape (P,). Raises `OptionError` when there are none.
+    """Return rows of the poses that lie `delta` apart, two of shape (P,). Raises `OptionError` when there are none.
 
     Metres count along the true path and seconds on the clock: each pose is paired with the later one whose distance is
     nearest to what is wanted, if it is within a tenth of it (evo's all pairs, with pairs from the reference).
@@ -305,7 +305,8 @@ def delta_pairs(truth: Trajectory, delta: Delta) -> tuple[NDArray[np.int64], NDA
 def relative_errors(
     truth: Trajectory, estimate: Trajectory, start: NDArray[np.int64], end: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """E = (A_i^-1 A_j)^-1 (B_i^-1 B_j) for truth A, estimate B, rows i, j: translation and angle in degrees, (P,)."""
+    """Return E = (A_i^-1 A_j)^-1 (B_i^-1 B_j) for truth A, estimate B, rows i, j: translation and angle in degrees,
+    (P,)."""
     a, b = (_steps(t, start, end) for t in (truth, estimate))
     error = (a.inverse() @ b).as_matrix()
     angle = np.linalg.norm(rotation_log(error[:, :3, :3]), axis=1)
@@ -319,7 +320,7 @@ def _steps(trajectory: Trajectory, start: NDArray[np.int64], end: NDArray[np.int
 
 
 def statistics(errors: Array) -> Statistics:
-    """Summary of non-negative errors. Shape (N,)."""
+    """Return the summary of non-negative errors. Shape (N,)."""
     return Statistics(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(np.mean(errors)),

@@ -88,8 +88,8 @@ def _structure(count: int, rows: Rows, columns: Rows) -> tuple[Rows, list[Rows]]
 
 
 def _postorder(structure: list[Rows]) -> Rows:
-    """New places that fill in no more, at which every block comes right after those that lead up to it (the postorder
-    of the elimination tree), so that blocks of like structure lie side by side. Shape (n,)."""
+    """Return the new places that fill in no more, at which every block comes right after those that lead up to it (the
+    postorder of the elimination tree), so that blocks of like structure lie side by side. Shape (n,)."""
     count = len(structure)
     children: list[list[int]] = [[] for _ in range(count + 1)]
     for k in sorted(range(count), key=lambda k: len(structure[k]), reverse=True):
@@ -105,7 +105,7 @@ def _postorder(structure: list[Rows]) -> Rows:
 
 
 def _groups(structure: list[Rows]) -> list[tuple[int, int]]:
-    """Runs of places that are eliminated together: [start, end) with almost the same structure."""
+    """Return runs of places that are eliminated together: [start, end) with almost the same structure."""
     groups: list[tuple[int, int, int]] = []
     for k, own in enumerate(structure):
         start, filled = k, 1 + len(own)
@@ -197,7 +197,7 @@ class BlockFactor:
         return BlockFactor(pattern, uppers, lowers)
 
     def solve(self, right: Array) -> Array:
-        """H^-1 applied to right-hand sides by block. Shape (n, D) -> (n, D)."""
+        """Return H^-1 applied to right-hand sides by block. Shape (n, D) -> (n, D)."""
         x = right.copy()
         d = self.pattern.size
         for front, upper, lower in zip(self.pattern.fronts, self.upper, self.lower, strict=True):
@@ -215,7 +215,7 @@ class BlockFactor:
         return x
 
     def inverse_blocks(self) -> tuple[Array, Array]:
-        """Blocks of H^-1 on the diagonal (n, D, D) and at the pattern's rows and columns (N, D, D)."""
+        """Return blocks of H^-1 on the diagonal (n, D, D) and at the pattern's rows and columns (N, D, D)."""
         d, pattern = self.pattern.size, self.pattern
         diagonal = np.empty((pattern.count, d, d))
         off = np.empty((len(pattern.flipped), d, d))

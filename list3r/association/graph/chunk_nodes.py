@@ -69,7 +69,7 @@ class ChunkNodes:
 
     @staticmethod
     def of(samples: FrameSamples, length: int) -> ChunkNodes:
-        """Runs of `length` frames, at the same frames in every chunk of a video; rigid chunks have length 0."""
+        """Return runs of `length` frames, at the same frames in every chunk of a video; rigid chunks have length 0."""
         run = samples.camera_frames // length if length else np.zeros(len(samples.camera_frames), np.int64)
         _, node = np.unique(run, return_inverse=True)
         count = np.bincount(node)
@@ -88,7 +88,7 @@ class ChunkNodes:
         )
 
     def nearest(self, frame: int) -> int:
-        """The node of the posed frame nearest to a frame."""
+        """Return the node of the posed frame nearest to a frame."""
         return int(self.node[int(np.argmin(np.abs(self.frames - frame)))])
 
 
@@ -115,7 +115,7 @@ class Tie:
 
 
 def relate_frames(u: FrameSamples, v: FrameSamples, edge: Edge, nodes_u: ChunkNodes) -> FrameRelations:
-    """The relation of every frame that both chunks hold with enough depth."""
+    """Return the relation of every frame that both chunks hold with enough depth."""
     at_u, at_v = shared_samples(u, v)
     frames, rows = [], []
     S_u_v = edge.S_v_u.inverse()
@@ -146,7 +146,7 @@ def relate_frames(u: FrameSamples, v: FrameSamples, edge: Edge, nodes_u: ChunkNo
 def ties_of(
     relations: FrameRelations, edge: Edge, nodes_u: ChunkNodes, nodes_v: ChunkNodes, settings: NodeSettings
 ) -> list[Tie]:
-    """The relations averaged over the frames of each node."""
+    """Return the relations averaged over the frames of each node."""
     here = nodes_u.node[np.searchsorted(nodes_u.frames, relations.frames)]
     there = nodes_v.node[np.searchsorted(nodes_v.frames, relations.frames)]
     out = []
@@ -162,7 +162,8 @@ def ties_of(
 
 
 def measured_walk(relations: Sequence[FrameRelations]) -> Array:
-    """Variance of shift, turn and log scale that one frame adds in one chunk, by how relations change along overlaps.
+    """Return the variance of shift, turn and log scale that one frame adds in one chunk, by how relations change along
+    overlaps.
 
     Shares of the depth, radians. Each overlap is cut into thirds; two chunks change independently. Shape (3,), 0 where
     no overlap is long enough.
@@ -181,7 +182,7 @@ def measured_walk(relations: Sequence[FrameRelations]) -> Array:
 
 
 def walk_covariance(nodes: ChunkNodes, first: int, walk: Array) -> Array:
-    """Covariance of a node's similarity as the next one sees it. Shape (7, 7)."""
+    """Return the covariance of a node's similarity as the next one sees it. Shape (7, 7)."""
     pair = slice(first, first + 2)
     center, reach = nodes.center[pair].mean(axis=0), float(nodes.reach[pair].mean())
     back = about(center[None])[0]
@@ -194,7 +195,7 @@ def _depth(T_chunk_cam: Array, points: NDArray[np.float32]) -> Array:
 
 
 def _robust_mean(x: Array) -> tuple[Array, Array]:
-    """Mean of rows without those far off (Cauchy-like weights), and their robust deviation. Shapes (7,)."""
+    """Return the mean of rows without those far off (Cauchy-like weights), and their robust deviation. Shapes (7,)."""
     middle = np.median(x, axis=0)
     scatter = 1.4826 * np.median(np.abs(x - middle), axis=0)
     for _ in range(5):
@@ -205,7 +206,7 @@ def _robust_mean(x: Array) -> tuple[Array, Array]:
 
 
 def _views(samples: FrameSamples) -> tuple[Array, Array]:
-    """Middle of what each posed frame sees, and how far it is from the camera. Shapes (G, 3) and (G,)."""
+    """Return the middle of what each posed frame sees, and how far it is from the camera. Shapes (G, 3) and (G,)."""
     order = np.argsort(samples.frame, kind="stable")
     points = samples.points[order].astype(np.float64)
     starts = np.searchsorted(samples.frame[order], samples.camera_frames, "left")

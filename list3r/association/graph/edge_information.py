@@ -44,7 +44,7 @@ class WeightSettings:
 
 
 def edge_weights(confidence: Array, settings: WeightSettings) -> Array:
-    """Weights of edges from their confidence m (paper A.4), the strongest edge 1. Shape (E,).
+    """Return weights of edges from their confidence m (paper A.4), the strongest edge 1. Shape (E,).
 
     With the paper's constants all raw weights are below 3.3e-4, so only their ratios mean something.
     """
@@ -55,7 +55,7 @@ def edge_weights(confidence: Array, settings: WeightSettings) -> Array:
 
 
 def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
-    """Inverse covariances of the edges' tangent errors with bending, in u's units.
+    """Return the inverse covariances of the edges' tangent errors with bending, in u's units.
 
     Shape (E, D, D), D = 6 if metric else 7. The paper's sharpened confidence (A.4) is not multiplied in, see
     docs/decisions/0041.
@@ -75,7 +75,8 @@ def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -
 
 
 def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settings: WeightSettings) -> Array:
-    """Covariances of chunks' frames from their own bending, about the middle of what their edges stand on, chunk units.
+    """Return covariances of chunks' frames from their own bending, about the middle of what their edges stand on, chunk
+    units.
 
     Shape (K, 7, 7), 0 for chunks without an edge that states a covariance.
     """
@@ -93,7 +94,7 @@ def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settin
 
 
 def plain_information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
-    """The same for every edge, angles and shifts in one unit: plain least squares. Shape (E, D, D)."""
+    """Return the same for every edge, angles and shifts in one unit: plain least squares. Shape (E, D, D)."""
     levers = [lever for e in edges if (lever := _lever(e, metric, settings)) is not None]
     lever = float(np.median(levers)) if levers else settings.lever_m
     unit = np.array([lever] * 3 + [1.0] * (3 if metric else 4)) * settings.unmeasured
@@ -101,14 +102,14 @@ def plain_information(edges: Sequence[Edge], metric: bool, settings: WeightSetti
 
 
 def _lever(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
-    """Half the spread of an edge's points in u's units; None where it does not say."""
+    """Return half the spread of an edge's points in u's units; None where it does not say."""
     if metric or "spread" not in edge.scores:
         return settings.lever_m if metric else None
     return max(0.5 * edge.scores["spread"] / float(edge.S_v_u.scale), 1e-9)
 
 
 def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
-    """Covariance of an edge that states none. Shape (7, 7)."""
+    """Return the covariance of an edge that states none. Shape (7, 7)."""
     lever = _lever(edge, metric, settings) or settings.lever_m
     deviation = settings.unmeasured / np.sqrt(max(edge.confidence, settings.least_confidence))
     unit = np.array([lever] * 3 + [1.0] * 4)
@@ -116,7 +117,7 @@ def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
 
 
 def _bent(covariance: Array, settings: WeightSettings) -> Array:
-    """Covariances with bending about the middle of each edge's support. Shape (E, 7, 7)."""
+    """Return covariances with bending about the middle of each edge's support. Shape (E, 7, 7)."""
     center, radius = support_of(covariance)
     shape = about(center)
     shape[:, :, :3] *= radius[:, None, None]
@@ -124,14 +125,14 @@ def _bent(covariance: Array, settings: WeightSettings) -> Array:
 
 
 def about(center: Array) -> Array:
-    """Matrices that take tangents about centres to tangents about the origin. Shape (E, 3) -> (E, 7, 7)."""
+    """Return matrices that take tangents about centres to tangents about the origin. Shape (E, 3) -> (E, 7, 7)."""
     out = np.tile(np.eye(7), (len(center), 1, 1))
     out[:, :3, 3:6], out[:, :3, 6] = skew(center), -center
     return out
 
 
 def support_of(covariance: Array) -> tuple[Array, Array]:
-    """Centre and radius of the points that alignments with these covariances stood on. Shapes (E, 3) and (E,).
+    """Return centre and radius of the points that alignments with these covariances stood on. Shapes (E, 3) and (E,).
 
     About the centre the errors of shift and turn are independent, which gives the centre; the ratio of their
     deviations is the radius. 0 and 1 where the turn has no error.

@@ -137,8 +137,8 @@ def _moved(
 
 
 def _near(new: int, here: int, ends: NDArray[np.int64], others: set[int], most: int) -> NDArray[np.int64]:
-    """Ids of the chunks that move: all on the shortest ways from `here` to the other chunks that the new one is tied
-    to, and the nearest to those (by edges between) until there are `most`. `ends` (E, 2) are ids of all edges."""
+    """Return ids of the chunks that move: all on the shortest ways from `here` to the other chunks that the new one is
+    tied to, and the nearest to those (by edges between) until there are `most`. `ends` (E, 2) are ids of all edges."""
     ids, at = np.unique(ends, return_inverse=True)
     at = at.reshape(ends.shape)
     old = ~(ends == new).any(axis=1)
@@ -156,7 +156,7 @@ def _near(new: int, here: int, ends: NDArray[np.int64], others: set[int], most: 
 
 
 def _under(known: Mapping[int, T]) -> MutableMapping[int, T]:
-    """A mapping as `ChainMap` is declared to want it; it is never written to."""
+    """Return a mapping as `ChainMap` is declared to want it; it is never written to."""
     return cast("MutableMapping[int, T]", known)
 
 
@@ -182,7 +182,7 @@ def _with(
 
 
 def _hanging(of_here: Array, edge: Edge, here: int, information: Array) -> Array:
-    """Covariance of a chunk at the other end of an edge from a chunk with covariance `of_here`. Shape (7, 7)."""
+    """Return covariance of a chunk at the other end of an edge from a chunk with covariance `of_here`. Shape (7, 7)."""
     own = np.zeros((7, 7))
     own[: len(information), : len(information)] = np.linalg.inv(information)
     if here == edge.u:
@@ -193,7 +193,7 @@ def _hanging(of_here: Array, edge: Edge, here: int, information: Array) -> Array
 
 
 def _factors(edges: Sequence[Edge]) -> Array:
-    """Variance factors of adjacent and of loop edges that the last full solution found. Shape (2,)."""
+    """Return the variance factors of adjacent and of loop edges that the last full solution found. Shape (2,)."""
     out = np.ones(2)
     for kind in range(2):
         known = (e.scores["variance_factor"] for e in edges if "variance_factor" in e.scores and _kind(e) == kind)

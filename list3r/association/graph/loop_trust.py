@@ -199,7 +199,7 @@ def _harden(
 def drift_factor(
     problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], settings: TrustSettings
 ) -> float:
-    """How many times larger (squared, at least 1) the chain's drift is than its edges say: the median over loops.
+    """Estimate how many times larger (squared, at least 1) chain's drift is than its edges say: the median over loops.
 
     Up to half of the loops may be false.
     """
@@ -209,7 +209,7 @@ def drift_factor(
 
 
 def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_]) -> Array:
-    """Squared Mahalanobis distances of the loops from the chain, by its uncertainty and their own. Shape (L,)."""
+    """Return squared Mahalanobis distances of loops from the chain, by its uncertainty and their own. Shape (L,)."""
     d = problem.size
     world = adjoint(start)[:, :d, :d]
     # Covariances of edges in the frame of the world, summed from the root.
@@ -229,7 +229,7 @@ def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[
 
 
 def _common_ancestor(tree: Tree, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row of the last common ancestor of pairs (binary lifting); a root where they lie in different trees."""
+    """Return row of the last common ancestor of pairs (binary lifting); a root where they lie in different trees."""
     depth = np.zeros(len(tree.parent), np.int64)
     for row in tree.order:
         if tree.edge[row] >= 0:

@@ -26,7 +26,7 @@ class Marginals:
 
 
 def marginals(problem: GraphProblem, poses: Sim3, trust: Array) -> Marginals:
-    """Blocks of the inverse information of all chunks, and what they leave over of each edge."""
+    """Compute the marginal covariances of all chunks and the redundancy of each edge."""
     d = problem.size
     out = np.zeros((len(problem.fixed), d, d))
     if problem.pattern.count == 0:
@@ -46,7 +46,8 @@ def marginals(problem: GraphProblem, poses: Sim3, trust: Array) -> Marginals:
 def variance_factors(
     squares: Array, redundancy: Array, trust: Array, kinds: NDArray[np.int64], before: Array, prior: float
 ) -> tuple[Array, Array]:
-    """How many times larger the errors of each kind of edge are (squared) than `before` says, and the freedom behind.
+    """Estimate how many times larger the errors of each kind of edge are (squared) than `before` says, and the freedom
+    behind.
 
     Helmert's estimation of variance components with `prior` degrees of freedom at 1. `squares`, `redundancy` and
     `trust` have shape (E,), `kinds` numbers the kind of each edge, `before` has a factor for each kind. What edges
@@ -61,5 +62,6 @@ def variance_factors(
 
 
 def widening(freedom: float) -> float:
-    """Factor on a covariance whose scale was estimated with so many degrees of freedom: F against chi^2 at 95 %."""
+    """Return the factor on a covariance whose scale was estimated with so many degrees of freedom: F against chi^2 at
+    95 %."""
     return float(3.0 * f_distribution.ppf(0.95, 3, freedom) / chi2.ppf(0.95, 3))

@@ -69,7 +69,7 @@ def bend_chunks(
     settings: NodeSettings | None = None,
     weights: GraphSettings | None = None,
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """The graph with every chunk where its nodes are on average, and the bend of each chunk.
+    """Return the graph with every chunk where its nodes are on average, and the bend of each chunk.
 
     The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given); chunks
     without posed frames have no bend. Samples are read chunk by chunk in order, two at a time are held.
@@ -93,7 +93,7 @@ def pieces_of(
     rigid: Collection[int],
     settings: NodeSettings,
 ) -> Pieces:
-    """Nodes of all chunks and relations of adjacent ones, in one pass over the samples."""
+    """Return nodes of all chunks and relations of adjacent ones, in one pass over the samples."""
     to = {e.v: e for e in believed if e.kind == "adjacent" and e.accepted}
     nodes: dict[int, ChunkNodes] = {}
     relations = []
@@ -163,8 +163,8 @@ def _problem(
 
 
 def _whole(edge: Edge, nodes: Mapping[int, ChunkNodes]) -> Tie:
-    """An edge that holds the nodes of the frames that it was found at; the ends that face each other where it does not
-    say (its information is that of the edge)."""
+    """Return an edge that holds the nodes of the frames that it was found at; the ends that face each other where it
+    does not say (its information is that of the edge)."""
     u, v = nodes[edge.u], nodes[edge.v]
     if edge.frames is not None:
         return Tie(u.nearest(edge.frames[0]), v.nearest(edge.frames[1]), edge.S_v_u, np.eye(7))
@@ -178,7 +178,8 @@ def _settled(
     graph: GraphResult,
     rigid: Collection[int],
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """Chunks at the mean of their nodes, moved so that the first chunk of each component stays, and their bends."""
+    """Place the chunks at the mean of their nodes, moved so that the first chunk of each component stays, and their
+    bends."""
     poses, bends = {}, {}
     for chunk, mine in nodes.items():
         S = graph.S_graph_chunk[chunk]
@@ -193,18 +194,18 @@ def _settled(
 
 
 def inverses(covariance: Array) -> Array:
-    """Inverses of symmetric matrices, symmetric. Shape (E, D, D)."""
+    """Return inverses of symmetric matrices, symmetric. Shape (E, D, D)."""
     inverse = np.linalg.inv(covariance)
     return np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2.0)
 
 
 def repeated(S: Sim3, count: int) -> Sim3:
-    """The same similarity many times over."""
+    """Return the same similarity many times over."""
     return Sim3(np.full(count, float(S.scale)), np.tile(S.rotation, (count, 1, 1)), np.tile(S.translation, (count, 1)))
 
 
 def _known_poses(samples: FrameSamples) -> FrameSamples:
-    """Without frames whose pose is not finite."""
+    """Return the samples without frames whose pose is not finite."""
     good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
     if good.all():
         return samples
@@ -212,7 +213,7 @@ def _known_poses(samples: FrameSamples) -> FrameSamples:
 
 
 def _one_node() -> ChunkNodes:
-    """A chunk that shows nothing."""
+    """Return a chunk that shows nothing."""
     zero = np.zeros(1)
     none = np.zeros(1, np.int64)
     return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64))

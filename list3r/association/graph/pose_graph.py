@@ -114,18 +114,18 @@ def optimize(
 def problem_of(
     active: Sequence[Edge], row: Mapping[int, int], fixed: NDArray[np.bool_], weights: Array
 ) -> GraphProblem:
-    """The graph of some edges with information `weights` (E, D, D); `row` numbers the chunks."""
+    """Return the graph of some edges with information `weights` (E, D, D); `row` numbers the chunks."""
     u, v = np.array([row[e.u] for e in active]), np.array([row[e.v] for e in active])
     return GraphProblem.build(u, v, stack([e.S_v_u for e in active]), weights, fixed)
 
 
 def information_of(edges: Sequence[Edge], metric: bool, settings: GraphSettings) -> Array:
-    """What each edge has to say. Shape (E, D, D)."""
+    """Return the information of each edge. Shape (E, D, D)."""
     return (information if settings.weighted else plain_information)(edges, metric, settings.weights)
 
 
 def check(edges: Sequence[Edge]) -> None:
-    """Raises `DegenerateError` for an edge that holds a number that is not finite, by its name."""
+    """Raise `DegenerateError` for an edge that holds a number that is not finite, by its name."""
     if not edges:
         return
     S = stack([e.S_v_u for e in edges])
@@ -141,8 +141,8 @@ def check(edges: Sequence[Edge]) -> None:
 
 
 def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array:
-    """What is stated of each chunk: its place in the graph, its own bending, and that of the first chunk, `first` (K,),
-    which moves all others. Shape (K, 7, 7)."""
+    """Return the covariance stated of each chunk: its place in the graph, its own bending, and that of the first chunk,
+    `first` (K,), which moves all others. Shape (K, 7, 7)."""
     size = found.marginals.covariance.shape[1]
     own = own * found.factors[0]
     from_first = adjoint(found.poses.inverse() @ take(found.poses, first))
@@ -154,13 +154,13 @@ def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array
 
 
 def _strengths(information: Array) -> Array:
-    """Information of each edge on the turn (which has no unit), by geometric mean, the strongest 1. Shape (E,)."""
+    """Return information of each edge on turn (which has no unit), by geometric mean, the strongest 1. Shape (E,)."""
     size = np.cbrt(np.maximum(np.linalg.det(information[:, 3:6, 3:6]), 0.0))
     return np.asarray(size / max(float(size.max()), 1e-300))
 
 
 def _weak(edges: Sequence[Edge], ids: Sequence[int], weights: Array, settings: GraphSettings) -> list[int]:
-    """Numbers of the loops that say next to nothing; none where the graph would fall apart without them."""
+    """Return numbers of the loops that say next to nothing; none where the graph would fall apart without them."""
     if not settings.weighted or not any(e.kind != "adjacent" for e in edges):
         return []
     strength = _strengths(weights)
@@ -241,19 +241,19 @@ def _chain(
 
 
 def chain_poses(ids: Sequence[int], edges: Sequence[Edge]) -> tuple[dict[int, Sim3], dict[int, int]]:
-    """Poses of chunks along a spanning tree of the edges, from the first of each component, and the components."""
+    """Return poses of chunks along a spanning tree of edges, from the first of each component, and the components."""
     component = _components(ids, edges)
     return _chain(ids, edges, component, {})[0], component
 
 
 def across(S_world_here: Sim3, edge: Edge, here: int) -> Sim3:
-    """Pose of the chunk at the other end of an edge."""
+    """Return the pose of the chunk at the other end of an edge."""
     S_here_there = edge.S_v_u.inverse() if here == edge.u else edge.S_v_u
     return S_world_here @ S_here_there
 
 
 def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
-    """By chunk id: (other chunk, number of the edge)."""
+    """Return the neighbours by chunk id: (other chunk, number of the edge)."""
     out: dict[int, list[tuple[int, int]]] = {}
     for k, edge in enumerate(edges):
         out.setdefault(edge.u, []).append((edge.v, k))
@@ -262,7 +262,7 @@ def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
 
 
 def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int) -> Edge:
-    """The edge with its weight in the graph, and what the graph thinks of it."""
+    """Return the edge with its weight in the graph, and what the graph thinks of it."""
     deviations = deviations_of(square)
     trusted = bool(found.trust[n] > 0.5)
     trust = float((found.limit[n] / (square + found.limit[n])) ** 2)
@@ -281,5 +281,5 @@ def deviations_of(square: float) -> float:
 
 
 def contradicted(edge: Edge, deviations: float) -> str:
-    """Why a loop is not believed."""
+    """Return why a loop is not believed."""
     return f"the rest of the graph contradicts it by {deviations:.1f} deviations (geometry alone: {edge.reason})"

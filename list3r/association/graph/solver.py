@@ -56,22 +56,22 @@ class GraphProblem:
         return int(self.information.shape[1])
 
     def scaled(self, factors: Array) -> GraphProblem:
-        """The same graph with variances larger by factors. Shape (E,)."""
+        """Return the same graph with variances larger by factors. Shape (E,)."""
         return replace(self, information=self.information / factors[:, None, None])
 
     def residuals(self, poses: Sim3) -> Array:
-        """Tangent error of each edge. Shape (E, D)."""
+        """Return the tangent error of each edge. Shape (E, D)."""
         apart = self.S_u_v @ take(poses, self.v).inverse() @ take(poses, self.u)
         return np.asarray(apart.log()[:, : self.size])
 
     def squares(self, poses: Sim3) -> Array:
-        """e^T W e of each edge. Shape (E,)."""
+        """Return e^T W e of each edge. Shape (E,)."""
         e = self.residuals(poses)
         return np.asarray(np.einsum("ei,eij,ej->e", e, self.information, e, optimize=True))
 
     def solve(self, poses: Sim3, trust: Array, iterations: int, settled: float = _CONVERGED) -> Sim3:
-        """Poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`, until a step gains less
-        than a share `settled` of the cost. Shape of trust (E,)."""
+        """Return the poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`, until a step
+        gains less than a share `settled` of the cost. Shape of trust (E,)."""
         if len(self.u) == 0 or not (~self.fixed).any():
             return poses
         damping = 0.0
@@ -95,7 +95,7 @@ class GraphProblem:
         return poses
 
     def factor(self, poses: Sim3, trust: Array) -> BlockFactor:
-        """The factor of the information matrix of all chunks that are not fixed. Raises `NotPositiveError`."""
+        """Return the factor of the information matrix of all chunks that are not fixed. Raises `NotPositiveError`."""
         diagonal, off, _ = self._normal_equations(self.residuals(poses), trust)
         return BlockFactor.of(self.pattern, diagonal, off)
 
@@ -115,7 +115,7 @@ class GraphProblem:
         return poses @ Sim3.exp(full)
 
     def _normal_equations(self, e: Array, trust: Array) -> tuple[Array, Array, Array]:
-        """Diagonal blocks, off-diagonal blocks of the inner edges, and the gradient, for right-hand steps."""
+        """Return diagonal blocks, off-diagonal blocks of the inner edges, and the gradient, for right-hand steps."""
         d = self.size
         to_u, to_v = self.jacobians(e)
         both = np.concatenate([to_u, to_v], axis=2)
@@ -132,7 +132,7 @@ class GraphProblem:
         return diagonal, blocks[self.inner, :d, d:], gradient
 
     def jacobians(self, e: Array) -> tuple[Array, Array]:
-        """Derivatives of the errors by right-hand steps of u and of v. Shapes (E, D, D).
+        """Return derivatives of the errors by right-hand steps of u and of v. Shapes (E, D, D).
 
         The inverse Jacobian of log is the Bernoulli series I + ad/2 + ad^2/12 - ad^4/720 + ad^6/30240, good to 1e-7
         for turns up to one radian.
@@ -147,7 +147,7 @@ class GraphProblem:
 
 
 def stack(poses: Sequence[Sim3]) -> Sim3:
-    """One batched similarity of many. Shape (K,)."""
+    """Return one batched similarity of many. Shape (K,)."""
     return Sim3(
         np.array([float(p.scale) for p in poses]),
         np.array([p.rotation for p in poses]).reshape(-1, 3, 3),
@@ -156,17 +156,17 @@ def stack(poses: Sequence[Sim3]) -> Sim3:
 
 
 def take(poses: Sim3, rows: NDArray[np.int64]) -> Sim3:
-    """Some of a batch."""
+    """Return some of a batch."""
     return Sim3(poses.scale[rows], poses.rotation[rows], poses.translation[rows])
 
 
 def unstack(poses: Sim3, names: Sequence[int]) -> dict[int, Sim3]:
-    """One similarity for each name."""
+    """Return one similarity for each name."""
     return {n: Sim3(poses.scale[k], poses.rotation[k], poses.translation[k]) for k, n in enumerate(names)}
 
 
 def adjoint(S: Sim3) -> Array:
-    """Matrices with S exp(x) S^-1 = exp(Ad x), tangents (rho, omega, sigma). Shape (E, 7, 7)."""
+    """Return matrices with S exp(x) S^-1 = exp(Ad x), tangents (rho, omega, sigma). Shape (E, 7, 7)."""
     out = np.zeros((*S.scale.shape, 7, 7))
     out[..., :3, :3] = S.scale[..., None, None] * S.rotation
     out[..., :3, 3:6] = skew(S.translation) @ S.rotation
@@ -177,7 +177,7 @@ def adjoint(S: Sim3) -> Array:
 
 
 def _ad(e: Array) -> Array:
-    """The adjoint's derivative: ad(e) x = [e, x]. Shape (E, D) -> (E, D, D), D = 6 or 7."""
+    """Return the adjoint's derivative: ad(e) x = [e, x]. Shape (E, D) -> (E, D, D), D = 6 or 7."""
     size = e.shape[1]
     out = np.zeros((len(e), size, size))
     out[:, :3, :3] = skew(e[:, 3:6])
@@ -190,7 +190,7 @@ def _ad(e: Array) -> Array:
 
 
 def _gathered(where: NDArray[np.int64], values: Array, count: int) -> Array:
-    """Sums of rows by number. Shape (N, ...) -> (count, ...)."""
+    """Return sums of rows by number. Shape (N, ...) -> (count, ...)."""
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     order = np.argsort(where, kind="stable")
     out = np.zeros((count, flat.shape[1]))

@@ -47,7 +47,7 @@ def place_by_surfaces(
     bends: Mapping[int, Bend],
     settings: SurfaceSettings | None = None,
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """The graph with its chunks where surfaces have them, and bends that leave the cameras where they are beside it.
+    """Return graph with its chunks where surfaces have them, and bends that leave the cameras where they are beside it.
 
     The first chunk of each component stays; the cameras of a component move together, by the mean of what its chunks
     move by.
@@ -83,14 +83,14 @@ def place_by_surfaces(
 
 
 def _bending(nodes: ChunkNodes, s: SurfaceSettings) -> Array:
-    """Covariance of a chunk's bending about the middle of what it sees. Shape (7, 7)."""
+    """Return the covariance of a chunk's bending about the middle of what it sees. Shape (7, 7)."""
     back = about(nodes.center[:1])[0]
     deviation = np.repeat([s.shift * float(nodes.reach[0]), s.turn_rad, s.scale], [3, 3, 1])
     return np.asarray(back @ np.diag(deviation**2) @ back.T)
 
 
 def _sharper(edge: Edge, s: SurfaceSettings) -> Array:
-    """The covariance of an edge, of a loop with what depths tell of the scale. Shape (7, 7)."""
+    """Return the covariance of an edge, of a loop with what depths tell of the scale. Shape (7, 7)."""
     assert edge.covariance is not None
     factor = np.ones(7)
     if edge.kind == "loop":
@@ -99,7 +99,7 @@ def _sharper(edge: Edge, s: SurfaceSettings) -> Array:
 
 
 def _beside(placed: Mapping[int, Sim3], graph: GraphResult, bends: Mapping[int, Bend]) -> dict[int, Bend]:
-    """Bends that take what the frames saw to where the cameras' graph has it, moved as the things are on average."""
+    """Return bends that take what frames saw to where the cameras' graph has it, moved as the things are on average."""
     out: dict[int, Bend] = {}
     for component in sorted(set(graph.components.values())):
         mine = [k for k in sorted(placed) if graph.components[k] == component]

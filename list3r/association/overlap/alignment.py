@@ -99,7 +99,7 @@ def align(
     metric: bool,
     settings: AlignmentSettings | None = None,
 ) -> Alignment:
-    """The similarity (rigid when `metric`) that takes `p_u` to `p_v`, with its covariance.
+    """Estimate the similarity (rigid when `metric`) that takes `p_u` to `p_v`, with its covariance.
 
     `p_u` and `p_v` have shape (N, 3); `weight` (N,) is >= 0, a pair of weight 0 or with a coordinate that is not finite
     is left out; `group` (N,) int numbers the frame of each pair, in order of time. Raises `DegenerateError` for support
@@ -143,8 +143,8 @@ def robust_start(
     metric: bool,
     settings: AlignmentSettings | None = None,
 ) -> Sim3:
-    """The transform that `align` starts from: by few of the pairs, not exact, but spoilt neither by scattered outliers
-    nor by up to about half of the frames being misplaced together. Raises `DegenerateError`."""
+    """Return the transform that `align` starts from: by few of the pairs, not exact, but spoilt neither by scattered
+    outliers nor by up to about half of the frames being misplaced together. Raises `DegenerateError`."""
     chosen = settings or AlignmentSettings()
     pairs, _ = _usable(_Pairs.build(p_u, p_v, weight, group), chosen)
     return _robust_start(pairs.thinned(chosen.start_pairs), metric, _spread(pairs.v), chosen)
@@ -171,20 +171,20 @@ class _Pairs:
         return _Pairs(self.u[rows], self.v[rows], self.weight[rows], self.group[rows])
 
     def thinned(self, most: int) -> _Pairs:
-        """At most `most` pairs, evenly over the groups."""
+        """Return at most `most` pairs, evenly over the groups."""
         if len(self.u) <= most:
             return self
         order = np.argsort(self.group, kind="stable")
         return self[order[np.linspace(0, len(order) - 1, most).astype(np.int64)]]
 
     def residual(self, S_v_u: Sim3) -> Array:
-        """Distances after alignment, v's units. Shape (N,)."""
+        """Return distances after alignment, v's units. Shape (N,)."""
         off = S_v_u.apply(self.u) - self.v
         return np.asarray(np.sqrt(np.einsum("ni,ni->n", off, off)))
 
 
 def _usable(every: _Pairs, settings: AlignmentSettings) -> tuple[_Pairs, NDArray[np.bool_]]:
-    """The pairs that can be used, and which they are. Raises `DegenerateError` when they are too few."""
+    """Return the pairs that can be used, and which they are. Raises `DegenerateError` when they are too few."""
     finite = np.isfinite(every.u).all(axis=1) & np.isfinite(every.v).all(axis=1) & np.isfinite(every.weight)
     used = finite & (every.weight > 0)
     count, least = int(used.sum()), settings.least_pairs
@@ -217,8 +217,8 @@ def _spread(points: Array) -> float:
 
 
 def _fit(pairs: _Pairs, weight: Array, metric: bool, symmetric: bool) -> Sim3:
-    """Weighted Umeyama. The symmetric scale is the geometric mean of the least squares ones of both directions, the
-    maximum likelihood where both sides are equally noisy relative to their size (Deming regression); least squares
+    """Fit by weighted Umeyama. The symmetric scale is the geometric mean of the least squares ones of both directions,
+    the maximum likelihood where both sides are equally noisy relative to their size (Deming regression); least squares
     itself shrinks towards zero with the noise of u."""
     w = weight / weight.sum()
     mean_u, mean_v = w @ pairs.u, w @ pairs.v
@@ -236,7 +236,7 @@ def _fit(pairs: _Pairs, weight: Array, metric: bool, symmetric: bool) -> Sim3:
 
 
 def _robust_start(pairs: _Pairs, metric: bool, spread: float, settings: AlignmentSettings) -> Sim3:
-    """The better of two starts: least absolute deviations over all pairs, and the best fit of one group alone."""
+    """Return better of two starts: least absolute deviations over all pairs, and the best fit of one group alone."""
     starts = [_least_absolute(pairs, metric, spread, settings), *_fits_of_groups(pairs, metric)]
     residuals = [pairs.residual(S) for S in starts]
     scale = max(min(float(np.median(r)) for r in residuals), 1e-12 * spread)
@@ -259,7 +259,7 @@ def _least_absolute(pairs: _Pairs, metric: bool, spread: float, settings: Alignm
 
 
 def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
-    """Fits of single groups that hold enough, spread over all groups."""
+    """Return fits of single groups that hold enough, spread over all groups."""
     values, counts = np.unique(pairs.group, return_counts=True)
     values = values[counts >= 8]
     if len(values) > most:
@@ -269,20 +269,20 @@ def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
 
 
 def _corners(points: Array) -> Array:
-    """Corners of the points' box: what two transforms do there bounds what they do inside. Shape (8, 3)."""
+    """Return corners of the points' box: what two transforms do there bounds what they do inside. Shape (8, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     return np.asarray(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high))
 
 
 def _moved(S_a: Sim3, S_b: Sim3, corners: Array) -> float:
-    """How far two transforms carry the points apart."""
+    """Return how far two transforms carry the points apart."""
     return float(np.abs(S_a.apply(corners) - S_b.apply(corners)).max())
 
 
 def _refine(
     pairs: _Pairs, start: Sim3, metric: bool, spread: float, settings: AlignmentSettings
 ) -> tuple[Sim3, Array, float]:
-    """The fit under Tukey's biweight: transform, trust in each pair (N,), and the residual beyond which it is none."""
+    """Return fit under Tukey's biweight: transform, trust in each pair (N,), and residual beyond which it is none."""
     S_v_u, corners = start, _corners(pairs.u)
     for k in range(settings.iterations):
         residual = pairs.residual(S_v_u)

@@ -128,7 +128,8 @@ class _Terms:
 
 
 def _left_out(information: Array, score: Array) -> Array:
-    """Covariance by leaving out each of G groups in turn, one Newton step each (the delete-a-group jackknife, CR3)."""
+    """Return the covariance by leaving out each of G groups in turn, one Newton step each (the delete-a-group
+    jackknife, CR3)."""
     count, size = score.shape
     rest = information.sum(axis=0) - information + 1e-12 * np.trace(information.sum(axis=0)) * np.eye(size)
     change = np.linalg.solve(rest, score[..., None])[..., 0]
@@ -136,7 +137,7 @@ def _left_out(information: Array, score: Array) -> Array:
 
 
 def _steadied(scatter: Array, information: Array, count: int) -> Array:
-    """The scatter of G groups, drawn towards the shape of the inverse information the fewer groups there are."""
+    """Return the scatter of G groups, drawn towards the shape of the inverse information the fewer groups there are."""
     root, inverse_root = _roots(information)
     white = root @ scatter @ root
     size = len(scatter)
@@ -146,7 +147,8 @@ def _steadied(scatter: Array, information: Array, count: int) -> Array:
 
 
 def _with_bending(scatter: Array, terms: _Terms, gain: float) -> tuple[Array, float]:
-    """Widened where thirds of the groups, in order, differ by more than the scatter of single groups explains."""
+    """Return the scatter, widened where thirds of the groups, in order, differ by more than the scatter of single
+    groups explains."""
     count, size = terms.score.shape
     if terms.frames < 6:
         return scatter, 1.0
@@ -164,14 +166,14 @@ def _with_bending(scatter: Array, terms: _Terms, gain: float) -> tuple[Array, fl
 
 
 def _roots(matrix: Array) -> tuple[Array, Array]:
-    """Symmetric square root and its inverse of a symmetric positive matrix."""
+    """Return the symmetric square root and its inverse of a symmetric positive matrix."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2.0)
     root = np.sqrt(np.maximum(values, 1e-14 * max(float(values[-1]), 1e-300)))
     return (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
 
 
 def _small_sample(size: int, count: int) -> float:
-    """How much wider a 95 % region must be because the scatter of `count` groups is itself uncertain.
+    """Return how much wider a 95 % region must be because the scatter of `count` groups is itself uncertain.
 
     Hotelling's T^2 against chi^2; the degrees of freedom after drawing towards the information's shape, and a tenth for
     the kernel's own uncertainty, are from simulation (4 to 100 groups, Gaussian noise, outliers, errors by frame).

@@ -41,7 +41,7 @@ class BalancedSupport:
 
 
 def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settings: SupportSettings) -> BalancedSupport:
-    """What stands still as one correspondence for each patch: a block of the picture in one region of one frame.
+    """Return one correspondence for each patch of what stands still: a block of the picture in one region of one frame.
 
     Pairs of one patch err together, so what a patch is worth does not grow with its pairs for long, and neither a wall
     nor a confident thing crowds out the rest. How far patches of a region err, and pairs within them, is measured by
@@ -82,7 +82,7 @@ def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settin
 def _patches(
     pairs: Pairs, regions: Regions, usable: Mask, camera: Camera, settings: SupportSettings
 ) -> tuple[Ints, int]:
-    """Number of the patch of each usable pair (0 for others), and how many there are; at most `budget`."""
+    """Return the number of the patch of each usable pair (0 for others), and how many there are; at most `budget`."""
     _, frame = np.unique(pairs.frame, return_inverse=True)
     columns, rows = settings.patches
     while True:
@@ -98,7 +98,7 @@ def _patches(
 
 
 def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: SupportSettings) -> Floats:
-    """Trust in each pair: Tukey's biweight of how far along the ray it lies from its patch's median. Shape (N,)."""
+    """Return trust in each pair: Tukey's biweight of how far along ray it lies from its patch's median. Shape (N,)."""
     trust = np.zeros(len(off))
     rows = np.flatnonzero(usable)
     if not len(rows):
@@ -117,7 +117,7 @@ def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: 
 
 
 def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, settings: SupportSettings) -> Floats:
-    """Information of each pair, relative to its depth: its share of 1 / (t^2 + s^2 / n) of its patch of n pairs.
+    """Return information of each pair, relative to its depth: its share of 1 / (t^2 + s^2 / n) of its patch of n pairs.
 
     t is the deviation of whole patches of its region, s that of pairs within them, both robust, and drawn towards those
     of all regions where a region has little to tell them by. Shape (N,).
@@ -146,5 +146,5 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
 
 
 def _variance(squares: Floats) -> float:
-    """Robust variance from squared deviations, which lie mostly along the ray: their median over that of chi^2_1."""
+    """Return robust variance from squared deviations, which lie mostly along ray: their median over that of chi^2_1."""
     return median(squares) / _CHI2_MEDIAN if len(squares) else 0.0

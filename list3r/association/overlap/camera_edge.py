@@ -37,7 +37,7 @@ class CameraEdgeSettings:
 def camera_edge(
     u: FrameSamples, v: FrameSamples, u_id: int, v_id: int, settings: CameraEdgeSettings | None = None
 ) -> Edge | None:
-    """The adjacent edge from the poses of the frames that two chunks share; None where their path is too short."""
+    """Return adjacent edge from the poses of the frames that two chunks share; None where their path is too short."""
     s = settings or CameraEdgeSettings()
     frames, at_u, at_v = np.intersect1d(u.camera_frames, v.camera_frames, return_indices=True)
     if len(frames) < s.least_frames:
@@ -78,7 +78,7 @@ def camera_edge(
 
 
 def better_edge(by_points: Edge | None, by_cameras: Edge | None) -> Edge | None:
-    """The edge by cameras where there is one, with what the points told; else that by points."""
+    """Return the edge by cameras where there is one, with what the points told; else that by points."""
     if by_cameras is None or by_points is None:
         return by_cameras or by_points
     scores = {**by_points.scores, **by_cameras.scores, "spread": by_points.scores["spread"]}
@@ -86,13 +86,13 @@ def better_edge(by_points: Edge | None, by_cameras: Edge | None) -> Edge | None:
 
 
 def _mean_rotation(rotations: Array) -> Array:
-    """The rotation nearest to all, by the sum of their matrices."""
+    """Return the rotation nearest to all, by the sum of their matrices."""
     U, _, Vt = np.linalg.svd(rotations.sum(axis=0))
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def _with_rotation(R: Array, a: Array, b: Array, weight: Array) -> Sim3 | None:
-    """Scale and place for a known rotation, symmetric in both sides."""
+    """Return the scale and place for a known rotation, symmetric in both sides."""
     w = weight / weight.sum()
     middle_a, middle_b = w @ a, w @ b
     x, y = (a - middle_a) @ R.T, b - middle_b
@@ -108,7 +108,7 @@ def _angles(rotations: Array) -> Array:
 
 
 def _covariance(places: Array, shift: float, turn: float, settings: CameraEdgeSettings) -> Array | None:
-    """Of x = (rho, omega, sigma) in u's units, from errors of places and directions of the cameras."""
+    """Return covariance of x = (rho, omega, sigma) in u's units, from errors of places and directions of cameras."""
     information = np.zeros((7, 7))
     for place in places:
         J = np.concatenate([np.eye(3), -skew(place), place[:, None]], axis=1)

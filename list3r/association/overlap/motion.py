@@ -94,7 +94,7 @@ class _DepthGrid:
 def flag_moving(
     samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings | None = None
 ) -> LocalLibrary:
-    """The library with `dynamic` and `motion` set for what moves against the rest of the chunk.
+    """Return the library with `dynamic` and `motion` set for what moves against the rest of the chunk.
 
     `camera` is that of the colour images, whose pixels `samples` number. What is already flagged stays flagged.
     """
@@ -112,7 +112,7 @@ def flag_moving(
 def seen_through(
     samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings | None = None
 ) -> Floats:
-    """Share of each instance's points that other frames in which it is visible see through. Shape (I,).
+    """Return the share of each instance's points that other frames in which it is visible see through. Shape (I,).
 
     A high quantile over pairs of frames; 0 where there are too few to judge.
     """
@@ -147,7 +147,7 @@ def seen_through(
 def motion_track(
     samples: FrameSamples, instance: LocalInstance, settings: MotionSettings | None = None
 ) -> MotionTrack | None:
-    """Where the middle of what is seen of an instance was, frame by frame; None where it has no points.
+    """Return where the middle of what is seen of an instance was, frame by frame; None where it has no points.
 
     Component-wise medians, steadied over neighbouring frames by how much of the thing each shows.
     """
@@ -166,7 +166,7 @@ def motion_track(
 
 
 def _steadied(frames: Ints, middle: Floats, shown: Floats, settings: MotionSettings) -> Floats:
-    """Local straight lines through the positions, weighed by the square of the area shown."""
+    """Return the local straight lines through the positions, weighed by the square of the area shown."""
     out = middle.copy()
     for k, frame in enumerate(frames):
         near = np.abs(frames - frame) <= settings.smoothing_frames
@@ -183,7 +183,7 @@ def _steadied(frames: Ints, middle: Floats, shown: Floats, settings: MotionSetti
 
 
 def _choose(samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings) -> _Samples:
-    """The samples of at most `frames` frames, spread evenly."""
+    """Return the samples of at most `frames` frames, spread evenly."""
     good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
     frames = np.intersect1d(samples.camera_frames[good], samples.frame)
     if len(frames) > settings.frames:
@@ -206,7 +206,7 @@ def _choose(samples: FrameSamples, library: LocalLibrary, camera: Camera, settin
 
 
 def _cells(xy: Floats, camera: Camera, settings: MotionSettings) -> Ints:
-    """Row and column of each pixel in the depth grid. Shape (S, 2)."""
+    """Return the row and column of each pixel in the depth grid. Shape (S, 2)."""
     columns, rows = settings.grid
     return np.column_stack(
         [
@@ -237,7 +237,7 @@ def _depth_grid(used: _Samples, k: int, camera: Camera, settings: MotionSettings
 
 
 def _project(used: _Samples, k: int, camera: Camera, settings: MotionSettings) -> tuple[Floats, Ints]:
-    """Depth of all samples in frame k, and their cells there, -1 outside."""
+    """Return the depth of all samples in frame k, and their cells there, -1 outside."""
     T = used.T_cam_chunk[k]
     cam = used.points @ T[:3, :3].T + T[:3, 3]
     z = np.maximum(cam[:, 2], 1e-9)
@@ -254,7 +254,7 @@ def _depth_steps(
     cell: tuple[Ints, ...],
     settings: MotionSettings,
 ) -> Floats:
-    """Share of the depth by which frame k must see farther than points of frame a to see through them. (K, K).
+    """Return share of the depth by which frame k must see farther than points of frame a to see through them. (K, K).
 
     From the 0.4 quantile of the static part's own disagreement, which movers over half of the picture do not reach.
     """
@@ -288,7 +288,8 @@ def _found_again(used: _Samples, k: int, behind: Mask, reach: Floats) -> Mask:
 
 
 def _judge(again: Floats, through: Floats, visible: Floats, settings: MotionSettings) -> Floats:
-    """Quantile of the share seen through, over the half of an instance's pairs of frames that lie farther apart. (I,).
+    """Return the quantile of the share seen through, over the half of an instance's pairs of frames that lie farther
+    apart. (I,).
 
     Both frames of a pair show the instance; what moves slowly still hides behind itself from one frame to the next.
     """

@@ -51,7 +51,7 @@ class Pairs:
 
 
 def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
-    """The samples at the same pixel of the same frame, finite, with confidence, seen from posed cameras.
+    """Return the samples at the same pixel of the same frame, finite, with confidence, seen from posed cameras.
 
     Raises `DegenerateError` when there is none, naming what is missing.
     """
@@ -91,7 +91,7 @@ def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
 
 
 def shared_samples(u: FrameSamples, v: FrameSamples) -> tuple[Ints, Ints]:
-    """Positions in u and v of the samples at the same pixel of the same frame, by frame and pixel."""
+    """Return positions in u and v of the samples at the same pixel of the same frame, by frame and pixel."""
     key_u = (u.frame.astype(np.int64) << np.int64(32)) + u.pixel
     key_v = (v.frame.astype(np.int64) << np.int64(32)) + v.pixel
     _, pick_u, pick_v = np.intersect1d(key_u, key_v, assume_unique=True, return_indices=True)
@@ -99,12 +99,12 @@ def shared_samples(u: FrameSamples, v: FrameSamples) -> tuple[Ints, Ints]:
 
 
 def moved(T: Floats, points: Floats) -> Floats:
-    """Each point by its own transform. Shapes (N, 3, 4), (N, 3) -> (N, 3)."""
+    """Move each point by its own transform. Shapes (N, 3, 4), (N, 3) -> (N, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", T[:, :, :3], points) + T[:, :, 3])
 
 
 def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
-    """Row of each frame's camera, -1 where it has none that is finite."""
+    """Return the row of each frame's camera, -1 where it has none that is finite."""
     if not len(samples.camera_frames):
         return np.full(len(frame), -1, np.int64)
     order = np.argsort(samples.camera_frames, kind="stable")
@@ -114,6 +114,6 @@ def _camera_rows(samples: FrameSamples, frame: Ints) -> Ints:
 
 
 def _cameras(samples: FrameSamples, row: Ints) -> Floats:
-    """From the chunk to the cameras of rows. Shape (N, 3, 4)."""
+    """Return the transforms from the chunk to the cameras of rows. Shape (N, 3, 4)."""
     used, which = np.unique(row, return_inverse=True)
     return np.asarray(np.linalg.inv(samples.T_chunk_cam[used])[which.ravel(), :3], np.float64)

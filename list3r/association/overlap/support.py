@@ -133,13 +133,13 @@ class StaticSupport:
 
 
 def confident(pairs: Pairs, settings: SupportSettings) -> Mask:
-    """Pairs that confidence alone would take. Shape (N,)."""
+    """Return pairs that confidence alone would take. Shape (N,)."""
     least = settings.confidence_share * min(np.median(pairs.confidence_u), np.median(pairs.confidence_v))
     return np.asarray((pairs.confidence_u > least) & (pairs.confidence_v > least))
 
 
 def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: SupportSettings) -> Regions:
-    """Regions by one chunk's instances, and by blocks of the picture where there is none."""
+    """Return regions by one chunk's instances, and by blocks of the picture where there is none."""
     columns, rows = settings.blocks
     block = (pairs.pixel % camera.width) * columns // camera.width
     block = block + columns * ((pairs.pixel // camera.width) * rows // camera.height)
@@ -245,7 +245,7 @@ def inconsistency(
 
 
 def relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:
-    """Points of u against those of v in the camera of their frame, each by its own chunk's pose. Shape (N, 3)."""
+    """Return points of u against those of v in camera of their frame, each by its own chunk's pose. Shape (N, 3)."""
     cam_u = moved(pairs.T_cam_u, pairs.p_u)
     ratio = np.log(np.maximum(pairs.cam_v[:, 2], 1e-9) / np.maximum(cam_u[:, 2], 1e-9))
     frames, which = np.unique(pairs.frame, return_inverse=True)
@@ -263,8 +263,8 @@ def relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:
 def _best_hypothesis(
     pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: SupportSettings
 ) -> tuple[Sim3, Mask]:
-    """The similarity that most regions agree with (of all pairs, of what has no instance, and of each large region),
-    and the pairs of the regions that do not.
+    """Return the similarity that most regions agree with (of all pairs, of what has no instance, and of each large
+    region), and the pairs of the regions that do not.
 
     A region counts by the square root of its pairs, so that one thing, however large, is outvoted by a few others, and
     by its extent in space, because what bounds a room is wide.
@@ -297,7 +297,7 @@ def _best_hypothesis(
 
 
 def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mask) -> tuple[Floats, Ints, Floats]:
-    """Median displacement of each region in each frame, its region, and its number of pairs."""
+    """Return the median displacement of each region in each frame, its region, and its number of pairs."""
     pick = np.flatnonzero(sure)
     _, place = np.unique(frame[pick], return_inverse=True)
     key = regions.of_pair[pick] * (int(place.max()) + 1) + place.ravel()
@@ -311,7 +311,7 @@ def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mas
 def _limit(
     value: Floats, still: NDArray[np.signedinteger], judged: Mask, settings: SupportSettings, least: float
 ) -> float:
-    """What a static region is off by at most, from those that were not removed."""
+    """Return what a static region is off by at most, from those that were not removed."""
     vote = np.asarray(np.sqrt(still) * judged, np.float64)
     if not vote.any():
         return float("inf")
@@ -325,7 +325,7 @@ def _ids(regions: Regions, found: Inconsistency, excess: float) -> frozenset[int
 
 
 def _pixels(cam: Floats, camera: Camera) -> Floats:
-    """Pinhole projection, px; a point behind the camera projects far outside. Shape (N, 3) -> (N, 2)."""
+    """Return the pinhole projection, px; a point behind the camera projects far outside. Shape (N, 3) -> (N, 2)."""
     depth = np.maximum(cam[:, 2:], 1e-6)
     return np.asarray(cam[:, :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
 
@@ -342,7 +342,7 @@ def _extent(points: Floats) -> float:
 
 
 def median(values: Floats) -> float:
-    """The median, NaN of nothing."""
+    """Return the median, NaN of nothing."""
     return float(np.median(values)) if len(values) else float("nan")
 
 

@@ -47,7 +47,7 @@ class Prediction:
     """Of x in S_true = S_v_u exp(x), u's units. Shape (7, 7)."""
 
     def deviations(self, S_v_u: Sim3) -> float:
-        """How many standard deviations away a measured relation is (Mahalanobis distance)."""
+        """Return how many standard deviations away a measured relation is (Mahalanobis distance)."""
         off = (self.S_v_u.inverse() @ S_v_u).log()
         return float(np.sqrt(max(float(off @ np.linalg.solve(self.covariance, off)), 0.0)))
 
@@ -63,7 +63,7 @@ class Ways:
             self._near.setdefault(edge.v, []).append((edge.u, edge))
 
     def tied_to(self, chunk_id: int) -> set[int]:
-        """The chunks that some way leads to, and the chunk itself."""
+        """Return the chunks that some way leads to, and the chunk itself."""
         out, queue = {chunk_id}, [chunk_id]
         while queue:
             fresh = {k for k, _ in self._near.get(queue.pop(), [])} - out
@@ -72,7 +72,7 @@ class Ways:
         return out
 
     def predict(self, u: int, v: int, more: Sequence[Edge] = ()) -> Prediction | None:
-        """The relation of two chunks along the surest path, `more` edges among them; None where there is no path."""
+        """Return relation of two chunks along the surest path, `more` edges among them; None where there is no path."""
         near = self._near
         if more:
             near = dict(near)
@@ -83,7 +83,7 @@ class Ways:
 
 
 def predict(edges: Iterable[Edge], u: int, v: int, settings: ChainSettings) -> Prediction | None:
-    """The relation of two chunks along the surest path of accepted edges; None where there is no path."""
+    """Return the relation of two chunks along the surest path of accepted edges; None where there is no path."""
     return Ways(edges, settings).predict(u, v)
 
 
@@ -107,7 +107,7 @@ def _along(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings:
 
 
 def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings: ChainSettings) -> list[Edge] | None:
-    """The path with the least sum of 1 / confidence (Dijkstra)."""
+    """Return the path with the least sum of 1 / confidence (Dijkstra)."""
     queue: list[tuple[float, int, int]] = [(0.0, u, u)]
     done: dict[int, int] = {}
     by: dict[tuple[int, int], Edge] = {}
@@ -134,7 +134,7 @@ def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings: 
 
 
 def _step(edge: Edge, here: int, settings: ChainSettings) -> tuple[Sim3, Array]:
-    """The similarity across an edge from the chunk `here`, and its covariance with the bending of one chunk."""
+    """Return the similarity across an edge from the chunk `here`, and its covariance with the bending of one chunk."""
     spread_v = edge.scores.get("spread", 1.0)
     spread_u = spread_v / float(edge.S_v_u.scale)
     forth = here == edge.u

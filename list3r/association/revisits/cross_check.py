@@ -76,7 +76,7 @@ class CrossCheck:
     """How many instances landed on others."""
 
     def contradiction(self, settings: CrossSettings) -> str | None:
-        """Why the relation cannot be true, or None."""
+        """Return why the relation cannot be true, or None."""
         if self.overlap < settings.least_overlap:
             return f"the chunks share no surface through it ({self.overlap:.0%} of their points)"
         if self.agreement < settings.least_agreement:
@@ -110,7 +110,7 @@ def cross_check(
 def shared_view(
     S_v_u: Sim3, u: Side, v: Side, frames: tuple[Ints, Ints], settings: CrossSettings | None = None
 ) -> float:
-    """Largest share of surface that a frame of u and a frame of v both see through a relation, in [0, 1].
+    """Return the largest share of surface that a frame of u and a frame of v both see through a relation, in [0, 1].
 
     Of the two shares of a pair of frames the smaller one counts. `frames` are those of u and of v that are compared.
     """
@@ -122,7 +122,7 @@ def shared_view(
 
 
 def _only(side: Side, frames: Ints) -> Side:
-    """Ten of the given frames of a side, or fewer."""
+    """Return ten of the given frames of a side, or fewer."""
     kept = frames[np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 10)).astype(np.int64))]
     s = side.samples
     rows, cameras = np.isin(s.frame, kept), np.isin(s.camera_frames, kept)
@@ -140,7 +140,7 @@ def _only(side: Side, frames: Ints) -> Side:
 
 
 def _seen(S: Sim3, source: Side, target: Side, settings: CrossSettings) -> Array:
-    """Share of each source frame's points that lie on what each target frame sees. Shape (Gs, Gt)."""
+    """Return the share of each source frame's points that lie on what each target frame sees. Shape (Gs, Gt)."""
     points, frame, _ = _points(source, settings)
     grids = _grids(target, settings)
     names = source.samples.camera_frames
@@ -189,7 +189,8 @@ class _Grids:
 
 
 def _look(S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: Ints, settings: CrossSettings) -> _Look:
-    """Points of the source, moved by S, in the frames of the target; pairs of frames that are both skipped are not."""
+    """Return points of the source, moved by S, in the frames of the target; pairs of frames that are both skipped are
+    not."""
     points, frame, instance = _points(source, settings)
     grids = _grids(target, settings)
     if not len(points) or not len(grids.frames):
@@ -217,7 +218,7 @@ def _usable(side: Side, settings: CrossSettings) -> Mask:
 
 
 def _points(side: Side, settings: CrossSettings) -> tuple[Array, Ints, Ints]:
-    """Points spread evenly over the samples, their frames and instances."""
+    """Return points spread evenly over the samples, their frames and instances."""
     rows = np.flatnonzero(_usable(side, settings))
     if len(rows) > settings.points:
         rows = rows[np.linspace(0, len(rows) - 1, settings.points).astype(np.int64)]
@@ -248,7 +249,7 @@ def _grids(side: Side, settings: CrossSettings) -> _Grids:
 
 
 def _spread(depth: Array, take: np.ufunc) -> Array:
-    """The least or greatest of each cell and its eight neighbours. Shape (G, R, C)."""
+    """Return the least or greatest of each cell and its eight neighbours. Shape (G, R, C)."""
     edge = np.inf if take is np.minimum else -np.inf
     padded = np.pad(depth, ((0, 0), (1, 1), (1, 1)), constant_values=edge)
     r, c = depth.shape[1:]
@@ -260,7 +261,7 @@ def _spread(depth: Array, take: np.ufunc) -> Array:
 
 
 def _verdicts(points: Array, grids: _Grids, camera: Camera, settings: CrossSettings) -> tuple[Mask, Mask, Ints]:
-    """For each point and frame: on a surface, in space seen to be empty, and the instance there. Shapes (N, G).
+    """Return for each point and frame: on a surface, in space seen to be empty, and the instance there. Shapes (N, G).
 
     A point is compared with the nearest and the farthest of the samples round it, so that edges between samples are no
     contradiction.
@@ -281,7 +282,7 @@ def _verdicts(points: Array, grids: _Grids, camera: Camera, settings: CrossSetti
 
 
 def _kinds(u: InstanceSet, v: InstanceSet, landed: Ints, settings: CrossSettings) -> tuple[float, int]:
-    """Mean rank, among all of the other chunk, of the feature of the instance that each instance lands on."""
+    """Return mean rank, among all of the other chunk, of the feature of the instance that each instance lands on."""
     if u.space != v.space or len(u.local_id) < 2 or len(v.local_id) < 2 or u.feature.shape[1] != v.feature.shape[1]:
         return float("nan"), 0
     known = np.isin(landed[:, 0], u.local_id) & np.isin(landed[:, 1], v.local_id)

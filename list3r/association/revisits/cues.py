@@ -81,7 +81,7 @@ NO_CUES = InstanceCues(0.0, 0.0, (), float("nan"))
 def instance_set(
     nodes: Sequence[LocalNode], T_chunk_cam: NDArray[np.float64], space: str, settings: CueSettings
 ) -> InstanceSet:
-    """The instances of a chunk from its local nodes and the poses (G, 4, 4) of its cameras.
+    """Return the instances of a chunk from its local nodes and the poses (G, 4, 4) of its cameras.
 
     Structure, what moves, and what has no finite feature or no support is left out.
     """
@@ -108,7 +108,7 @@ def _sound(node: LocalNode) -> bool:
 
 
 def compare_instances(u: InstanceSet, v: InstanceSet, settings: CueSettings | None = None) -> InstanceCues:
-    """How the instances of two chunks agree. Features of two spaces cannot be compared and give no cues."""
+    """Tell how the instances of two chunks agree. Features of two spaces cannot be compared and give no cues."""
     chosen = settings or CueSettings()
     if u.space != v.space or not len(u.local_id) or not len(v.local_id) or u.feature.shape[1] != v.feature.shape[1]:
         return NO_CUES
@@ -122,19 +122,19 @@ def compare_instances(u: InstanceSet, v: InstanceSet, settings: CueSettings | No
 
 
 def loop_score(s_det: float, cues: InstanceCues, weight: float) -> float:
-    """s_loop of the paper, (0 to 2): weight * s_det + (1 - weight) * (s_sem + s_rel)."""
+    """Return s_loop of the paper, (0 to 2): weight * s_det + (1 - weight) * (s_sem + s_rel)."""
     return weight * s_det + (1.0 - weight) * (cues.s_sem + cues.s_rel)
 
 
 def _mutual(cosine: Array, settings: CueSettings) -> Ints:
-    """Mutual nearest neighbours. Shape (P, 2)."""
+    """Return the mutual nearest neighbours. Shape (P, 2)."""
     forth, back = cosine.argmax(axis=1), cosine.argmax(axis=0)
     rows = np.flatnonzero((back[forth] == np.arange(len(cosine))) & (cosine.max(axis=1) >= settings.least_cosine))
     return np.stack([rows, forth[rows]], axis=1)
 
 
 def _candidates(cosine: Array, settings: CueSettings) -> Ints:
-    """Pairs of instances that may be one thing: near the best of either side. Shape (M, 2)."""
+    """Return pairs of instances that may be one thing: near the best of either side. Shape (M, 2)."""
     out = np.zeros(cosine.shape, bool)
     for axis in (0, 1):
         best = cosine.max(axis=axis, keepdims=True)
@@ -144,7 +144,7 @@ def _candidates(cosine: Array, settings: CueSettings) -> Ints:
 
 
 def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings) -> tuple[Ints, float, float]:
-    """The largest set of candidate pairs (P, 2) whose distances agree up to one scale, its score and the log scale."""
+    """Return largest set of candidate pairs (P, 2) whose distances agree up to one scale, its score and log scale."""
     pairs = _candidates(cosine, settings)
     none = np.zeros((0, 2), np.int64), 0.0, float("nan")
     if len(pairs) < 3:
@@ -172,7 +172,8 @@ def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings
 
 
 def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> tuple[Array, Array]:
-    """Log ratios of distances for each pair of pairs, NaN where they share an instance, and their scatter. (M, M)."""
+    """Return the log ratios of distances for each pair of pairs, NaN where they share an instance, and their scatter.
+    (M, M)."""
     i, j = pairs.T
     d_u = np.linalg.norm(u.center[i][:, None] - u.center[i][None], axis=-1)
     d_v = np.linalg.norm(v.center[j][:, None] - v.center[j][None], axis=-1)
@@ -185,7 +186,7 @@ def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettin
 
 
 def _scales(ratio: Array, sigma: Array, most: int = 4) -> list[float]:
-    """The likeliest common log ratios: modes of a smooth histogram."""
+    """Return the likeliest common log ratios: modes of a smooth histogram."""
     upper = np.triu_indices(len(ratio), 1)
     values, widths = ratio[upper], sigma[upper]
     known = np.isfinite(values)
@@ -200,7 +201,7 @@ def _scales(ratio: Array, sigma: Array, most: int = 4) -> list[float]:
 
 
 def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]:
-    """A large set of pairs each of which agrees with every other, grown from the best connected pairs of pairs."""
+    """Return a large set of pairs each of which agrees with every other, grown from best connected pairs of pairs."""
     linked = np.where(agree >= settings.consistent, agree, 0.0)
     strength = (linked @ linked) * (linked > 0) * (cosine[:, None] + cosine[None])
     starts = np.argsort(-np.triu(strength, 1), axis=None, kind="stable")[:12]

@@ -26,7 +26,7 @@ class DescriptorScale:
     """Cosine from which frame similarity alone is believed: VGGT-Long's threshold of 0.85."""
 
     def score(self, cosine: float) -> float:
-        """s_det in [0, 1]: the cosine on the scale of trained place recognition, 0.5 relaxed and 0.85 strict."""
+        """Return s_det in [0, 1]: the cosine on the scale of trained place recognition, 0.5 relaxed and 0.85 strict."""
         at = (-1.0, self.relaxed, self.strict, 1.0)
         return float(np.interp(cosine, at, (0.0, 0.5, 0.85, 1.0)))
 
@@ -102,7 +102,7 @@ class FrameIndex:
         self.index.add(np.ascontiguousarray(descriptors))
 
     def search(self, descriptors: Floats, allowed: NDArray[np.bool_], k: int) -> tuple[Ints, Floats]:
-        """Rows and cosines of the k nearest allowed ones of each descriptor, -1 where there are fewer. (Q, k)."""
+        """Return rows and cosines of k nearest allowed ones of each descriptor, -1 where there are fewer. (Q, k)."""
         bitmap = np.packbits(allowed, bitorder="little")
         selector = self._faiss.IDSelectorBitmap(len(allowed), self._faiss.swig_ptr(bitmap))
         parameters: Any = self._faiss.SearchParameters(sel=selector)  # type: ignore[call-arg]
@@ -125,7 +125,7 @@ class FrameIndices:
 
 
 def find_candidates(store: DescriptorStore, chunk_id: int, settings: SearchSettings | None = None) -> list[Candidate]:
-    """Stored frames that look like frames of a chunk, best first; of chunks that came before it only."""
+    """Find stored frames that look like frames of a chunk, best first; of chunks that came before it only."""
     chosen = settings or SearchSettings()
     rows = {c.chunk_id: c for c in store.chunks()}
     own_keys, own = _descriptors(store, [chunk_id])
@@ -151,7 +151,8 @@ def find_candidates(store: DescriptorStore, chunk_id: int, settings: SearchSetti
 def choose(
     frame_v: Ints, stored: Ints, cosine: Floats, scale: DescriptorScale, settings: SearchSettings
 ) -> list[Candidate]:
-    """Mutual nearest neighbours between pairs of chunks, thinned out in time, with a quota for each pair of chunks.
+    """Return the mutual nearest neighbours between pairs of chunks, thinned out in time, with a quota for each pair of
+    chunks.
 
     `frame_v` (P,) is Frame.index in the new chunk, `stored` (P, 2) chunk id and Frame.index, `cosine` (P,).
     """
@@ -186,7 +187,7 @@ def _is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bo
 
 
 def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> FrameIndices:
-    """The index with all of the given chunks in it, read anew where a chunk is no longer the one that was read."""
+    """Return index with all of the given chunks in it, read anew where a chunk is no longer the one that was read."""
     wanted = set(chunk_ids)
     checksums = {k: c for k, c in store.chunk_checksums().items() if k in wanted}
     known = store.derived.of(FrameIndices)
@@ -202,7 +203,7 @@ def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> FrameIndices:
 
 
 def _descriptors(store: DescriptorStore, chunk_ids: Sequence[int]) -> tuple[Ints, Floats]:
-    """Keys and unit descriptors of some chunks; what is not finite becomes zero and resembles nothing."""
+    """Return keys and unit descriptors of some chunks; what is not finite becomes zero and resembles nothing."""
     keys, descriptors = store.keyframe_descriptors(chunk_ids)
     if not len(keys):
         return keys, np.zeros((0, 0), np.float32)

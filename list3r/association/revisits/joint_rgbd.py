@@ -81,7 +81,7 @@ class RgbdJointReconstructor:
 
 
 def _part(made: Reconstruction, which: slice) -> Reconstruction:
-    """Some of the frames."""
+    """Return some of the frames."""
     return replace(
         made,
         frame_indices=made.frame_indices[which],

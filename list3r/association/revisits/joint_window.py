@@ -83,7 +83,7 @@ def joint_edge(
     objection: Objection | None = None,
     settings: WindowSettings | None = None,
 ) -> Edge:
-    """The loop edge from u to v through a joint window, accepted or rejected with the reason.
+    """Return the loop edge from u to v through a joint window, accepted or rejected with the reason.
 
     Without `objection` every edge that can be measured is accepted (the paper's baseline, VGGT-Long). With it a first
     estimate is put to the test, and only what stands is measured with care.
@@ -129,7 +129,7 @@ class _Verdict:
         self.seen = ""
 
     def of(self, S_v_u: Sim3) -> str | None:
-        """Why it cannot be, or None."""
+        """Return why it cannot be, or None."""
         if self._objection is not None and (against := self._objection(S_v_u)):
             return against
         shared = shared_view(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
@@ -145,7 +145,7 @@ class _Verdict:
 
 
 def window_frames(place: Place, settings: WindowSettings) -> Ints:
-    """The posed frames of a place's chunk round its frame, ascending (Frame.index)."""
+    """Return the posed frames of a place's chunk round its frame, ascending (Frame.index)."""
     posed = place.side.samples.camera_frames
     middle = int(np.argmin(np.abs(posed - place.frame))) if len(posed) else 0
     span = settings.frames * settings.step
@@ -154,7 +154,7 @@ def window_frames(place: Place, settings: WindowSettings) -> Ints:
 
 
 def no_edge(u: tuple[int, int], v: tuple[int, int], reason: str) -> Edge:
-    """An edge that is kept only for the record; `u` and `v` are chunk id and Frame.index."""
+    """Return an edge that is kept only for the record; `u` and `v` are chunk id and Frame.index."""
     return Edge(
         u=u[0],
         v=v[0],
@@ -171,7 +171,7 @@ def no_edge(u: tuple[int, int], v: tuple[int, int], reason: str) -> Edge:
 
 
 def _rough(a: FrameSamples, b: FrameSamples, settings: WindowSettings) -> Sim3:
-    """A first estimate of the similarity from a to b, by some of the samples that they share."""
+    """Return a first estimate of the similarity from a to b, by some of the samples that they share."""
     at_a, at_b = shared_samples(a, b)
     pick = np.linspace(0, len(at_a) - 1, min(len(at_a), settings.rough_pairs)).astype(np.int64)
     at_a, at_b = at_a[pick], at_b[pick]
@@ -180,14 +180,14 @@ def _rough(a: FrameSamples, b: FrameSamples, settings: WindowSettings) -> Sim3:
 
 
 def _half(a: FrameSamples, b: FrameSamples, place: Place, window: JointWindow, settings: EdgeSettings) -> Edge:
-    """The edge between a chunk and its side of the window."""
+    """Return the edge between a chunk and its side of the window."""
     metric = place.metric and window.scale_kind == "metric"
     ends = EdgeEnd(place.chunk_id, a), EdgeEnd(place.chunk_id, b)
     return measure_edge(*ends, place.side.camera, metric, settings, kind="loop").edge
 
 
 def _composed(u: Place, v: Place, to_window: Edge, to_v: Edge) -> Edge:
-    """u -> window -> v. The weaker half decides the confidence."""
+    """Compose u -> window -> v. The weaker half decides the confidence."""
     halves = (to_window, to_v)
     confidence = min(e.confidence for e in halves)
     scale = float(to_v.S_v_u.scale)
@@ -213,7 +213,7 @@ def _composed(u: Place, v: Place, to_window: Edge, to_v: Edge) -> Edge:
 
 
 def composed_covariance(first: Edge, second: Edge) -> Array | None:
-    """Covariance of S_second S_first: second exp(x) first exp(y) = second first exp(Ad(first^-1) x) exp(y)."""
+    """Return covariance of S_second S_first: second exp(x) first exp(y) = second first exp(Ad(first^-1) x) exp(y)."""
     if first.covariance is None or second.covariance is None:
         return None
     moved = adjoint(first.S_v_u.inverse())

@@ -35,8 +35,8 @@ class KeyframeErrorSettings:
 def registration_covariance(
     found: FrameRegistration, T_chunk_cam: Array, depth: float, settings: KeyframeErrorSettings
 ) -> Array:
-    """Covariance of a rigid S_v_u through a registration of v's view to u's keyframe at `T_chunk_cam` (4, 4), whose
-    middle depth is `depth`: of x in S_true = S_v_u exp(x), u's units, sigma 0. Shape (7, 7).
+    """Return the covariance of a rigid S_v_u through a registration of v's view to u's keyframe at `T_chunk_cam` (4,
+    4), whose middle depth is `depth`: of x in S_true = S_v_u exp(x), u's units, sigma 0. Shape (7, 7).
 
     S_v_u = T_v T_u_v^-1 T_u^-1, so a left-hand error d of T_u_v is x = -Ad(T_u) d.
     """
@@ -51,8 +51,8 @@ def registration_covariance(
 
 
 def with_scale(covariance: Array, center: Array, deviation: float, unit: float) -> Array:
-    """A covariance stated in `unit`s of u (u's coordinates times `unit`), brought to u's own, with an error of the
-    scale about `center` (3,), u's coordinates: surfaces meet there whatever the scale. Shape (7, 7)."""
+    """Return a covariance stated in `unit`s of u (u's coordinates times `unit`), brought to u's own, with an error of
+    the scale about `center` (3,), u's coordinates: surfaces meet there whatever the scale. Shape (7, 7)."""
     back = np.diag([1.0 / unit] * 3 + [1.0] * 4)
     along = about(center[None])[0][:, 6] * deviation
     return np.asarray(back @ covariance @ back + np.outer(along, along))

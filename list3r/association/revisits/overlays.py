@@ -42,7 +42,7 @@ def write_loop(
 
 
 def draw_loop(edge: Edge, u: tuple[FrameSamples, Keyframe, Camera], v: tuple[FrameSamples, Keyframe, Camera]) -> Image:
-    """Both ends of a loop edge with the points of each that the other one sees. RGB, shape (h, w, 3)."""
+    """Return the both ends of a loop edge with the points of each that the other one sees. RGB, shape (h, w, 3)."""
     halves, said = [], []
     for (mine, keyframe, camera), (other, far, _), S_other_mine in (
         (u, v, edge.S_v_u),
@@ -71,7 +71,7 @@ def draw_loop(edge: Edge, u: tuple[FrameSamples, Keyframe, Camera], v: tuple[Fra
 def compare(
     mine: FrameSamples, frame: int, other: FrameSamples, far: int, S_mine_other: Sim3, camera: Camera
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Samples of a frame that points of the other chunk land near: their pixels, and whether depth agrees. (N,)."""
+    """Return samples of a frame that points of other chunk land near: their pixels, and whether depth agrees. (N,)."""
     none = np.zeros(0, np.int64), np.zeros(0, bool)
     at = int(np.searchsorted(mine.camera_frames, frame))
     if at == len(mine.camera_frames) or mine.camera_frames[at] != frame:
@@ -96,7 +96,7 @@ def compare(
 
 
 def _picture(keyframe: Keyframe, camera: Camera) -> tuple[Image, int]:
-    """The keyframe's picture, at least 320 px wide, and its magnification."""
+    """Return the keyframe's picture, at least 320 px wide, and its magnification."""
     color = None
     if keyframe.jpeg:
         color = decode_picture(keyframe.jpeg)

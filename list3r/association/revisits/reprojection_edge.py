@@ -53,7 +53,7 @@ def refine_loop(
     camera_v: Camera,
     settings: ReprojectionSettings | None = None,
 ) -> Edge:
-    """The accepted edge of two keyframes' chunks, refined; unchanged where too few features have depth."""
+    """Return the accepted edge of two keyframes' chunks, refined; unchanged where too few features have depth."""
     s = settings or ReprojectionSettings()
     rows = match(u.keypoint_descriptors, v.keypoint_descriptors, s.ratio)
     a, b = (k.points_cam[rows[:, n]].astype(np.float64) for n, k in enumerate((u, v)))
@@ -82,7 +82,7 @@ def refine_loop(
 
 
 def _refined(start: Sim3, pairs: _Pairs, unit: Array, s: ReprojectionSettings) -> tuple[Sim3, Array]:
-    """The camera of v from that of u, and the Jacobian of its weighted residuals."""
+    """Return the camera of v from that of u, and the Jacobian of its weighted residuals."""
 
     def residual(x: Array) -> Array:
         return pairs.off(start @ Sim3.exp(x * unit), s).ravel()
@@ -92,7 +92,7 @@ def _refined(start: Sim3, pairs: _Pairs, unit: Array, s: ReprojectionSettings) -
 
 
 def _covariance(jacobian: Array, unit: Array, s: ReprojectionSettings) -> Array:
-    """Of the tangent in u's camera, u's units."""
+    """Return the covariance of the tangent in u's camera, u's units."""
     floor = np.array([s.least_shift] * 3 + [s.least_turn_rad] * 3 + [s.least_scale]) ** 2
     information = jacobian.T @ jacobian / s.correlated + 1e-9 * np.eye(7)
     return np.asarray((np.linalg.inv(information) + np.diag(floor)) * unit[:, None] * unit)
@@ -128,7 +128,7 @@ class _Pairs:
         return _Pairs(self.a[kept], self.b[kept], self.xy_a[kept], self.xy_b[kept], self.camera_a, self.camera_b)
 
     def off(self, S_b_a: Sim3, s: ReprojectionSettings) -> Array:
-        """Residuals in deviations: of the picture of v, of that of u, and of the ratio of depths. Shape (N, 5)."""
+        """Return residuals in deviations: of picture of v, of that of u, and of the ratio of depths. Shape (N, 5)."""
         forth, back = S_b_a.apply(self.a), S_b_a.inverse().apply(self.b)
         ratio = np.log(np.maximum(forth[:, 2], 1e-6) / np.maximum(self.b[:, 2], 1e-6))
         return np.concatenate(

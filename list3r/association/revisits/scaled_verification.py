@@ -28,7 +28,7 @@ _TRIALS = 600
 def verify_scaled(
     keyframe_u: Keyframe, keyframe_v: Keyframe, u_id: int, v_id: int, settings: VerificationSettings | None = None
 ) -> Edge:
-    """The loop edge between two chunks of unknown scale, accepted or rejected with the reason."""
+    """Return the loop edge between two chunks of unknown scale, accepted or rejected with the reason."""
     chosen = settings or VerificationSettings()
     pairs = match(keyframe_u.keypoint_descriptors, keyframe_v.keypoint_descriptors, chosen.features.ratio)
     a = keyframe_u.points_cam[pairs[:, 0]].astype(np.float64)
@@ -68,7 +68,8 @@ def _scaled(keyframe: Keyframe, factor: float) -> Keyframe:
 
 
 def _common_scale(a: Array, b: Array, settings: VerificationSettings) -> float | None:
-    """The factor on b's units at which most pairs agree on one similarity, by seeded RANSAC; None when too few do."""
+    """Return the factor on b's units at which most pairs agree on one similarity, by seeded RANSAC; None when too few
+    do."""
     least = settings.features.least_pairs
     if len(a) < least:
         return None

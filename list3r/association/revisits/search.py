@@ -108,7 +108,7 @@ def find_loops(
     joint: JointReconstructor | None = None,
     settings: RevisitSettings | None = None,
 ) -> list[Edge]:
-    """Loop edges, accepted or rejected, between a chunk and those stored before it.
+    """Find the loop edges, accepted or rejected, between a chunk and those stored before it.
 
     `joint` reconstructs frames of both places together; without one, chunks are compared by their keyframes alone.
     """
@@ -137,7 +137,7 @@ def find_loops(
 
 
 def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSettings) -> list[_Scored]:
-    """Candidates in order of s_loop, the best one of every pair of chunks before any second one."""
+    """Return candidates in order of s_loop, the best one of every pair of chunks before any second one."""
     out = []
     for candidate in candidates:
         cues = look.cues(candidate.u) if settings.instance_cues else NO_CUES
@@ -165,7 +165,7 @@ def _with_scores(edge: Edge, scored: _Scored) -> Edge:
 
 
 def _objected(edge: Edge, objection: Objection) -> Edge:
-    """An edge, rejected where there is an objection."""
+    """Return an edge, rejected where there is an objection."""
     against = objection(edge.S_v_u) if edge.accepted else None
     if against is None:
         return edge
@@ -173,7 +173,7 @@ def _objected(edge: Edge, objection: Objection) -> Edge:
 
 
 def _tells(keyframe: Keyframe) -> bool:
-    """Whether a keyframe has local features and depth."""
+    """Tell whether a keyframe has local features and depth."""
     return bool(keyframe.depth_small.size) and len(keyframe.keypoints_xy) > 0
 
 
@@ -191,14 +191,15 @@ class _Lookout:
         self._tied = self._ways.tied_to(chunk_id)
 
     def cues(self, u: int) -> InstanceCues:
-        """How the instances of a stored chunk agree with those of the new one."""
+        """Tell how the instances of a stored chunk agree with those of the new one."""
         if u not in self._cues:
             here, there = self._side(self._id).instances, self._side(u).instances
             self._cues[u] = compare_instances(there, here, self._settings.cues)
         return self._cues[u]
 
     def unlikely(self, scored: _Scored) -> bool:
-        """Whether a candidate is not worth a try: instances only rank those whose keyframes tell cheaply and surely."""
+        """Tell whether a candidate is not worth a try: instances only rank those whose keyframes tell cheaply and
+        surely."""
         if not self._settings.instance_cues:
             return True
         return scored.score < self._settings.least_score and not all(map(_tells, self._keyframes(scored.candidate)))
@@ -207,11 +208,11 @@ class _Lookout:
         return self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
 
     def refused(self, scored: _Scored, reason: str) -> Edge:
-        """An edge that is kept only for the record."""
+        """Return an edge that is kept only for the record."""
         return no_edge(self._id_of(scored), (self._id, scored.candidate.frame_v), reason)
 
     def verified(self, scored: _Scored, joint: JointReconstructor | None, found: Sequence[Edge]) -> Edge:
-        """The edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
+        """Return the edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
         c = scored.candidate
         u, v = self._rows[c.u], self._rows[self._id]
         way = None if self._apart(c.u) else self._ways.predict(c.u, self._id, found)
@@ -233,11 +234,11 @@ class _Lookout:
         return replace(edge, scores=edge.scores | off)
 
     def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
-        """Whether a chunk that nothing tied to the new one before hangs on a single pair of frames so far."""
+        """Tell whether a chunk that nothing tied to the new one before hangs on a single pair of frames so far."""
         return self._apart(u) and len(accepted) == 1
 
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
-        """The edges without those that join what was apart in more than one way.
+        """Return the edges without those that join what was apart in more than one way.
 
         Where no way leads from one chunk to the other nothing contradicts a false relation but another relation. Each
         is therefore found without regard to the others; those that agree speak for each other, and where the places
@@ -257,16 +258,16 @@ class _Lookout:
         return out
 
     def _agree(self, one: Edge, other: Edge) -> bool:
-        """Whether two relations of the new chunk can both be true; those to places apart from each other can."""
+        """Tell whether two relations of the new chunk can both be true; those to places apart from each other can."""
         way = self._ways.predict(other.u, self._id, [one])
         return way is None or way.deviations(other.S_v_u) <= self._settings.chain.most_deviations
 
     def _apart(self, u: int) -> bool:
-        """Whether nothing tied a chunk to the new one before."""
+        """Tell whether nothing tied a chunk to the new one before."""
         return u not in self._tied
 
     def _objection(self, cues: InstanceCues, way: Prediction | None, S_v_u: Sim3) -> str | None:
-        """What the way between the chunks and the layout of their instances say against a relation."""
+        """Return what the way between the chunks and the layout of their instances say against a relation."""
         if way is not None and (off := way.deviations(S_v_u)) > self._settings.chain.most_deviations:
             return f"the way between the chunks contradicts it by {off:.0f} deviations"
         if len(cues.pairs) >= self._settings.layout_pairs and np.isfinite(cues.log_scale):

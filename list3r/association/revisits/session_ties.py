@@ -42,7 +42,7 @@ class TieSettings:
 def hold_back(
     edges: Sequence[Edge], session_of: Mapping[int, int], unit: float = 1.0, settings: TieSettings | None = None
 ) -> list[Edge]:
-    """The edges, those between sessions that do not suffice to join them held back, and released where they do now.
+    """Return edges, those between sessions that do not suffice to join them held back, and released where they do now.
 
     `session_of` gives the session of every chunk; `unit` is what a metre is in chunk units.
     """
@@ -75,7 +75,7 @@ class _Blocks:
         self.poses, self.block = poses, block
 
     def offset(self, e: Edge) -> Sim3:
-        """What takes u's block into v's, by this relation."""
+        """Return the similarity that takes u's block into v's by this relation."""
         return across(self.poses[e.v], e, e.v) @ self.poses[e.u].inverse()
 
     def join(self, e: Edge) -> None:
@@ -88,7 +88,7 @@ class _Blocks:
 
 
 def _by_block(ties: Sequence[int], edges: Sequence[Edge], blocks: _Blocks) -> dict[tuple[int, int], list[int]]:
-    """The ties of each two blocks that are not one yet, in order."""
+    """Return the ties of each two blocks that are not one yet, in order."""
     out: dict[tuple[int, int], list[int]] = {}
     for k in ties:
         a, b = sorted((blocks.block[edges[k].u], blocks.block[edges[k].v]))
@@ -102,13 +102,13 @@ def _suffices(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSetting
 
 
 def _best(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -> Edge:
-    """The relation that most others agree with."""
+    """Return the relation that most others agree with."""
     votes = _agreeing(found, blocks, unit, s)
     return max(zip(votes, found, strict=True), key=lambda v: (v[0], v[1].confidence, -v[1].u, -v[1].v))[1]
 
 
 def _agreeing(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -> list[int]:
-    """With how many relations of other pairs of chunks each one agrees, itself counted."""
+    """Return with how many relations of other pairs of chunks each one agrees, itself counted."""
     return [1 + len({(f.u, f.v) for f in found if _agree(e, f, blocks, unit, s)} - {(e.u, e.v)}) for e in found]
 
 

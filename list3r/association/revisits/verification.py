@@ -85,7 +85,7 @@ def verify(
     metric: bool = True,
     settings: VerificationSettings | None = None,
 ) -> Edge:
-    """The loop edge between two chunks by one keyframe of each, accepted or rejected with the reason."""
+    """Return the loop edge between two chunks by one keyframe of each, accepted or rejected with the reason."""
     chosen = settings or VerificationSettings()
     build = _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id)
     if not metric:
@@ -110,7 +110,7 @@ def verify(
 
 
 def rejected(keyframe_u: Keyframe, keyframe_v: Keyframe, u_id: int, v_id: int, reason: str) -> Edge:
-    """A loop edge between two chunks that is kept only for the record."""
+    """Return a loop edge between two chunks that is kept only for the record."""
     return _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id).rejected(reason)
 
 
@@ -131,7 +131,7 @@ def _refine(
     b: NDArray[np.float32],
     settings: VerificationSettings,
 ) -> FrameRegistration | None:
-    """T_u_v from depth and the features that agree, in the camera coordinates of u."""
+    """Return T_u_v from depth and the features that agree, in the camera coordinates of u."""
     T = pose.T_a_b
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     a, b = a[known], b[known]
@@ -193,7 +193,7 @@ class _EdgeBuilder:
         self.scores: dict[str, float] = {}
 
     def rejected(self, reason: str) -> Edge:
-        """An edge that is kept only for the record."""
+        """Return an edge that is kept only for the record."""
         return self._edge(Sim3.identity(), 0.0, 0, 0.0, False, reason)
 
     def judged(
