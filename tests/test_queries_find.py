@@ -88,14 +88,14 @@ def test_words_that_nothing_bears_are_named_with_those_that_things_bear(store: S
 
 
 def test_what_does_not_hold_is_said(store: Store) -> None:
-    assert find(store, "white table").notes == ("no one thing is all of 'white', 'table'",)
+    assert find(store, "white table").notes == ("no instance matches all of the words 'white', 'table'",)
     found = find(store, "mug on chair")
     assert found == [] and "on" in found.notes[0] and found.unknown_words == ()
 
 
 def test_ambiguous_answers_are_ranked_with_reasons(store: Store) -> None:
     found = find(store, "things on the table")
-    assert found.ambiguous and "2 things answer" in found.notes[-1]
+    assert found.ambiguous and "2 instances match" in found.notes[-1]
     assert all("on #2" in m.reason for m in found)
     assert [m.score for m in found] == sorted((m.score for m in found), reverse=True)
     assert found[0].best_view is not None and found[0].best_view.frame_index == 3

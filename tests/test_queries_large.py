@@ -142,7 +142,7 @@ def test_what_is_left_out_is_said(store: Store, large: pytest.MonkeyPatch) -> No
     large.setattr(gather, "EVERYTHING", 10)
     large.setattr("list3r.queries.relations._MOST_NAMED", 20)
     large.setattr("list3r.queries.nearest._LOADED", 20)
-    assert "more than 20 things are 'red'; 20 of them" in relations(store, subject="red").reason
+    assert "more than 20 instances match 'red'; 20 of them" in relations(store, subject="red").reason
     assert relations(store, subject=7).reason == ""
     found = nearest(store, words="red box")
     assert len(found) == 5 and "instances match 'red box'; 20 of them were considered" in found.notes[0]
@@ -163,4 +163,4 @@ def test_what_nothing_bears_is_said(store: Store, large: pytest.MonkeyPatch) -> 
     large.setattr(gather, "EVERYTHING", 10)
     assert nearest(store, words="red zebra", point=(4, 4, 1)).notes == ()
     for said in (nearest(store, words="zebra").notes[0], relations(store, subject="zebra").reason):
-        assert said.startswith("nothing in this memory bears the word 'zebra'; things here are called: ")
+        assert said.startswith("no instance has the word 'zebra' in its label or description; frequent names: ")

@@ -120,5 +120,5 @@ def test_weights_that_went_away_are_a_note(memory: Path, tmp_path: Path) -> None
     (folder / "model.safetensors").unlink()
     with Store.open(memory) as store:
         found = find(store, "zebra", encoder=stored_words(store))
-        assert not found and any("not compared" in note for note in found.notes)
+        assert not found and any("cannot be compared" in note for note in found.notes)
         assert nearest(store, words="zebra", encoder=stored_words(store)) == []

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from list3r.evaluation.revisits import Judgement
+    from list3r.evaluation.revisits import RevisitJudgement
 
 Array = NDArray[np.float64]
 
@@ -202,7 +202,9 @@ def _tag(axis: Axes, xy: Array, text: str, color: str) -> None:
     axis.text(float(xy[0]), float(xy[1]), text, color=color, fontsize=7, ha="center", va="center", path_effects=halo)
 
 
-def revisits_figure(frame: NDArray[np.int64], share: NDArray[np.float32], judged: Judgement, title: str) -> Figure:
+def revisits_figure(
+    frame: NDArray[np.int64], share: NDArray[np.float32], judged: RevisitJudgement, title: str
+) -> Figure:
     """Return covisibility of all pairs of frames in grey; above the diagonal the loop candidates by verdict and truth.
 
     `frame` (F,) and directed shares (F, F) as in `Covisibility`.

@@ -79,7 +79,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class RevisitJudgement:
     """Candidates of one video with what is true of them. Several videos are scored together."""
 
     candidates: Candidates
@@ -152,7 +152,7 @@ def judge(
     spans: Mapping[int, tuple[int, int]],
     neighbours: Collection[tuple[int, int]] | None = None,
     settings: RevisitTruthSettings | None = None,
-) -> Judgement:
+) -> RevisitJudgement:
     """Tell which candidates of a video are true.
 
     `spans` gives the first and last Frame.index of each chunk. `neighbours` are pairs of chunks that are no revisits
@@ -170,7 +170,7 @@ def judge(
     label[known[apart[rows[known], columns[known]]]] = FALSE
     pairs = [_ordered(u, v) for u, v in candidates.chunks.tolist()]
     by_chunk = [TRUE if p in true_pairs else FALSE if p in false_pairs else OPEN for p in pairs]
-    return Judgement(candidates, label, np.array(by_chunk, dtype=np.int8).reshape(-1), frozenset(true_pairs))
+    return RevisitJudgement(candidates, label, np.array(by_chunk, dtype=np.int8).reshape(-1), frozenset(true_pairs))
 
 
 def frame_labels(
@@ -182,7 +182,7 @@ def frame_labels(
     return np.minimum(s, s.T) >= chosen.least, np.maximum(s, s.T) < chosen.different
 
 
-def score(judgements: Sequence[Judgement], settings: RevisitTruthSettings | None = None) -> RevisitScores:
+def score(judgements: Sequence[RevisitJudgement], settings: RevisitTruthSettings | None = None) -> RevisitScores:
     """Score the candidates of one or several videos together."""
     chosen = settings or RevisitTruthSettings()
     names = sorted({name for j in judgements for name in j.candidates.scores})
@@ -251,7 +251,7 @@ def _cumulative(scores: ArrayLike, labels: ArrayLike) -> tuple[Array, Array, Arr
     return -levels, np.cumsum(right), np.cumsum(count)
 
 
-def _ranking(judgements: Sequence[Judgement], name: str, true_count: int, precision: float) -> Ranking:
+def _ranking(judgements: Sequence[RevisitJudgement], name: str, true_count: int, precision: float) -> Ranking:
     absent = [np.full(len(j.frame_labels), np.nan) for j in judgements]
     values = [j.candidates.scores.get(name, nan) for j, nan in zip(judgements, absent, strict=True)]
     pairs = [p for j, v in zip(judgements, values, strict=True) for p in _by_pair(j, v).values()]
@@ -267,7 +267,7 @@ def _ranking(judgements: Sequence[Judgement], name: str, true_count: int, precis
     )
 
 
-def _by_pair(judgement: Judgement, values: Array) -> dict[tuple[int, int], tuple[int, float]]:
+def _by_pair(judgement: RevisitJudgement, values: Array) -> dict[tuple[int, int], tuple[int, float]]:
     """(label, best value) of each pair of chunks that has a candidate."""
     out: dict[tuple[int, int], tuple[int, float]] = {}
     for (u, v), label, value in zip(
@@ -290,7 +290,7 @@ def _agreement(labels: NDArray[np.int8], true_count: int) -> Agreement:
     )
 
 
-def _wrong(judgement: Judgement) -> list[tuple[int, int, int, int]]:
+def _wrong(judgement: RevisitJudgement) -> list[tuple[int, int, int, int]]:
     """Return the accepted candidates between chunks that see different places throughout."""
     c = judgement.candidates
     bad = c.accepted & (judgement.chunk_labels == FALSE)

@@ -1,4 +1,4 @@
-"""The memory as the exporters read it: one component, one frame of reference at a time."""
+"""Read the memory for exporters: one connected component, one coordinate frame at a time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class Component:
-    """What shares one frame of reference. Two components were never placed against each other: do not overlay them."""
+    """What shares one coordinate frame. Two components were never placed against each other: do not overlay them."""
 
     id: int
     """The smallest chunk id of it."""
@@ -33,7 +33,7 @@ class Component:
 
 
 def read_components(store: Store) -> list[Component]:
-    """The components of a memory, the main one first; an empty memory has one empty component."""
+    """Return the components of a memory, the main one first; an empty memory has one empty component."""
     chunks = store.chunks()
     component_of = {c.chunk_id: c.component for c in chunks}
     poses = store.camera_poses()
@@ -55,7 +55,7 @@ def read_components(store: Store) -> list[Component]:
 
 
 def thinned_support(store: Store, instance: Instance, limit: int | None) -> Support:
-    """Surface points in the world, at most `limit` of them, finite; the same ones every time."""
+    """Return the surface points in the world, at most `limit` of them, finite; the same ones every time."""
     support = store.support(instance.id)
     keep = np.flatnonzero(np.isfinite(support.points).all(axis=1))
     if limit is not None and len(keep) > limit:
@@ -66,7 +66,7 @@ def thinned_support(store: Store, instance: Instance, limit: int | None) -> Supp
 
 
 def point_spacing(points: NDArray[np.float32]) -> float:
-    """Width that lets neighbouring points of a surface touch: from the area that they cover on a coarse grid.
+    """Return width that lets neighbouring points of a surface touch: from the area that they cover on a coarse grid.
 
     The occupied cells of a grid with about sixteen points a cell estimate the area; `points` has shape (N, 3), N >= 1.
     """
@@ -79,13 +79,13 @@ def point_spacing(points: NDArray[np.float32]) -> float:
 
 
 def has_box(instance: Instance) -> bool:
-    """Whether the instance has finite geometry."""
+    """Tell whether the instance has finite geometry."""
     box = instance.box
     return bool(np.isfinite([*box.center, *box.size, *box.rotation.ravel()]).all())
 
 
 def frames_per_second(frames: list[FrameRow]) -> float | None:
-    """Median rate of one session in frames of the source per second, None where the clock says nothing."""
+    """Return the median rate of one session in frames of the source per second, None where the clock says nothing."""
     known = [f for f in frames if f.state != "bad"]
     steps = np.diff([f.time_s for f in known]), np.diff([f.frame_index for f in known])
     rates = steps[1][steps[0] > 0] / steps[0][steps[0] > 0]

@@ -1,4 +1,4 @@
-"""Instances and relations as two tables of comma-separated values, for spreadsheets and data frames."""
+"""Write instances and relations as two CSV tables, for spreadsheets and data frames."""
 
 from __future__ import annotations
 

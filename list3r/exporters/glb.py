@@ -1,4 +1,4 @@
-"""Boxes and points as binary glTF, for any 3D viewer."""
+"""Write boxes and points as binary glTF, for any 3D viewer."""
 
 # mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
@@ -36,7 +36,7 @@ class GlbSettings:
 
 
 def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = None) -> tuple[Path, ...]:
-    """Node `instance_12` with its children `instance_12_points` and, for things, `instance_12_box` (lines).
+    """Write node `instance_12` with its children `instance_12_points` and, for things, `instance_12_box` (lines).
 
     The node `world` above them turns z up into the y up of glTF. Facts of an instance are the `extras` of its geometry.
     Each component is a file of its own, the main one at `path`. Returns the files written.
@@ -79,7 +79,8 @@ def _add(scene: trimesh.Scene, geometry: Any, name: str, parent: str, instance: 
 
 
 def _add_nothing(scene: trimesh.Scene) -> None:
-    """glTF of trimesh needs one geometry: an empty memory gives one invisible point at the origin."""
+    """Add an invisible point: glTF of trimesh needs one geometry, and an empty memory gives one invisible point at the
+    origin."""
     scene.add_geometry(
         trimesh.PointCloud(np.zeros((1, 3)), colors=np.zeros((1, 4), np.uint8)), node_name="empty", geom_name="empty"
     )

@@ -12,7 +12,7 @@ _LIGHTNESS = (0.68, 0.56, 0.76)
 
 
 def instance_color(instance_id: int, chroma: float = 0.15) -> Color:
-    """sRGB colour of an id: hues a golden angle apart, at three lightnesses, in OKLCH (Ottosson 2020)."""
+    """Return the sRGB colour of an id: hues a golden angle apart, at three lightnesses, in OKLCH (Ottosson 2020)."""
     hue = instance_id * _GOLDEN_ANGLE
     lightness = _LIGHTNESS[instance_id % len(_LIGHTNESS)]
     a, b = chroma * np.cos(hue), chroma * np.sin(hue)
@@ -35,17 +35,17 @@ def instance_color(instance_id: int, chroma: float = 0.15) -> Color:
 
 
 def structure_color(instance_id: int) -> Color:
-    """A greyish colour for floor, walls and the like, so that things stand out before them."""
+    """Return a greyish colour for floor, walls and the like, so that things stand out before them."""
     return instance_color(instance_id, chroma=0.02)
 
 
 def linear_from_srgb(rgb: ArrayLike) -> NDArray[np.float64]:
-    """Linear light in [0, 1] of sRGB values in [0, 255] (IEC 61966-2-1): what USD and glTF hold. Any shape."""
+    """Return linear light in [0, 1] of sRGB values in [0, 255] (IEC 61966-2-1): what USD and glTF hold. Any shape."""
     v = np.asarray(rgb, dtype=np.float64) / 255.0
     return np.asarray(np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4))
 
 
 def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float64]:
-    """The inverse of `linear_from_srgb`, in [0, 1], values outside clipped. Any shape."""
+    """Return the inverse of `linear_from_srgb`, in [0, 1], values outside clipped. Any shape."""
     v = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
     return np.asarray(np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055))

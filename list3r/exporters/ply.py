@@ -1,4 +1,4 @@
-"""A point cloud in which every point knows its instance."""
+"""Write a point cloud with the instance id of every point."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PlySettings:
 
 
 def write_ply(store: Store, path: str | Path, settings: PlySettings | None = None) -> tuple[Path, ...]:
-    """All support points in world coordinates as binary PLY with a property `instance`, the id of each point.
+    """Write all support points in world coordinates as binary PLY with a property `instance`, the id of each point.
 
     Each component is a file of its own, the main one at `path`. Returns the files written.
     """

@@ -1,4 +1,4 @@
-"""The scene graph as JSON: the fixed fields of `scene.schema.json`, readable without any of our code."""
+"""Write the scene graph as JSON: the fixed fields of `scene.schema.json`, readable without any of our code."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _METRIC_DECIMALS = 4
 
 
 def scene_schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) that every scene keeps."""
+    """Return the JSON Schema (draft 2020-12) that every scene keeps."""
     text = resources.files("list3r.exporters").joinpath("scene.schema.json").read_text(encoding="utf-8")
     return dict(json.loads(text))
 
@@ -38,7 +38,7 @@ def write_scene_json(store: Store, path: str | Path) -> tuple[Path, ...]:
 
 
 def scene_dict(store: Store) -> dict[str, Any]:
-    """The scene graph of a memory as plain JSON values, without NaN.
+    """Return the scene graph of a memory as plain JSON values, without NaN.
 
     `frame.up` is [0, 0, 1] where gravity is known or estimated and null where it is unknown; `frame.units` is "m" for
     a metric or anchored memory and "unit" for a relative one; geometry that an instance lacks is null. Coordinates of
@@ -76,7 +76,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
 
 
 def _length_decimals(store: Store, components: list[Component]) -> int:
-    """Decimals of lengths: 0.1 mm where metric, 1e-5 of the scene's extent where the unit is arbitrary."""
+    """Return decimals of lengths: 0.1 mm where metric, 1e-5 of the scene's extent where the unit is arbitrary."""
     centers = [i.center for c in components for i in c.instances if np.isfinite(i.center).all()]
     if units(store) == "m" or not centers:
         return _METRIC_DECIMALS
@@ -89,7 +89,7 @@ def _number(value: float, decimals: int) -> float | None:
 
 
 def _vector(values: ArrayLike, decimals: int) -> list[float] | None:
-    """Rounded numbers, without negative zero; None where one is not finite."""
+    """Return the rounded numbers, without negative zero; None where one is not finite."""
     flat = np.asarray(values, dtype=np.float64).ravel()
     return [float(v) + 0.0 for v in np.round(flat, decimals)] if np.isfinite(flat).all() else None
 
@@ -97,7 +97,7 @@ def _vector(values: ArrayLike, decimals: int) -> list[float] | None:
 def instance_entry(
     instance: Instance, decimals: int = _METRIC_DECIMALS, track: tuple[ArrayLike, ArrayLike] | None = None
 ) -> dict[str, Any]:
-    """One entry of `instances`; lengths rounded to so many decimals.
+    """Return one entry of `instances`; lengths rounded to so many decimals.
 
     `track` are the seconds (V,) and places (V, 3) of a thing that moves; without them the entry has none.
     """
@@ -185,7 +185,7 @@ def _sessions(store: Store) -> list[dict[str, Any]]:
 
 
 def _lay_out(scene: dict[str, Any]) -> str:
-    """JSON with one item of each list a line: short enough to read, stable enough to compare."""
+    """Return JSON with one item of each list a line: short enough to read, stable enough to compare."""
     parts = []
     for key, value in scene.items():
         if isinstance(value, list) and value:

@@ -1,4 +1,4 @@
-"""The camera trajectory in the format of the TUM RGB-D benchmark."""
+"""Write the camera trajectory in the format of the TUM RGB-D benchmark."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Pose = tuple[FrameRow, Sim3]
 
 
 def write_tum(store: Store, path: str | Path) -> tuple[Path, ...]:
-    """`T_world_cam` of every posed frame (colour camera) as `time_s tx ty tz qx qy qz qw`, in the order of time.
+    """Write `T_world_cam` of every posed frame (colour camera) as `time_s tx ty tz qx qy qz qw`, in the order of time.
 
     Sessions have clocks of their own and components frames of reference of their own, so each pair of them is one
     trajectory: the longest goes to `path`, the others beside it. Returns the files written.
@@ -39,7 +39,7 @@ _COLUMNS = "time_s tx ty tz qx qy qz qw"
 
 
 def _trajectories(store: Store) -> list[tuple[str, list[Pose]]]:
-    """(name of the part, its poses), the longest first and nameless; at least one."""
+    """Return (name of the part, its poses), the longest first and nameless; at least one."""
     parts: dict[tuple[int, int], list[Pose]] = {}
     for component in read_components(store):
         for pose in component.poses:

@@ -1,4 +1,4 @@
-"""What sessions have changed."""
+"""List what sessions have changed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KINDS = ("moved", "removed", "added", "seen_again")
 
 @dataclass(frozen=True)
 class Changed:
-    """One thing that a session showed in a new light."""
+    """One instance that a session showed to have changed."""
 
     instance: Instance
     """As it is today."""
@@ -43,7 +43,8 @@ class Changed:
 def changes(
     store: Store, since: int | None = None, kinds: tuple[str, ...] = KINDS[:3], min_confidence: float = 0.0
 ) -> list[Changed]:
-    """What was moved, removed and added in the sessions after `since` (all where it is None), the newest session first.
+    """Return what was moved, removed and added in the sessions after `since` (all where it is None), the newest session
+    first.
 
     Within a session by kind, the surest first. A thing that no frame could look at has no event. Raises `OptionError`
     for a session or a kind that there is not.

@@ -1,4 +1,4 @@
-"""Things by what is said of them: attributes, a noun, and how they stand to others; see `grammar`."""
+"""Find instances by a phrase: attributes, a noun and relations to other instances; see `grammar`."""
 
 from __future__ import annotations
 
@@ -22,27 +22,29 @@ from list3r.queries.views.viewpoint import VIEWPOINT, between
 from list3r.queries.words import STRUCTURE, not_borne
 
 _BY_STRUCTURE_M = 0.4
-"""What is nearer than this to a wall is near it: the memory stores that of things only."""
+"""Largest distance from a wall at which something is near it, metres: the memory stores `near` for things only."""
 _MOST_OBJECTS = 40
-"""So many things that others are left of, or between, are looked at."""
+"""Instances that others may be left of, or between: at most so many are considered."""
+_EQUAL = 0.02
+"""Difference of two scores below which two answers are equally good."""
 _ALIKE = 0.1
 """Sizes that differ by less than this share are equally the biggest."""
 
 
 class Found(Matches):
-    """Ranked answers; `notes` say which words nothing bears, which relations are not known, how many are equal."""
+    """Ranked answers; `notes` name words without a match, unknown relations, and how many answers are equal."""
 
     def __init__(
         self, matches: Iterable[Match] = (), notes: Sequence[str] = (), unknown_words: Sequence[str] = ()
     ) -> None:
         super().__init__(matches, notes)
         self.unknown_words = tuple(dict.fromkeys(unknown_words))
-        """Words that nothing in the memory bears."""
+        """Words that no instance of the memory has."""
 
     @property
     def ambiguous(self) -> bool:
         """Whether the second answer is as good as the first."""
-        return len(self) > 1 and self[0].score - self[1].score < 0.02
+        return len(self) > 1 and self[0].score - self[1].score < _EQUAL
 
 
 _Pair = tuple[int, str, float, str]
@@ -58,7 +60,7 @@ class _Candidate:
 
 @dataclass
 class _Search:
-    """One question while it is worked on."""
+    """State of one question."""
 
     store: Store
     things: dict[int, Instance]
@@ -74,14 +76,14 @@ class _Search:
 def find(
     store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> Found:
-    """The things that a text describes, the best first: "white mug on table", "chair next to 12".
+    """Find the instances that a text describes, the best first: "white mug on table", "chair next to 12".
 
-    Every word must be borne by label, kind of structure, description or colour; small and large are relative to what
-    else there is of the kind; every relation must hold. Nothing that fits is an empty answer, never a guess: its
-    `notes` name the words that nothing bears and the relations that the memory cannot know. Left, right, front and
-    behind are told from `viewpoint` (see `relations.Place`), else as the picture shows it in which the other thing is
-    seen best. With an `encoder` of a space that the memory holds, phrases with words that nothing bears are compared
-    by their vectors. The score is how well the words fit times how sure the relations are. Raises `OptionError` for a
+    Every word must occur in the label, kind of structure, description or colour; small and large are relative to the
+    other instances of the kind; every relation must hold. Without a match the answer is empty, never a guess: its
+    `notes` name the words that no instance has and the relations that the memory cannot know. Left, right, front and
+    behind are judged from `viewpoint` (see `relations.Place`), otherwise in the picture that shows the other instance
+    best. With an `encoder` of a space that the memory holds, phrases with words that no instance has are compared by
+    their vectors. The score is how well the words match times how sure the relations are. Raises `OptionError` for a
     text without sense and `UnknownIdError` for a number that was never an id.
     """
     k = checked_count(k)
@@ -94,11 +96,13 @@ def find(
     search = _Search(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
     search.notes += [] if gathered is None else gathered.notes
     found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
-    matches = [Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "a thing") for c in found[:k]]
+    matches = [
+        Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "any instance") for c in found[:k]
+    ]
     out = Found(matches, search.notes, search.unknown)
     if out.ambiguous and len(found) > 1:
-        equal = sum(c.score > found[0].score - 0.02 for c in found)
-        out.notes = (*out.notes, f"{equal} things answer equally well; say more to tell them apart")
+        equal = sum(c.score > found[0].score - _EQUAL for c in found)
+        out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
     return out
 
 
@@ -106,7 +110,7 @@ def find(
 
 
 def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
-    """What a phrase may mean: words, then relations, then size among what is left."""
+    """Return what a phrase may mean: words, then relations, then size among what is left."""
     if phrase.instance_id is not None:
         i = checked_instance(search.store, phrase.instance_id)
         found = [_Candidate(i, 1.0, (f"#{i.id}",))]
@@ -119,7 +123,7 @@ def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
         found = _sized(search, found, phrase)
     for clause in phrase.where:
         if not found:
-            # The rest is looked at all the same, so that all words that nothing bears are told.
+            # The rest is searched all the same, so that all words without a match are named.
             _meaning(search, clause.object)
             if clause.other:
                 _meaning(search, clause.other)
@@ -131,7 +135,7 @@ def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
 
 
 def _vocabulary(i: Instance) -> dict[str, float]:
-    """Words that an instance bears, with how well each names it."""
+    """Return words that an instance bears, with how well each names it."""
     return vocabulary(i.label, i.structure, i.description, i.color_name)
 
 
@@ -156,12 +160,12 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
             reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
             out.append(_Candidate(i, score, reasons))
     if not out and len(phrase.words) > 1:
-        search.notes.append("no one thing is all of " + ", ".join(repr(w) for w in phrase.words))
+        search.notes.append("no instance matches all of the words " + ", ".join(repr(w) for w in phrase.words))
     return out
 
 
 def _unknown(search: _Search, words: Sequence[str]) -> list[str]:
-    """Words that nothing bears."""
+    """Return words that nothing bears."""
     if search.gathered is not None:
         known = search.store.known_words(words)
         return [w for w in words if w not in known]
@@ -173,14 +177,15 @@ def _bears(search: _Search, n: int, words: Sequence[str]) -> bool:
 
 
 def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
-    """Things by the likeness of their vectors to the phrase; None where no vectors of the encoder's space are there."""
+    """Return instances by the likeness of their vectors to the phrase; None where no vectors of the encoder's space are
+    there."""
     if search.encoder is None:
         return None
     text = " ".join(phrase.words)
     try:
         cosine = named_by_vectors(search.store, search.encoder, text)
     except OptionError as error:  # the memory has come to a machine without the model's weights
-        search.notes.append(f"free words are not compared: {error}")
+        search.notes.append(f"free words cannot be compared: {error}")
         return None
     if cosine is None:
         return None
@@ -203,7 +208,8 @@ def _look_at_too(search: _Search, ids: Sequence[int]) -> None:
 
 
 def _sized(search: _Search, found: list[_Candidate], phrase: Phrase) -> list[_Candidate]:
-    """Those of a size, relative to the others that fit the words, or to all things where those are fewer than four."""
+    """Return those of a size, relative to the others that fit the words, or to all things where those are fewer than
+    four."""
     size = phrase.size
     assert size is not None
     edges = np.array([]) if search.gathered is None else search.gathered.sizes_of(search.store, phrase.words)
@@ -220,13 +226,13 @@ def _sized(search: _Search, found: list[_Candidate], phrase: Phrase) -> list[_Ca
         fit = 1.0 - rank if high <= 0.5 else rank if low >= 0.5 else 1.0 - 2.0 * abs(rank - 0.5)
         if said > 0.0 or low <= rank <= high:
             score = max(said, 0.5 + 0.5 * fit)
-            why = f"{size}: longest edge {_edge(c.instance):.2f}, {1.0 - rank:.0%} of what is there is larger"
+            why = f"{size}: longest edge {_edge(c.instance):.2f}, {1.0 - rank:.0%} of the others are larger"
             out.append(_Candidate(c.instance, c.score * score, (*c.reasons, why)))
     return out
 
 
 def _extreme(found: list[_Candidate], superlative: str) -> list[_Candidate]:
-    """The largest or smallest, and what is practically as large."""
+    """Return the largest or smallest, and what is practically as large."""
     kind = SUPERLATIVES[superlative]
     sizes = [_edge(c.instance) if abs(kind) == 1 else float(np.ptp(c.instance.aabb[:, 2])) for c in found]
     best = max(sizes) if kind > 0 else min(sizes)
@@ -247,7 +253,7 @@ def _edge(i: Instance) -> float:
 
 
 def _related(search: _Search, found: list[_Candidate], clause: Clause, text: str) -> list[_Candidate]:
-    """Those that stand in the relation to something that the clause's phrase means."""
+    """Return those that stand in the relation to something that the clause's phrase means."""
     objects = _few(search, _meaning(search, clause.object), clause)
     others = _few(search, _meaning(search, clause.other), clause) if clause.other else []
     if clause.other:
@@ -256,17 +262,17 @@ def _related(search: _Search, found: list[_Candidate], clause: Clause, text: str
         out = _standing(search, found, objects, clause.predicates)
     if not out and objects and (others or not clause.other):
         ends = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
-        search.notes.append(f"of {len(found)} that fit {text!r} none is known to be {clause.said} {ends!r}")
+        search.notes.append(f"of {len(found)} instances that match {text!r} none is known to be {clause.said} {ends!r}")
     return out
 
 
 def _few(search: _Search, objects: list[_Candidate], clause: Clause) -> list[_Candidate]:
-    """Not more than can be looked at from each of them, the best first."""
+    """Return no more than can be searched from each of them, the best first."""
     stored = not ({"between", *VIEWPOINT} & set(clause.predicates))
     if stored or len(objects) <= _MOST_OBJECTS:
         return objects
     search.notes.append(
-        f"{len(objects)} things may be meant after {clause.said!r}; the best {_MOST_OBJECTS} were taken"
+        f"{len(objects)} instances match the phrase after {clause.said!r}; the best {_MOST_OBJECTS} were considered"
     )
     return sorted(objects, key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))[:_MOST_OBJECTS]
 
@@ -317,13 +323,13 @@ def _pairs_of_many(
 def _pairs(
     search: _Search, subjects: dict[int, _Candidate], object: _Candidate, predicates: Sequence[str]
 ) -> list[_Pair]:
-    """(subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
+    """Return (subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
     o = object.instance
     out: list[tuple[int, str, float, str]] = []
     for predicate in predicates:
         place = _viewpoint(search, o) if predicate in VIEWPOINT else None
         if predicate in VIEWPOINT and place is None:
-            search.notes.append(f"{predicate.replace('_', ' ')} depends on who looks; say from where")
+            search.notes.append(f"{predicate.replace('_', ' ')} depends on the viewpoint; name one")
             continue
         held = relations(search.store, None, predicate, o.id, viewpoint=place)
         if held.state == "unknown" and (predicate in VIEWPOINT or predicate in VERTICAL):
@@ -336,7 +342,7 @@ def _pairs(
 
 
 def _near_structure(search: _Search, subjects: dict[int, _Candidate], o: Instance) -> list[tuple[int, str, float, str]]:
-    """Things near a wall, by the distance of surfaces: the memory keeps `near` of things only."""
+    """Return things near a wall, by the distance of surfaces: the memory keeps `near` of things only."""
     limit = _BY_STRUCTURE_M * unit_of(search.store)
     near = set(search.store.ids_in_box(o.aabb[0] - limit, o.aabb[1] + limit))
     out = []
@@ -349,7 +355,7 @@ def _near_structure(search: _Search, subjects: dict[int, _Candidate], o: Instanc
 
 
 def _viewpoint(search: _Search, o: Instance) -> Place | None:
-    """From where left and right are told: as asked, else the picture in which the other thing is seen best."""
+    """Return from where left and right are told: as asked, else the picture in which the other thing is seen best."""
     if search.viewpoint is not None:
         return search.viewpoint
     if o.best_view is None:

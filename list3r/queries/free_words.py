@@ -1,4 +1,4 @@
-"""Free words against the vectors that things have in a text and image model's space."""
+"""Compare free text with the vectors of instances in the space of a text and image model."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class WordEncoder(Protocol):
         ...
 
     def encode(self, text: str) -> NDArray[np.float32]:
-        """The unit vector of a text. Shape (D,)."""
+        """Return the unit vector of a text. Shape (D,)."""
         ...
 
 
 def named_by_vectors(store: Store, encoder: WordEncoder, words: str) -> dict[int, float] | None:
-    """Cosine of every thing that a text may name, by id, the ids ascending; None where the memory has no vectors of the
-    encoder's space. Raises `OptionError` where the encoder's weights are not there.
+    """Return the cosine of every thing that a text may name, by id, the ids ascending; None where the memory has no
+    vectors of the encoder's space. Raises `OptionError` where the encoder's weights are not there.
     """
     if encoder.space not in store.embedding_spaces():
         return None
@@ -43,5 +43,5 @@ def named_by_vectors(store: Store, encoder: WordEncoder, words: str) -> dict[int
 
 
 def like(words: str, cosine: float, space: str) -> str:
-    """Why a thing that the words do not name is an answer all the same."""
+    """Say why a thing that the words do not name is an answer all the same."""
     return f"like {words!r}: cosine {cosine:.2f} in {space}"

@@ -105,7 +105,7 @@ class Clause:
 
 
 def parse(text: str) -> Phrase:
-    """The structure of a question. Raises `OptionError` for one that is empty, too long, or ends in a relation."""
+    """Parse a question. Raises `OptionError` for one that is empty, too long, or ends in a relation."""
     tokens = _tokens(text)
     if not tokens:
         raise OptionError(f"{text!r} has no word to look for; ask for example for: white mug on table")
@@ -115,12 +115,12 @@ def parse(text: str) -> Phrase:
 
 
 def _tokens(text: str) -> list[str]:
-    """Words in lower case and numbers; the names of predicates (next_to) come apart into what people say."""
+    """Return words in lower case and numbers; the names of predicates (next_to) come apart into what people say."""
     return re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text.lower())
 
 
 def _sentence(tokens: list[str], text: str) -> Phrase:
-    """The first phrase with its clauses; "and" before a relation comes back to it."""
+    """Return the first phrase with its clauses; "and" before a relation comes back to it."""
     start = _next_relation(tokens, 0)
     head = _phrase(tokens[: start if start is not None else len(tokens)])
     clauses: list[Clause] = []
@@ -167,7 +167,7 @@ def _phrase(tokens: list[str]) -> Phrase:
 
 
 def _relation_at(tokens: list[str], k: int) -> tuple[int, tuple[str, ...]]:
-    """(how many words, predicates) of the longest relation that begins at a word; 0 words for none."""
+    """Return (how many words, predicates) of the longest relation that begins at a word; 0 words for none."""
     for length in range(min(_LONGEST, len(tokens) - k), 0, -1):
         said = tuple(tokens[k : k + length])
         if said in _PHRASES:
@@ -183,7 +183,7 @@ def _next_relation(tokens: list[str], k: int) -> int | None:
 
 
 def _next_and(tokens: list[str], start: int) -> int:
-    """Where the clause that begins at `start` ends: at an "and" that a relation follows, or at the end."""
+    """Return where the clause that begins at `start` ends: at an "and" that a relation follows, or at the end."""
     length, predicates = _relation_at(tokens, start)
     spared = predicates == ("between",)
     for n in range(start + length, len(tokens)):

@@ -1,4 +1,4 @@
-"""What every query answers with, and the filters that all of them share."""
+"""The answer of every query, and the filters that all of them share."""
 
 from __future__ import annotations
 
@@ -108,11 +108,11 @@ class Filters:
         return None if self.state == "any" else self.state
 
     def select(self, instances: Iterable[Instance]) -> list[Instance]:
-        """Those that pass."""
+        """Return those that pass."""
         return [i for i in instances if self.passes(i)]
 
     def passes(self, i: Instance) -> bool:
-        """Whether a question is about this one."""
+        """Tell whether a question is about this one."""
         sized = self.min_size is not None or self.max_size is not None
         size = float(np.max(i.box.size)) if sized else 0.0
         return (
@@ -137,21 +137,21 @@ _LARGEST_ID = 2**63 - 1
 
 
 def checked_instance(store: Store, instance_id: int) -> Instance:
-    """The instance of an id or of an alias. Raises `UnknownIdError`, also for a number that no id can be."""
+    """Return the instance of an id or of an alias. Raises `UnknownIdError`, also for a number that no id can be."""
     if not 0 <= int(instance_id) <= _LARGEST_ID:
         raise UnknownIdError(f"{store.path} has no instance {instance_id}; `list3r list {store.path}` shows the ids")
     return store.instance(int(instance_id))
 
 
 def checked_count(k: int) -> int:
-    """A count of answers, at least 1. Raises `OptionError`."""
+    """Return the count of answers, at least 1. Raises `OptionError`."""
     if k < 1:
         raise OptionError(f"k = {k}: ask for at least 1 answer")
     return min(int(k), _MOST)
 
 
 def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Three finite numbers. Raises `OptionError`."""
+    """Return a point of three finite numbers. Raises `OptionError`."""
     try:
         point = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -164,7 +164,7 @@ def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def checked_length(value: float, name: str) -> float:
-    """A finite length that is not negative. Raises `OptionError`."""
+    """Return a finite length that is not negative. Raises `OptionError`."""
     if not np.isfinite(value) or value < 0:
         raise OptionError(f"{name} {value} must be a finite length, 0 or more")
     return float(value)

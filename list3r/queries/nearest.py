@@ -1,4 +1,4 @@
-"""What is nearest to a point or to a thing, and what do words name."""
+"""Find what is nearest to a point or to an instance, and what words name."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def nearest(
     encoder: WordEncoder | None = None,
     **options: Unpack[FilterOptions],
 ) -> Matches:
-    """The k things nearest to a `point` (world) or to an instance, by the distance between surfaces.
+    """Find the k instances nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
     With `words` only things whose label or description bears one of them; with words alone those that they name best
     (most words, then confidence), without distances. The words must all be found where any thing bears them all. Words
@@ -60,7 +60,7 @@ def nearest(
     if point is not None and instance_id is not None:
         raise OptionError("give a point or an instance to be near to, not both")
     if point is None and instance_id is None and words is None:
-        raise OptionError("say what to be near to: a point, an instance, or words that name a thing")
+        raise OptionError("give what to be near to: a point, an instance, or words")
     if max_distance is not None:
         if point is None and instance_id is None:
             raise OptionError("a largest distance needs a point or an instance to measure from")
@@ -93,7 +93,7 @@ def nearest(
 
 
 def _common(store: Store, words: str) -> bool:
-    """Whether so many bear all the words that it is better to look around for them than to look at them all."""
+    """Tell whether so many bear all the words that it is better to look around for them than to look at them all."""
     return len(store.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
 
 
@@ -120,11 +120,11 @@ def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> li
 def _alike(
     store: Store, encoder: WordEncoder, words: str, filters: Filters, notes: list[str]
 ) -> list[tuple[Instance, float, str]]:
-    """Things whose vectors fit words that nothing bears."""
+    """Return things whose vectors fit words that nothing bears."""
     try:
         cosine = named_by_vectors(store, encoder, words) or {}
     except OptionError as error:  # the memory has come to a machine without the model's weights
-        notes.append(f"free words are not compared: {error}")
+        notes.append(f"free words cannot be compared: {error}")
         return []
     alike = filters.select(store.instances_of(list(cosine)))
     return [(i, round(cosine[i.id], 4), like(words, cosine[i.id], encoder.space)) for i in alike]
@@ -152,7 +152,7 @@ def _near(
 
 
 def _named(candidates: Sequence[Instance], words: str) -> list[tuple[Instance, float, str]]:
-    """Those that bear the words: all of them where some thing does, else as many as any thing does."""
+    """Return those that bear the words: all of them where some thing does, else as many as any thing does."""
     wanted = wanted_words(words)
     found = [(i, *word_score(i, wanted)) for i in candidates]
     most = max((len(hit) for _, _, hit in found), default=0)
@@ -175,9 +175,7 @@ def _by_distance(
     k: int,
     limit: float | None,
 ) -> list[tuple[float, Instance]]:
-    """The k nearest of some. Boxes bound the distance from below, so only what can still win has its surface looked
-    at.
-    """
+    """Return the k nearest of some. Boxes bound the distance from below: only what can still win is measured."""
     if not candidates:
         return []
     gaps = box_gaps(np.array([i.aabb for i in candidates]), aabb)
@@ -193,7 +191,7 @@ def _by_distance(
 
 
 def _aabb(origin: Instance | None, place: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """The box of what is asked about. Shape (2, 3)."""
+    """Return the box of what is asked about. Shape (2, 3)."""
     if origin is not None:
         return origin.aabb
     assert place is not None
@@ -201,7 +199,7 @@ def _aabb(origin: Instance | None, place: NDArray[np.float64] | None) -> NDArray
 
 
 def _measure(store: Store, origin: Instance | None, place: NDArray[np.float64] | None) -> Callable[[Instance], float]:
-    """What tells how far the surface of an instance is."""
+    """Return the function that tells how far the surface of an instance is."""
     if origin is not None:
         known = origin
         return lambda i: distance_between(store, i, known)
@@ -213,7 +211,7 @@ def _measure(store: Store, origin: Instance | None, place: NDArray[np.float64] |
 def _match(
     i: Instance, surface: float, named: str, origin: Instance | None, place: NDArray[np.float64] | None
 ) -> Match:
-    """An answer, with its distance in words."""
+    """Return an answer, with its distance in words."""
     if origin is not None:
         offset, whence = i.center - origin.center, f"from #{origin.id}"
     else:

@@ -1,4 +1,4 @@
-"""How two things hang together: the shortest way through the relation graph."""
+"""Find the shortest path between two instances in the relation graph."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from list3r.queries.match import checked_instance
 from list3r.queries.relations import Relations
 
 _TELLING = ("in", "contains", "on", "supports", "attached_to", "under", "above", "below", "between", "next_to", "near")
-"""Of two relations of the same two things the one named first here tells more."""
+"""Predicates from the most to the least specific: of two relations between the same instances the first is given."""
 
 
 def path(store: Store, start: int, end: int, *, structure: bool = True) -> Relations:
-    """The fewest relations that lead from one instance to another, in order; of ways equally short the surest.
+    """Return the fewest relations that lead from one instance to another, in order; of equally short paths the surest.
 
-    Where a step is stored only the other way round and has an inverse, the inverse is given; where it has none
-    (`under`, `attached_to`), the relation as it is stored, whose object then comes first on the way. Empty with a
-    `reason` where nothing leads there. Without `structure` the way does not lead over floor and walls, which nearly
+    Where a step is stored only in the other direction and has an inverse, the inverse is given; where it has none
+    (`under`, `attached_to`), the relation as it is stored, whose object then comes first on the path. Empty with a
+    `reason` where there is no path. Without `structure` the path does not lead over floor and walls, which nearly
     everything stands on. Raises `UnknownIdError`.
     """
     import networkx
@@ -42,8 +42,8 @@ def path(store: Store, start: int, end: int, *, structure: bool = True) -> Relat
         way = networkx.shortest_path(graph, a.id, b.id, weight="weight")
     except (networkx.NetworkXNoPath, networkx.NodeNotFound):
         apart = a.component != b.component
-        why = "they live in parts of the memory that are not joined" if apart else "no relation leads there"
-        return Relations([], "known", f"no way from #{a.id} to #{b.id}: {why}")
+        why = "they are in different connected components" if apart else "no relations connect them"
+        return Relations([], "known", f"no path from #{a.id} to #{b.id}: {why}")
     steps = [_forward(best[frozenset((s, o))], s) for s, o in itertools.pairwise(way)]
     return Relations(steps, "known", f"{len(steps)} step{'s' if len(steps) > 1 else ''}")
 
@@ -54,7 +54,7 @@ def _rank(r: Relation) -> tuple[int, float, int]:
 
 
 def _forward(r: Relation, subject: int) -> Relation:
-    """The relation with this subject where it has an inverse."""
+    """Return the relation with this subject where it has an inverse."""
     if r.subject == subject or r.predicate not in INVERSE:
         return r
     return Relation(r.object, INVERSE[r.predicate], r.subject, r.confidence, r.margin)

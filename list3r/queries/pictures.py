@@ -47,7 +47,7 @@ class InstanceSight:
     """Run-length code at the picture's size, see `list3r.memory.masks`. Shape (R,)."""
 
     def worth(self, settings: PictureSettings | None = None) -> float:
-        """How well a picture shows the instance, in [0, 1]: how much of it, and whether large enough to see."""
+        """Tell how well a picture shows the instance, in [0, 1]: how much of it, and whether large enough to see."""
         s = settings or PictureSettings()
         return self.visible_fraction * min(1.0, math.sqrt(self.area_px) / s.full_side_px)
 
@@ -228,7 +228,7 @@ def _projected(store: Store, instance: Instance, settings: PictureSettings) -> I
 
 
 def _looking_at(store: Store, instance: Instance, most: int) -> list[KeyframePicture]:
-    """Keyframes of its component whose picture holds its centre, those in which it is largest first."""
+    """Return keyframes of its component whose picture holds its centre, those in which it is largest first."""
     poses = {(f.session_id, f.frame_index): S for f, S in store.camera_poses()}
     lenses = {c.chunk_id: c.intrinsics for c in store.chunks()}
     near = []

@@ -1,4 +1,4 @@
-"""Relations of a memory: those that it stores, and those that hold from a viewpoint or between two things."""
+"""Relations of a memory: stored ones, and those that hold from a viewpoint or between two instances."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def relations(
     viewpoint: Place | None = None,
     other: int | str | None = None,
 ) -> Relations:
-    """Relations that match what is given, the surest first. Subject and object are ids, aliases, or words.
+    """Return the relations that match what is given, the surest first. Subject and object are ids, aliases, or words.
 
     With a `viewpoint` the four of `viewpoint.VIEWPOINT` are told as well (or alone, where one is the predicate); where
     neither subject nor object is given, of things that the memory calls near each other. `between` needs `object` and
@@ -63,13 +63,11 @@ def relations(
     if not 0.0 <= min_confidence <= 1.0:
         raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
     if predicate in VIEWPOINT and viewpoint is None:
-        raise OptionError(
-            f"{predicate} depends on who looks: say from where (--from ID, camera, camera:FRAME or x,y,z)"
-        )
+        raise OptionError(f"{predicate} depends on the viewpoint: name one (--from ID, camera, camera:FRAME or x,y,z)")
     if viewpoint is not None and predicate is not None and predicate not in VIEWPOINT:
-        raise OptionError(f"{predicate} does not depend on who looks; leave out the viewpoint")
+        raise OptionError(f"{predicate} does not depend on the viewpoint; leave it out")
     if (predicate == "between") != (other is not None):
-        raise OptionError("between takes two things, object and other (--object A --and B), and nothing else takes two")
+        raise OptionError("between, and only between, takes two instances: object and other (--object A --and B)")
     notes: list[str] = []
     subjects, objects = _ids(store, subject, notes), _ids(store, object, notes)
     if predicate == "between":
@@ -88,7 +86,8 @@ def relations(
 
 
 def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
-    """Who looks from a place, see `Place`; None where up is not known. Raises `OptionError` and `UnknownIdError`."""
+    """Return who looks from a place, see `Place`; None where up is not known. Raises `OptionError` and
+    `UnknownIdError`."""
     upright = store.get_value("gravity", "unknown") in ("known", "estimated")
     up = np.array([0.0, 0.0, 1.0])
     where = _parse_place(store, viewpoint) if isinstance(viewpoint, str) else viewpoint
@@ -116,7 +115,7 @@ def _parse_place(store: Store, text: str) -> int | PosedCamera | list[float]:
 
 
 def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | None:
-    """The ids that a number or words stand for; None for whatever."""
+    """Return the ids that a number or words stand for; None for whatever."""
     if what is None:
         return None
     if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):
@@ -124,7 +123,7 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
         if is_large(store):
             found = store.bearing(sorted(wanted), _MOST_NAMED + 1)
             if len(found) > _MOST_NAMED:
-                notes.append(f"more than {_MOST_NAMED} things are {what!r}; {_MOST_NAMED} of them were looked at")
+                notes.append(f"more than {_MOST_NAMED} instances match {what!r}; {_MOST_NAMED} of them were considered")
             found = sorted(found[:_MOST_NAMED])
         else:
             found = [i.id for i in store.instances() if wanted <= words_of(i)]
@@ -148,7 +147,7 @@ def _stored(store: Store, subjects: list[int] | None, predicate: str | None, obj
         if (allowed[0] is None or r.subject in allowed[0]) and (allowed[1] is None or r.object in allowed[1])
     ]
     if store.get_value("gravity", "unknown") not in ("known", "estimated"):
-        why = "which way is up is not known in this memory, so neither is what is on, in, above or under what"
+        why = "gravity is unknown in this memory, and with it what is on, in, above or under what"
         if predicate in VERTICAL and not found:
             return Relations([], "unknown", why)
         if predicate is None:
@@ -162,7 +161,9 @@ def _viewed(
     viewer = viewer_from(store, viewpoint)
     if viewer is None:
         return Relations(
-            [], "unknown", "which way is up is not known in this memory, so neither is left or right; try a camera"
+            [],
+            "unknown",
+            "gravity is unknown in this memory, and with it left and right; use a camera as the viewpoint",
         )
     things = {i.id: i for i in store.instances()}
     if subjects is None and objects is None:
@@ -184,13 +185,13 @@ def _viewed(
         out += [r for r in found or [] if predicate in (None, r.predicate)]
     reason = f"as seen from {viewer.name}"
     if untold:
-        reason += f"; of {untold} pairs it cannot be told from there"
+        reason += f"; {untold} pairs cannot be judged from there"
     return Relations(out, "unknown" if untold and not out else "known", reason)
 
 
 def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, others: list[int] | None) -> Relations:
     if ones is None or others is None:
-        raise OptionError("between takes two things: say both, object and other (--object A --and B)")
+        raise OptionError("between takes two instances: give both object and other (--object A --and B)")
     noise = noise_of(store)
     things = {i.id: i for i in store.instances()}
     asked = [i for i in things.values() if (i.structure is None if subjects is None else i.id in set(subjects))]
@@ -204,7 +205,7 @@ def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, o
     ]
     apart = [(a, b) for a in ones for b in others if things[a].component != things[b].component]
     if apart and not found:
-        return Relations([], "unknown", "the two live in parts of the memory that are not joined")
+        return Relations([], "unknown", "the two are in different connected components")
     unique: dict[tuple[int, frozenset[int]], BetweenRelation] = {}
     for r in found:
         unique.setdefault((r.subject, frozenset((r.object, r.other))), r)
@@ -217,12 +218,12 @@ def _near_line(store: Store, a: Instance, b: Instance, asked: list[Instance]) ->
 
 
 def noise_of(store: Store) -> float:
-    """Standard deviation of a position: the one of the stored relations, in world units."""
+    """Return the standard deviation of a position: the one of the stored relations, in world units."""
     return RelationSettings().noise_m * unit_of(store)
 
 
 def unit_of(store: Store) -> float:
-    """What a metre is about in world units: 1 where the memory is metric, else told by the distances of things from
+    """Estimate what a metre is in world units: 1 where the memory is metric, else told by the distances of things from
     the cameras, which stand about two metres from what they look at indoors.
     """
     if store.get_value("scale_kind", "metric") != "relative":

@@ -1,4 +1,4 @@
-"""When a thing was seen, and what was to be seen from somewhere."""
+"""When an instance was seen, and what is visible from a camera."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
 from list3r.queries.views.camera import PosedCamera
 from list3r.queries.views.visibility import Visibility, in_front, look
+
+LEAST_VISIBLE = 0.1
+"""Share of an instance's outline that must be visible for a camera to see it, in [0, 1]."""
+_WHOLE = 0.995
+"""Share of an instance inside the picture from which all of it is."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,7 @@ class Sightings:
 
 
 def seen(store: Store, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
-    """When and in which frames an instance was seen; of frames that two chunks share, the better view counts.
+    """Return when and in which frames an instance was seen; of frames that two chunks share, the better view counts.
 
     Raises `UnknownIdError`, and `OptionError` for a gap that is none.
     """
@@ -74,12 +79,12 @@ def visible(
     store: Store,
     camera: PosedCamera,
     *,
-    min_visible: float = 0.1,
+    min_visible: float = LEAST_VISIBLE,
     max_depth: float | None = None,
     occlusion: bool = True,
     **options: Unpack[FilterOptions],
 ) -> list[Match]:
-    """What a camera sees: things of which at least `min_visible` of the outline in the picture is not hidden.
+    """Return what a camera sees: things of which at least `min_visible` of the outline in the picture is not hidden.
 
     The score is that share times the share of the thing that lies in the picture; the distance is from the camera to
     the nearest point that shows. For a camera of a frame the reason says whether the thing was followed in it. What
@@ -101,7 +106,7 @@ def visible(
 
 def _match(s: Visibility, camera: PosedCamera, followed: set[int] | None) -> Match:
     reason = f"{s.visible:.0%} of its outline shows, {s.picture:.1%} of the picture"
-    if s.inside < 0.995:
+    if s.inside < _WHOLE:
         reason += f", {s.inside:.0%} of it inside"
     if followed is not None:
         reason += ", followed in this frame" if s.instance.id in followed else ", not followed in this frame"
@@ -111,7 +116,7 @@ def _match(s: Visibility, camera: PosedCamera, followed: set[int] | None) -> Mat
 
 
 def _followed(store: Store, camera: PosedCamera) -> set[int] | None:
-    """Instances whose masks are in the camera's frame, by the chunk that places it; None without a frame."""
+    """Return instances whose masks are in the camera's frame, by the chunk that places it; None without a frame."""
     if camera.frame is None:
         return None
     out = set()

@@ -1,4 +1,4 @@
-"""What looks like a thing."""
+"""Find instances that look alike."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def similar(
     k: int = 5,
     **options: Unpack[FilterOptions],
 ) -> list[Match]:
-    """The k things whose features are most like those of an instance, or like a `vector` of a named `space`.
+    """Find the k instances whose features are most like those of an instance, or like a `vector` of a named `space`.
 
     The score is the cosine; with `part` of the first so many numbers, which is all that `vector` then holds. Raises
     `SpaceMismatchError` for vectors of another space, `OptionError` and
@@ -63,7 +63,7 @@ def similar(
 
 
 def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: int, filters: Filters) -> list[Match]:
-    """By the first `part` numbers of all vectors, of which there is no index."""
+    """Compare by the first `part` numbers of all vectors, of which there is no index."""
     query = np.asarray(vector, np.float64)
     length = float(np.linalg.norm(query))
     if not np.isfinite(length) or length == 0.0:

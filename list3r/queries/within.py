@@ -1,4 +1,4 @@
-"""What lies in a region: a box, a sphere, or what a camera sees."""
+"""Find what lies in a region: a box, a sphere, or the frustum of a camera."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point
-from list3r.queries.seen import visible
+from list3r.queries.seen import LEAST_VISIBLE, visible
 from list3r.queries.views.camera import PosedCamera
 from list3r.queries.views.surfaces import distance_to_point, surface_of
 
@@ -27,8 +27,8 @@ def within(
     occlusion: bool = True,
     **options: Unpack[FilterOptions],
 ) -> list[Match]:
-    """The things of which some surface lies in a box (`lower`, `upper`), in a sphere (`center`, `radius`), both in the
-    world, or in the frustum of a `camera`.
+    """Find the instances of which some surface lies in a box (`lower`, `upper`), in a sphere (`center`, `radius`), both
+    in the world, or in the frustum of a `camera`.
 
     In a box or sphere the score is the share of the thing's surface that lies inside, and distances are from the middle
     of the region; for a camera see `seen.visible`: with `occlusion` it leaves out what other things hide. The most
@@ -41,7 +41,7 @@ def within(
             "give one region: a box (lower and upper corner), a sphere (center and radius), or the view of a camera"
         )
     if camera is not None:
-        least = 0.1 if occlusion else 0.0
+        least = LEAST_VISIBLE if occlusion else 0.0
         return visible(store, camera, min_visible=least, max_depth=max_depth, occlusion=occlusion, **options)
     if max_depth is not None:
         raise OptionError("a largest depth needs the view of a camera")

@@ -1,4 +1,4 @@
-"""Matching words against labels and descriptions."""
+"""Match words with labels and descriptions."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ STRUCTURE = frozenset(("floor", "ceiling", "wall"))
 
 
 def wanted_words(text: str) -> list[str]:
-    """The words that matter, in order. Raises `OptionError` when none is left."""
+    """Return the words that matter, in order. Raises `OptionError` when none is left."""
     found = [w for w in split_words(text) if w not in _IGNORED]
     if not found:
-        raise OptionError(f"{text!r} has no word to look for; name a thing, a colour or a shape")
+        raise OptionError(f"{text!r} has no word to search for; name an object, a colour or a shape")
     return list(dict.fromkeys(found))
 
 
 def is_named(instance: Instance, text: str) -> bool:
-    """Whether label, kind of structure and description together bear all the words."""
+    """Tell whether label, kind of structure and description together bear all the words."""
     return set(wanted_words(text)) <= words_of(instance)
 
 
 def is_colored(instance: Instance, text: str) -> bool:
-    """Whether the main colour bears all the words: "red" is said of what is dark red, not the other way round."""
+    """Tell whether the main colour bears all the words: "red" is said of what is dark red, not the other way round."""
     return set(wanted_words(text)) <= set(split_words(instance.color_name))
 
 
 def words_of(instance: Instance) -> set[str]:
-    """All words that may name an instance: of its label, its kind of structure, its description and its colour."""
+    """Return all words that may name an instance: of its label, its kind of structure, its description and its
+    colour."""
     texts = (instance.label, instance.structure, instance.description.split(",")[0], instance.color_name)
     return {word for text in texts for word in split_words(text or "")}
 
 
 def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]:
-    """(score in [0, 1], words found): a word of the label counts fully, of the kind of structure and of the
+    """Return (score in [0, 1], words found): a word of the label counts fully, of the kind of structure and of the
     description nearly so, the beginning of a word half.
     """
     fields = [(1.0, instance.label), (0.9, instance.structure), (0.8, instance.description.split(",")[0])]
@@ -59,9 +60,11 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
 
 
 def not_borne(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:
-    """What to say where nothing bears some words: that, and what most things are called (the last words of names)."""
+    """Say that no instance has some words, and what most things are called (the last words of names)."""
     said = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
     count = Counter(word for last in said for word in last)
     names = ", ".join(word for word, _ in sorted(count.items(), key=lambda c: (-c[1], c[0]))[:most])
-    bear = f"word{'s' if len(words) > 1 else ''} {', '.join(map(repr, words))}"
-    return f"nothing in this memory bears the {bear}" + (f"; things here are called: {names}" if names else "")
+    missing = f"word{'s' if len(words) > 1 else ''} {', '.join(map(repr, words))}"
+    return f"no instance has the {missing} in its label or description" + (
+        f"; frequent names: {names}" if names else ""
+    )

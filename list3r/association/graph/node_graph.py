@@ -41,7 +41,7 @@ _STEPS = 10
 
 
 @dataclass(frozen=True)
-class Pieces:
+class NodeGraphParts:
     """What the graph is made of."""
 
     nodes: dict[int, ChunkNodes]
@@ -92,7 +92,7 @@ def pieces_of(
     believed: Sequence[Edge],
     rigid: Collection[int],
     settings: NodeSettings,
-) -> Pieces:
+) -> NodeGraphParts:
     """Return nodes of all chunks and relations of adjacent ones, in one pass over the samples."""
     to = {e.v: e for e in believed if e.kind == "adjacent" and e.accepted}
     nodes: dict[int, ChunkNodes] = {}
@@ -111,11 +111,11 @@ def pieces_of(
             there = before[1] if before is not None and before[0] == edge.u else _known_poses(read_samples(edge.u))
             relations.append((edge, relate_frames(there, samples, edge, nodes[edge.u])))
         before = (chunk, samples)
-    return Pieces(nodes, relations)
+    return NodeGraphParts(nodes, relations)
 
 
 def _problem(
-    pieces: Pieces,
+    pieces: NodeGraphParts,
     believed: Sequence[Edge],
     components: Mapping[int, int],
     metric: bool,

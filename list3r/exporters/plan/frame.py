@@ -1,4 +1,4 @@
-"""How the world lies on the page of a plan view."""
+"""Choose how the world lies on the page of a plan view."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ class PlanFrame:
     """What is up in the picture."""
 
     def reduced(self, times: int) -> PlanFrame:
-        """The same view in so many times fewer pixels each way."""
+        """Return the same view in so many times fewer pixels each way."""
         width, height = self.size_px
         return replace(self, pixels_per_unit=self.pixels_per_unit / times, size_px=(width // times, height // times))
 
     def to_px(self, points_world: ArrayLike) -> Array:
-        """Pixel positions (x right, y down) of world points. Shape (N, 3) -> (N, 2)."""
+        """Return the pixel positions (x right, y down) of world points. Shape (N, 3) -> (N, 2)."""
         xy = np.asarray(points_world, dtype=np.float64) @ self.R_plan_world[:2].T - self.center
         half = np.array(self.size_px) / 2.0
         return np.asarray(half + xy * self.pixels_per_unit * [1.0, -1.0])
 
     def height(self, points_world: ArrayLike) -> Array:
-        """Height above the page, world units. Shape (N, 3) -> (N,)."""
+        """Return the height above the page, world units. Shape (N, 3) -> (N,)."""
         return np.asarray(np.asarray(points_world, dtype=np.float64) @ self.R_plan_world[2])
 
 
 def choose_rotation(component: Component, gravity: str) -> tuple[Array, str]:
-    """R_plan_world that looks down and has the walls along the page, and what it took for up, in words."""
+    """Return R_plan_world that looks down and has the walls along the page, and what it took for up, in words."""
     up, note = _up(component, gravity)
     right = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
     right /= np.linalg.norm(right)
@@ -58,12 +58,12 @@ def choose_rotation(component: Component, gravity: str) -> tuple[Array, str]:
 
 
 def quarter_turn(rotation: Array) -> Array:
-    """The same view with the page turned by a quarter. Shape (3, 3)."""
+    """Return the same view with the page turned by a quarter. Shape (3, 3)."""
     return np.stack([rotation[1], -rotation[0], rotation[2]])
 
 
 def _up(component: Component, gravity: str) -> tuple[Array, str]:
-    """The vertical: world z, or without gravity the normal of the plane in which the camera moved."""
+    """Return the vertical: world z, or without gravity the normal of the plane in which the camera moved."""
     if gravity != "unknown":
         return np.array([0.0, 0.0, 1.0]), f"seen from above: z is up (gravity {gravity})"
     if len(component.poses) < 3:
@@ -80,7 +80,7 @@ def _up(component: Component, gravity: str) -> tuple[Array, str]:
 
 
 def _dominant_angle(component: Component, rotation: Array) -> float:
-    """Direction in [-45, 45] degrees, as radians, of most wall and box sides on the page."""
+    """Return the direction in [-45, 45] degrees, as radians, of most wall and box sides on the page."""
     boxed = [i for i in component.instances if has_box(i)]
     chosen = [i for i in boxed if is_wall(i, rotation[2])] or [i for i in boxed if not i.structure]
     total = 0j
@@ -92,7 +92,7 @@ def _dominant_angle(component: Component, rotation: Array) -> float:
 
 
 def is_wall(instance: Instance, up: Array) -> bool:
-    """Whether an instance is structure that stands upright, by its kind or else by the thin side of its box."""
+    """Tell whether an instance is structure that stands upright, by its kind or else by the thin side of its box."""
     if not instance.structure or instance.structure in FLAT_KINDS or not has_box(instance):
         return False
     thin = instance.box.rotation[:, int(np.argmin(instance.box.size))]

@@ -1,4 +1,4 @@
-"""Where the tags of a plan view go so that every one can be read."""
+"""Place the tags of a plan view so that every one can be read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ANGLES = np.deg2rad(np.arange(0.0, 360.0, 15.0) - 90.0)
 
 @dataclass(frozen=True)
 class TagTarget:
-    """A thing that wants a tag."""
+    """An instance to be tagged."""
 
     xy: tuple[float, float]
     """Its middle, px."""
@@ -32,7 +32,7 @@ class TagTarget:
 
 
 def place_tags(anchors: Sequence[TagTarget], page: Rect) -> list[tuple[float, float]]:
-    """Middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
+    """Return the middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
 
     Tags avoid each other and the small things. Where nothing is free within the search radius the place of least
     overlap is taken.
@@ -72,7 +72,8 @@ def _nearest_free(anchor: TagTarget, boxes: NDArray[np.float64], page: Rect) -> 
 
 
 def _rings(anchor: TagTarget) -> Iterator[NDArray[np.float64]]:
-    """Places round an anchor, the best first: on it if it is large, then rings of growing radius. Shape (R, 2) each."""
+    """Return places round an anchor, the best first: on it if it is large, then rings of growing radius. Shape (R, 2)
+    each."""
     middle, across = np.array(anchor.xy), np.array(anchor.tag)
     start = np.array(anchor.half) + across / 2 + 3 if anchor.small else np.zeros(2)
     if not anchor.small:

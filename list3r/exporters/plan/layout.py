@@ -1,4 +1,4 @@
-"""Where map and legend go on the page of a plan view."""
+"""Place map and legend on the page of a plan view."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Layout:
 
 
 def choose_layout(span: NDArray[np.float64], things: int, settings: PlanSettings) -> Layout:
-    """The legend beside the map, or below it for a wide scene. `span` is (width, height) of the scene, any unit."""
+    """Place legend beside the map, or below it for a wide scene. `span` is (width, height) of the scene, any unit."""
     s = settings
     ratio = float(span[1] / span[0])
     if ratio < s.wide:

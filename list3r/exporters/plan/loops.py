@@ -1,4 +1,4 @@
-"""Accepted loops on the plan view: which places were recognised as seen before."""
+"""Loop closures on the plan view."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from list3r.memory.store.store import Store
 
 
 def loop_ends(store: Store, component: Component) -> NDArray[np.float64]:
-    """Camera positions of the two frames of every accepted loop inside a component, world. Shape (L, 2, 3)."""
+    """Return camera positions of the two frames of every accepted loop inside a component, world. Shape (L, 2, 3)."""
     session_of = {c.chunk_id: c.session_id for c in component.chunks}
     camera = {(f.session_id, f.frame_index): S_world_cam.translation for f, S_world_cam in component.poses}
     ends = []

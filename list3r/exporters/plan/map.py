@@ -1,4 +1,4 @@
-"""The pixels of a plan view: the scene from above in pale colours, walls dark."""
+"""Draw the scene from above in pale colours, walls dark."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Pixels = NDArray[np.int64]
 
 
 def pale_picture(frame: PlanFrame, things: list[Support], floors: list[Support], walls: list[Support]) -> Image:
-    """Floor smoothed, things above it, the higher over the lower, all faded; walls dark. Shape (H, W, 3)."""
+    """Draw the floor smoothed, things above it, the higher over the lower, all faded; walls dark. Shape (H, W, 3)."""
     width, height = frame.size_px
     image = np.full((height, width, 3), PAPER)
     for support in floors:
@@ -40,7 +40,7 @@ def pale_picture(frame: PlanFrame, things: list[Support], floors: list[Support],
 
 
 def _smooth_floor(frame: PlanFrame, support: Support) -> tuple[Image, Image]:
-    """Faded colour (H, W, 3) and cover in [0, 1] (H, W, 1) of a floor, averaged over the gaps between its points."""
+    """Return faded colour (H, W, 3) and cover in [0, 1] (H, W, 1) of a floor, averaged over gaps between its points."""
     canvas, reach = _Canvas(frame), _reach(frame, support)
     canvas.stamp(canvas.place(frame, support), _codes(support.rgb, _FADE_FLOOR), min(reach, 2))
     codes = canvas.picture()
@@ -54,7 +54,7 @@ def _smooth_floor(frame: PlanFrame, support: Support) -> tuple[Image, Image]:
 
 
 def _from_above(frame: PlanFrame, supports: list[Support]) -> Codes:
-    """Faded colours of things as `_codes`, painted from low to high, 0 where nothing is. Shape (H, W)."""
+    """Return the faded colours of things as `_codes`, painted from low to high, 0 where nothing is. Shape (H, W)."""
     canvas = _Canvas(frame)
     if not supports:
         return canvas.picture()
@@ -70,18 +70,19 @@ def _from_above(frame: PlanFrame, supports: list[Support]) -> Codes:
 
 
 def _codes(rgb: NDArray[np.uint8], fade: float) -> Codes:
-    """Faded colours in one number each, never 0: 1 << 24 | red << 16 | green << 8 | blue. Shape (N, 3) -> (N,)."""
+    """Return the faded colours in one number each, never 0: 1 << 24 | red << 16 | green << 8 | blue. Shape (N, 3) ->
+    (N,)."""
     faded = np.round(rgb * fade + PAPER * (1 - fade)).astype(np.uint32)
     return np.asarray(np.uint32(1 << 24) | faded[:, 0] << 16 | faded[:, 1] << 8 | faded[:, 2])
 
 
 def _rgb(codes: Codes) -> NDArray[np.uint32]:
-    """The colours of `_codes`. Shape (...) -> (..., 3)."""
+    """Return the colours of `_codes`. Shape (...) -> (..., 3)."""
     return np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255], axis=-1)
 
 
 def _wall_density(frame: PlanFrame, walls: list[Support]) -> Image:
-    """How many wall points stand over each pixel, in [0, 1] of what is usual. Shape (H, W, 1)."""
+    """Return how many wall points stand over each pixel, in [0, 1] of what is usual. Shape (H, W, 1)."""
     canvas = _Canvas(frame)
     counts = np.zeros(canvas.codes.size)
     for support in walls:
@@ -93,7 +94,7 @@ def _wall_density(frame: PlanFrame, walls: list[Support]) -> Image:
 
 
 def _reach(frame: PlanFrame, support: Support) -> int:
-    """Radius of the disc that a point covers so that neighbours touch, px."""
+    """Return the radius of the disc that a point covers so that neighbours touch, px."""
     if not len(support.points):
         return 0
     spacing = point_spacing(support.points) * frame.pixels_per_unit
@@ -109,7 +110,7 @@ class _Canvas:
         self.codes = np.zeros(self.shape[0] * self.shape[1], np.uint32)
 
     def place(self, frame: PlanFrame, support: Support) -> Pixels:
-        """Numbers of the pixels of points. Shape (N,)."""
+        """Return numbers of the pixels of points. Shape (N,)."""
         rim = _MAX_REACH_PX
         xy = np.floor(frame.to_px(support.points)).astype(np.int64) + 2 * rim
         x = np.clip(xy[:, 0], rim, self.shape[1] - rim - 1)
@@ -117,7 +118,7 @@ class _Canvas:
         return np.asarray(y * self.shape[1] + x)
 
     def disc(self, reach: int) -> Pixels:
-        """Steps from a pixel to those of a disc round it. Shape (D,)."""
+        """Return steps from a pixel to those of a disc round it. Shape (D,)."""
         dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
         inside = dx**2 + dy**2 <= (reach + 0.5) ** 2
         return np.asarray(dy[inside] * self.shape[1] + dx[inside])
@@ -131,11 +132,11 @@ class _Canvas:
             self.codes[cells.ravel()] = np.repeat(codes[start : start + step], len(disc))
 
     def crop(self, values: NDArray[np.float64]) -> Image:
-        """Values of the map without the rim. Shape (H, W)."""
+        """Return values of the map without the rim. Shape (H, W)."""
         rim = 2 * _MAX_REACH_PX
         return values.reshape(self.shape)[rim:-rim, rim:-rim]
 
     def picture(self) -> Codes:
-        """The map without the rim. Shape (H, W)."""
+        """Return the map without the rim. Shape (H, W)."""
         rim = 2 * _MAX_REACH_PX
         return self.codes.reshape(self.shape)[rim:-rim, rim:-rim]

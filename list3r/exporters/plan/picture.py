@@ -1,4 +1,4 @@
-"""A plan view as a picture: walls, things with their ids, the camera's path, a scale bar and a legend."""
+"""Draw a plan view: walls, instances with their ids, the camera path, a scale bar and a legend."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def write_plan(store: Store, path: str | Path, settings: PlanSettings | None = N
 
 
 def plan_image(store: Store, component: Component, settings: PlanSettings | None = None) -> Image.Image:
-    """The plan view of one component."""
+    """Draw the plan view of one component."""
     settings = settings or PlanSettings()
     limits = (settings.points_per_instance, settings.points_per_structure)
     supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
@@ -91,7 +91,7 @@ def _subtitle(store: Store, component: Component) -> str:
 def _frame(
     store: Store, component: Component, supports: dict[int, Support], settings: PlanSettings, things: int
 ) -> tuple[PlanFrame, Layout]:
-    """Walls along the page, everything inside, as large as the page allows."""
+    """Choose a view with the walls along the page, everything inside, as large as the page allows."""
     rotation, note = choose_rotation(component, store.get_value("gravity", "unknown"))
     low, high = _extent(component, supports, rotation)
     if high[1] - low[1] > high[0] - low[0]:
@@ -106,7 +106,7 @@ def _frame(
 def _extent(
     component: Component, supports: dict[int, Support], rotation: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner, plan coordinates, of boxes of things, the camera, and structure but for its fringe."""
+    """Return lower and upper corner, plan coordinates, of boxes of things, camera, and structure but for its fringe."""
     page = rotation[:2].T
     parts = [i.box.corners() @ page for i in component.instances if not i.structure and has_box(i)]
     parts += [S_world_cam.translation[None] @ page for _, S_world_cam in component.poses]
@@ -130,17 +130,17 @@ class _Sheet:
         self.tag_font, self.text_font = _font(13), _font(14)
 
     def finish(self) -> Image.Image:
-        """The page at its size."""
+        """Return the page at its size."""
         return self.image.reduce(_OVERSAMPLING)
 
     def px(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where world points are on the page, px. Shape (N, 3) -> (N, 2)."""
+        """Return where world points are on the page, px. Shape (N, 3) -> (N, 2)."""
         return np.asarray(self.frame.to_px(points_world) + np.array([self.left, self.top]))
 
     # ------------------------------------------------------------------ the map
 
     def picture(self, component: Component, supports: dict[int, Support]) -> None:
-        """What was seen from above, in pale colours."""
+        """Draw what was seen from above, in pale colours."""
         up = self.frame.R_plan_world[2]
         seen = [i for i in component.instances if len(supports[i.id].points) and i.structure != "ceiling"]
         walls = [supports[i.id] for i in seen if is_wall(i, up)]
@@ -164,7 +164,7 @@ class _Sheet:
         return [(float(x), float(y)) for x, y in corners]
 
     def boxes(self, things: list[Instance], tagged: set[int]) -> None:
-        """Oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
+        """Draw oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
         for instance in sorted(things, key=lambda i: (-_area(self._footprint(i)), i.id)):
             color, outline = instance_color(instance.id), self._footprint(instance)
             if instance.id not in tagged:
@@ -175,7 +175,7 @@ class _Sheet:
             self.draw.line([*outline, outline[0], outline[1]], fill=(*color, 255), width=2 * _OVERSAMPLING)
 
     def tracks(self, tracks: dict[int, NDArray[np.float64]]) -> None:
-        """Where moving things went, in their colours: a dot where each was seen first, an arrow where last."""
+        """Draw where moving things went, in their colours: a dot where each was seen first, an arrow where last."""
         k = _OVERSAMPLING
         for instance_id, places in sorted(tracks.items()):
             xy, color = self.px(places), instance_color(instance_id)
@@ -192,7 +192,7 @@ class _Sheet:
                 self._stroke(end, end + 12 * k * turn, color, 3)
 
     def loops(self, ends: NDArray[np.float64]) -> None:
-        """Lines between the cameras of the frames that closed a loop, (L, 2, 3), and what they are over the map."""
+        """Draw lines between cameras of the frames that closed a loop, (L, 2, 3), and what they are over the map."""
         if not len(ends):
             return
         k = _OVERSAMPLING
@@ -200,14 +200,14 @@ class _Sheet:
             self.draw.line([(float(a[0]), float(a[1])), (float(b[0]), float(b[1]))], fill=(*_LOOP, 120), width=k)
             for x, y in (a, b):
                 self.draw.ellipse((x - 2.5 * k, y - 2.5 * k, x + 2.5 * k, y + 2.5 * k), fill=(*_LOOP, 200))
-        words = f"{len(ends)} loop{'s' * (len(ends) > 1)}: places seen again"
+        words = f"{len(ends)} loop closure{'s' * (len(ends) > 1)}"
         x, y = self.left + float(self.map_size[0]), 25.0 * k
         start = x - self.draw.textlength(words, font=self.text_font) - 40 * k
         self.draw.line([(start, y), (start + 32 * k, y)], fill=_LOOP, width=2 * k)
         self._text((x, y), words, self.text_font, _GREY, anchor="rm")
 
     def camera_path(self, component: Component) -> None:
-        """Where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""
+        """Draw where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""
         sessions = sorted({frame.session_id for frame, _ in component.poses})
         for session in sessions:
             poses = [p for p in component.poses if p[0].session_id == session]
@@ -253,7 +253,7 @@ class _Sheet:
         )
 
     def tags(self, things: list[Instance]) -> None:
-        """The id of each thing on or beside it, a line to it where it is away, its name where there is room."""
+        """Draw the id of each thing on or beside it, a line to it where it is away, its name where there is room."""
         k = _OVERSAMPLING
         anchors, names = [], []
         for instance in things:
@@ -295,17 +295,17 @@ class _Sheet:
         self._text((x, y), str(instance_id), self.tag_font, _contrast(color), anchor="mm")
 
     def scale_bar(self, unit: str) -> None:
-        """A bar of a round length at the right under the map."""
+        """Draw a bar of a round length at the right under the map."""
         k = _OVERSAMPLING
         length = _round_length(260 * k / self.frame.pixels_per_unit)
         x1, y = float(self.left + self.map_size[0]), self.top + self.map_size[1] + 38.0 * k
         x0 = x1 - length * self.frame.pixels_per_unit
         self.draw.line([(x0, y - 6 * k), (x0, y), (x1, y), (x1, y - 6 * k)], fill=_INK, width=2 * k)
-        words = f"{length:g} m" if unit == "m" else f"{length:g} x the memory's unit (relative scale)"
+        words = f"{length:g} m" if unit == "m" else f"{length:g} units of the memory (relative scale)"
         self._text((x1, y - 11 * k), words, self.text_font, _INK, anchor="rs")
 
     def axes(self, remark: str) -> None:
-        """The world's axes as they lie on the page, what is up, and a remark, under the map."""
+        """Draw the world's axes as they lie on the page, what is up, and a remark, under the map."""
         k = _OVERSAMPLING
         origin = np.array([self.left + 24.0 * k, self.top + self.map_size[1] + 32.0 * k])
         for axis, (name, color) in enumerate((("x", (200, 60, 60)), ("y", (40, 140, 60)), ("z", (50, 90, 200)))):
@@ -328,13 +328,13 @@ class _Sheet:
         )
 
     def header(self, title: str, subtitle: str) -> None:
-        """Name of the memory and what is in it."""
+        """Write the name of the memory and what is in it."""
         k = _OVERSAMPLING
         self._text((self.left, 14 * k), title, _font(24), _INK)
         self._text((self.left, 47 * k), subtitle, _font(15), _GREY)
 
     def legend(self, things: list[Instance], unit: str) -> None:
-        """A table of ids, descriptions and sizes; where it is too long, those that were seen most."""
+        """Draw a table of ids, descriptions and sizes; where it is too long, those that were seen most."""
         k, layout = _OVERSAMPLING, self.layout
         chosen = _seen_most(things, layout.columns * layout.rows)
         x, y = layout.legend_xy[0] * k, layout.legend_xy[1] * k
@@ -366,7 +366,7 @@ class _Sheet:
 
 
 def _seen_most(things: list[Instance], limit: int) -> list[Instance]:
-    """At most so many things, those with the most observations, by id."""
+    """Return at most so many things, those with the most observations, by id."""
     return sorted(sorted(things, key=lambda i: (-i.observations, i.id))[:limit], key=lambda i: i.id)
 
 
@@ -375,7 +375,7 @@ def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _plain(text: str) -> str:
-    """Text in the letters that Pillow's own font has."""
+    """Return the text in the letters that Pillow's own font has."""
     kept = "".join(c for c in text if c in "·…" or c.isascii())
     if kept == text:
         return text
@@ -418,6 +418,6 @@ def _contrast(color: Color) -> Color:
 
 
 def _round_length(limit: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not over the limit."""
+    """Return the largest 1, 2 or 5 times a power of ten that is not over the limit."""
     power = 10.0 ** np.floor(np.log10(limit))
     return float(power * max(m for m in (1, 2, 5) if m * power <= limit))

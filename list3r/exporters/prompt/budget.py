@@ -44,5 +44,5 @@ class Budget:
         return kept
 
     def text(self) -> str:
-        """The text."""
+        """Return the text."""
         return "".join(line + "\n" for line in self.lines)

@@ -47,7 +47,7 @@ def _greedy(shows: Mapping[int, Set[int]]) -> list[int]:
 
 
 def _without_spare(chosen: list[int], shows: Mapping[int, Set[int]]) -> list[int]:
-    """The choice without those whose instances the others all show, the last chosen looked at first."""
+    """Return the choice without those whose instances the others all show, the last chosen looked at first."""
     out = list(chosen)
     for key in reversed(chosen):
         others = set[int]().union(*(shows[k] for k in out if k != key))
@@ -57,7 +57,7 @@ def _without_spare(chosen: list[int], shows: Mapping[int, Set[int]]) -> list[int
 
 
 def _fewest(shows: Mapping[int, Set[int]]) -> list[int] | None:
-    """The least cover by an integer program; None where the search ended before it was found."""
+    """Return the least cover by an integer program; None where the search ended before it was found."""
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array
 

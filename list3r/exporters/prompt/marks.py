@@ -68,7 +68,7 @@ def _anchor(
     draw: ImageDraw.ImageDraw,
     font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
 ) -> TagTarget:
-    """Where a tag belongs: on the pixel of the mask that is farthest from its edge."""
+    """Return where a tag belongs: on the pixel of the mask that is farthest from its edge."""
     from scipy.ndimage import distance_transform_edt
 
     mask = np.pad(decode_mask(sight.mask, size), 1)

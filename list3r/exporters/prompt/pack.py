@@ -126,7 +126,7 @@ def _write_crops(memory: SceneMemory, folder: Path, listed: Sequence[int]) -> se
 
 @contextlib.contextmanager
 def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder` that takes its place when the block ends well."""
+    """Return a temporary folder beside `folder` that takes its place when the block ends well."""
     if not folder.parent.is_dir():
         raise ExportError(f"the folder {folder.parent} does not exist; create it first")
     if folder.exists() and not folder.is_dir():

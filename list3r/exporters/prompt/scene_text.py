@@ -183,7 +183,7 @@ class _SceneWriter:
         return " | ".join(cells)
 
     def turn(self, i: Instance) -> str:
-        """How far the box is turned about the vertical; nothing where that is little or which way is up is unknown."""
+        """Tell how far box is turned about the vertical; nothing where that is little or which way is up is unknown."""
         if self.memory.gravity == "unknown":
             return ""
         angle = float(np.rad2deg(np.arctan2(i.box.rotation[1, 0], i.box.rotation[0, 0])))

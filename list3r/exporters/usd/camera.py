@@ -1,4 +1,4 @@
-"""The camera's path as animated USD cameras."""
+"""Write the camera path as animated USD cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _APERTURE = 0.36
 
 
 def add_cameras(stage: Usd.Stage, scope: Sdf.Path, component: Component) -> None:
-    """One animated camera a session, `Camera`, then `Camera_session_2` and so on; time codes are frame numbers."""
+    """Add one animated camera a session, `Camera`, then `Camera_session_2` and so on; time codes are frame numbers."""
     sessions: dict[int, list[tuple[FrameRow, Sim3]]] = {}
     for pose in component.poses:
         sessions.setdefault(pose[0].session_id, []).append(pose)
@@ -43,7 +43,8 @@ def _animate(camera: UsdGeom.Camera, poses: list[tuple[FrameRow, Sim3]]) -> None
 
 
 def _set_lens(camera: UsdGeom.Camera, component: Component, poses: list[tuple[FrameRow, Sim3]]) -> None:
-    """Intrinsics: constant where all chunks agree, else sampled where they change and held by neighbouring samples."""
+    """Set the intrinsics: constant where all chunks agree, else sampled where they change and held by neighbouring
+    samples."""
     chunks = {c.chunk_id: c for c in component.chunks}
     lenses = [_lens((*chunks[f.chunk_id].intrinsics, *chunks[f.chunk_id].image_size)) for f, _ in poses]
     attributes = [
@@ -61,7 +62,7 @@ def _set_lens(camera: UsdGeom.Camera, component: Component, poses: list[tuple[Fr
 
 
 def _lens(camera: tuple[float, ...]) -> tuple[float, float, float, float, float]:
-    """Horizontal and vertical aperture, focal length, offsets; the image spans [-0.5, width - 0.5] px."""
+    """Return the horizontal and vertical aperture, focal length, offsets; the image spans [-0.5, width - 0.5] px."""
     fx, fy, cx, cy, height, width = camera
     focal = _APERTURE * fx / width
     return (
@@ -74,7 +75,7 @@ def _lens(camera: tuple[float, ...]) -> tuple[float, float, float, float, float]
 
 
 def set_time_range(stage: Usd.Stage, components: list[Component], store: Store) -> None:
-    """Start, end and rate of the stage: frame numbers, at the rate of the first session."""
+    """Set start, end and rate of the stage: frame numbers, at the rate of the first session."""
     frames = [frame.frame_index for c in components for frame, _ in c.poses]
     if not frames:
         return

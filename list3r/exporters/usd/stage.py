@@ -1,4 +1,4 @@
-"""The memory as an OpenUSD stage: a prim for each instance, relations between prims, the camera's path."""
+"""Write the memory as an OpenUSD stage: a prim for each instance, relations between prims, the camera path."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = Non
 
 
 def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
-    """The stage in memory: z up, metersPerUnit 1 (arbitrary units in a relative memory, `customLayerData` says so).
+    """Build stage in memory: z up, metersPerUnit 1 (arbitrary units in a relative memory, `customLayerData` says so).
 
     `/World/Instances/instance_12` is the box's own frame (translate, orient), with the points in it and the box as a
     guide; what moves has a sample of its translation for each frame that saw it. Floor, walls and the like are under
@@ -134,7 +134,7 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
 
 
 def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:
-    """Samples of a moving thing's place, as it is turned where it was last; time codes are frame numbers."""
+    """Add samples of a moving thing's place, as it is turned where it was last; time codes are frame numbers."""
     keys, _, places = store.track_frames(instance.id)
     if not len(keys):
         return
@@ -168,7 +168,7 @@ def _add_points(stage: Usd.Stage, path: Sdf.Path, points_object: NDArray[np.floa
 
 
 def _set_label(prim: Usd.Prim, instance: Instance) -> None:
-    """Semantic label in the taxonomy `class`; by hand where this build of USD has no `UsdSemantics`."""
+    """Set the semantic label in the taxonomy `class`; by hand where this build of USD has no `UsdSemantics`."""
     token = class_token(instance)
     try:
         from pxr import UsdSemantics
@@ -181,7 +181,7 @@ def _set_label(prim: Usd.Prim, instance: Instance) -> None:
 
 
 def class_token(instance: Instance) -> str:
-    """The label, else the kind of structure, else the words of the description before its first comma, as one token."""
+    """Return label, else kind of structure, else the words of the description before its first comma, as one token."""
     words = instance.label or instance.structure or instance.description.split(",")[0]
     return re.sub(r"\W+", "_", words.strip().lower()).strip("_") or "unknown"
 
@@ -216,7 +216,7 @@ def _set_facts(prim: Usd.Prim, instance: Instance) -> None:
 
 
 def _add_relations(stage: Usd.Stage, store: Store, paths: dict[int, Sdf.Path]) -> None:
-    """`list3r:relation:on` on the subject, its targets the objects, with confidences and margins in the same order."""
+    """Add `list3r:relation:on` to subject, its targets the objects, with confidences and margins in the same order."""
     found: dict[tuple[int, str], list[tuple[Sdf.Path, float, float]]] = {}
     for r in store.relations():
         if r.subject in paths and r.object in paths:

@@ -1,4 +1,4 @@
-"""The nearest of very many things: boxes from the R*Tree in growing surroundings, surfaces of those that can win."""
+"""Find the nearest of very many instances: boxes from the R*Tree in growing surroundings, then surfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a question looks from: the camera of a frame, of a moment, or of a pose."""
+"""Cameras that questions look from: of a frame, of a moment, or at a pose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from list3r.queries.match import checked_point
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A picture that was taken, or that could be."""
+    """A camera with its pose: one that took a frame, or one that could."""
 
     T_world_cam: NDArray[np.float64]
     """Rigid, OpenCV axes: x right, y down, z forward; lengths in world units. Shape (4, 4)."""
@@ -43,7 +43,7 @@ class PosedCamera:
 
 
 def camera_of_frame(store: Store, frame: int, session: int | None = None) -> PosedCamera:
-    """The camera of a posed frame, of the first session that has it unless one is named.
+    """Return the camera of a posed frame, of the first session that has it unless one is named.
 
     Raises `OptionError` for a frame that is not there or has no pose, with the nearest one that has.
     """
@@ -57,7 +57,7 @@ def camera_of_frame(store: Store, frame: int, session: int | None = None) -> Pos
 
 
 def camera_at_time(store: Store, time_s: float, session: int | None = None) -> PosedCamera:
-    """The camera of the posed frame nearest to a time, seconds of the source's clock. Raises `OptionError`."""
+    """Return the camera of the posed frame nearest to a time, seconds of the source's clock. Raises `OptionError`."""
     if not np.isfinite(time_s):
         raise OptionError(f"time {time_s} must be a finite number of seconds")
     rows = [f for f in store.frames(_checked_session(store, session)) if f.state == "posed"]
@@ -72,7 +72,7 @@ def camera_at_pose(
     quat_wxyz: ArrayLike,
     session: int | None = None,
 ) -> PosedCamera:
-    """The camera of a session, put at a position of the world and turned by R_world_cam (OpenCV axes).
+    """Return the camera of a session, put at a position of the world and turned by R_world_cam (OpenCV axes).
 
     Raises `OptionError` for a pose that is none and for a memory that has no camera.
     """
@@ -93,7 +93,7 @@ def camera_at_pose(
 
 
 def last_camera(store: Store, session: int | None = None) -> PosedCamera:
-    """Where the camera was last. Raises `OptionError` when no frame has a pose."""
+    """Return where the camera was last. Raises `OptionError` when no frame has a pose."""
     rows = [f for f in store.frames(_checked_session(store, session)) if f.state == "posed"]
     if not rows:
         raise OptionError(f"{store.path} has no frame with a pose to look from")

@@ -1,7 +1,7 @@
-"""What a question can be about, in a memory that holds too much to look at all of it.
+"""Collect the instances that a question can be about, in a memory with too many to load all.
 
-The index of words tells who bears the words of a phrase, and the stored relations which of those stand as they should;
-only these are loaded. In a memory of up to `EVERYTHING` things all are looked at, to the same answers.
+The word index gives the instances that have the words of a phrase, and the stored relations those of them that stand
+as asked; only these are loaded. In a memory of up to `EVERYTHING` instances all are loaded, with the same answers.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from list3r.queries.match import checked_instance
 from list3r.queries.views.viewpoint import VIEWPOINT
 
 EVERYTHING = 5_000
-"""Up to so many instances all are looked at."""
+"""Up to so many instances all are loaded."""
 _MOST_BEARING = 300_000
-"""Ids that bear the words of one phrase, at the most."""
+"""Ids that have the words of one phrase, at most."""
 _MOST = 5_000
-"""Instances that are loaded for one phrase, at the most."""
+"""Instances that are loaded for one phrase, at most."""
 _SAMPLE = 1_000
 """Instances that tell how large things are, and what they are called."""
 _KEPT = 20
@@ -42,16 +42,16 @@ class Gathered:
     """Some of all things, spread evenly."""
 
     def bearing(self, store: Store, words: tuple[str, ...]) -> list[int]:
-        """Ids that bear all of some words, the best first."""
+        """Return ids that bear all of some words, the best first."""
         if words not in self._bearing:
             found = store.bearing(words, _MOST_BEARING + 1)
             if len(found) > _MOST_BEARING:
-                self.notes.append(f"more than {_MOST_BEARING} things are {' '.join(words)}; say more")
+                self.notes.append(f"more than {_MOST_BEARING} instances match {' '.join(words)}; add words")
             self._bearing[words] = found[:_MOST_BEARING]
         return self._bearing[words]
 
     def sizes_of(self, store: Store, words: tuple[str, ...]) -> NDArray[np.float64]:
-        """Longest edges of some of the things that bear some words, of any where fewer than four do; ascending."""
+        """Return longest edges of some of things that bear some words, of any where fewer than four do; ascending."""
         bearing = self.bearing(store, words) if words else []
         ids = bearing[:: -(-len(bearing) // _SAMPLE)] if len(bearing) >= 4 else self.sample
         edges = [float(np.max(i.box.size)) for i in store.instances_of(ids) if i.structure is None]
@@ -59,17 +59,17 @@ class Gathered:
 
 
 def is_large(store: Store) -> bool:
-    """Whether a memory holds too much to look at all of it."""
+    """Tell whether a memory holds too much to look at all of it."""
     return store.largest_id() > EVERYTHING
 
 
 def sample(store: Store) -> list[Instance]:
-    """All instances, or some of all in a memory that holds too many."""
+    """Return all instances, or some of all in a memory that holds too many."""
     return store.instances_of(store.sample_ids(_SAMPLE)) if is_large(store) else store.instances()
 
 
 def gather(store: Store, phrase: Phrase) -> Gathered | None:
-    """What to look at for a question; None where that is everything."""
+    """Collect what to search for a question; None where that is everything."""
     if not is_large(store):
         return None
     out = Gathered(sample=store.sample_ids(_SAMPLE))
@@ -79,7 +79,7 @@ def gather(store: Store, phrase: Phrase) -> Gathered | None:
 
 
 def _candidates(store: Store, phrase: Phrase, out: Gathered) -> list[int] | None:
-    """Ids that a phrase may mean, the best first; None where it may mean anything. Those of its clauses are kept."""
+    """Return ids that a phrase may mean, best first; None where it may mean anything. Those of its clauses are kept."""
     found: list[int] | None = None
     if phrase.instance_id is not None:
         found = [checked_instance(store, phrase.instance_id).id]
@@ -99,7 +99,7 @@ def _candidates(store: Store, phrase: Phrase, out: Gathered) -> list[int] | None
 def _standing(
     store: Store, phrase: Phrase, clause: Clause, found: list[int] | None, objects: list[int] | None, out: Gathered
 ) -> list[int] | None:
-    """Those of `found` that stand so to one of the objects, which are kept."""
+    """Return those of `found` that stand so to one of the objects, which are kept."""
     if found is None and objects is None:
         _keep(out, clause.object, out.sample)
         return None
@@ -119,7 +119,7 @@ def _standing(
 
 
 def _near_structure(store: Store, objects: Sequence[int]) -> set[tuple[int, int]]:
-    """Pairs of anything and a wall or floor among some objects, whose boxes nearly meet."""
+    """Return pairs of anything and a wall or floor among some objects, whose boxes nearly meet."""
     out = set()
     for wall in store.instances_of(store.structure_among(objects[:_MOST])[:_KEPT]):
         reach = 0.1 * float(np.linalg.norm(np.ptp(wall.aabb, axis=0))) + 1.0
@@ -129,5 +129,5 @@ def _near_structure(store: Store, objects: Sequence[int]) -> set[tuple[int, int]
 
 def _keep(out: Gathered, phrase: Phrase, ids: Sequence[int]) -> None:
     if len(ids) > _MOST:
-        out.notes.append(f"{len(ids)} things may be meant by {phrase.text!r}; {_MOST} of them were looked at")
+        out.notes.append(f"{len(ids)} instances match {phrase.text!r}; {_MOST} of them were considered")
     out.ids.update(ids[:_MOST])

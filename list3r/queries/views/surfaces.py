@@ -1,4 +1,4 @@
-"""Surfaces of instances, kept while the instances stay as they are."""
+"""Surfaces of instances, cached while the instances stay as they are."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class SurfaceCache(LruCache[tuple[int, bytes], InstanceSurface]):
 
 
 def surface_of(store: Store, instance: Instance) -> InstanceSurface:
-    """The surface of an instance: its support, or its box where it has none."""
+    """Return the surface of an instance: its support, or its box where it has none."""
     known = store.derived.of(SurfaceCache)
     stamp = instance.aabb.tobytes() + instance.center.tobytes() + instance.observations.to_bytes(8, "little")
     key = instance.id, stamp
@@ -71,14 +71,14 @@ def surface_of(store: Store, instance: Instance) -> InstanceSurface:
 
 
 def surface_points(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
-    """Surface points of an instance in the world, thinned out (N, 3), and how far they lie from each other."""
+    """Return surface points of an instance in the world, thinned out (N, 3), and how far they lie from each other."""
     surface = surface_of(store, instance)
     return surface.points, surface.spacing
 
 
 def _surface(store: Store, instance: Instance) -> InstanceSurface:
-    """Support points inside the box, as deriving the box left strays out; those just outside are moved to its side, so
-    that a thing is never nearer than its box.
+    """Return the support points inside the box, as deriving the box left strays out; those just outside are moved to
+    its side, so that a thing is never nearer than its box.
     """
     points = store.surface_points(instance.id).astype(np.float64)
     if len(points):
@@ -96,14 +96,14 @@ _FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.f
 
 
 def _box_points(instance: Instance) -> NDArray[np.float64]:
-    """Corners and middles of edges and faces of the oriented box. Shape (26, 3)."""
+    """Return corners and middles of edges and faces of the oriented box. Shape (26, 3)."""
     box = instance.box
     points = box.center + (_FACES * box.size) @ box.rotation.T
     return np.asarray(np.clip(points, instance.aabb[0], instance.aabb[1]))
 
 
 def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float64]) -> float:
-    """From a point to the nearest surface point of an instance."""
+    """Measure from a point to the nearest surface point of an instance."""
     surface = surface_of(store, instance)
     if surface.support is not None:
         offset = surface.support - point
@@ -117,14 +117,14 @@ def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float6
 
 
 def _squared(x: float, y: float, z: float) -> float:
-    """Square of a distance by how far a point lies outside along three axes, not above 0 where it does not."""
+    """Return square of a distance by how far a point lies outside along three axes, not above 0 where it does not."""
     x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
     return x**2 + y**2 + z**2
 
 
 def distance_between(store: Store, a: Instance, b: Instance) -> float:
-    """Between the nearest surface points of two instances; 0 where they touch, which is where the points of one lie as
-    near to the other as to each other.
+    """Measure between the nearest surface points of two instances; 0 where they touch, which is where the points of one
+    lie as near to the other as to each other.
     """
     one, two = surface_of(store, a), surface_of(store, b)
     small, large = sorted((one, two), key=lambda s: len(s.points))

@@ -1,4 +1,4 @@
-"""left_of, right_of, in_front_of and behind, as somebody sees it who stands somewhere; and what is between two things.
+"""Judge left_of, right_of, in_front_of and behind from a viewpoint, and what is between two instances.
 
 The frame of reference: the viewer stands at a place (a point, the centre of an instance, or a camera) and looks level
 towards the middle of the two centres. `right` is to the viewer's right hand, `front` is towards the viewer. A thing is
@@ -24,7 +24,7 @@ VIEWPOINT = ("left_of", "right_of", "in_front_of", "behind")
 
 @dataclass(frozen=True)
 class Viewer:
-    """Who looks."""
+    """The viewpoint of a question."""
 
     place: Array
     """World. Shape (3,)."""
@@ -47,8 +47,8 @@ class BetweenRelation(Relation):
 
 
 def viewed(viewer: Viewer, subject: Instance, object: Instance, noise: float) -> list[Relation] | None:
-    """The viewpoint relations of two things; None where they cannot be told: the viewer stands above, below or amidst
-    them, or they live in parts of the memory that are not joined.
+    """Return the viewpoint relations of two things; None where they cannot be told: the viewer stands above, below or
+    amidst them, or they are in different connected components.
 
     `noise` is the standard deviation of a position, world units.
     """
@@ -75,8 +75,8 @@ def viewed(viewer: Viewer, subject: Instance, object: Instance, noise: float) ->
 
 
 def between(subject: Instance, a: Instance, b: Instance, noise: float) -> BetweenRelation | None:
-    """Whether a thing lies between two others: in the gap between their boxes it meets the tube that the thinner of
-    the two sweeps along the line of the centres, and is not so long as to be under or behind both. The margin is how
+    """Tell whether a thing lies between two others: in the gap between their boxes it meets the tube that the thinner
+    of the two sweeps along the line of the centres, and is not so long as to be under or behind both. The margin is how
     deep; None when it does not.
     """
     line = b.center - a.center
@@ -100,5 +100,5 @@ def between(subject: Instance, a: Instance, b: Instance, noise: float) -> Betwee
 
 
 def _extent(instance: Instance, axis: Array) -> float:
-    """Full length of a thing's box along a direction."""
+    """Return the full length of a thing's box along a direction."""
     return float(np.ptp(instance.box.corners() @ axis))

@@ -1,4 +1,4 @@
-"""What a camera would see: supports projected into its picture, each hidden by what lies before it.
+"""Render what a camera would see: supports projected into its picture, each hidden by what lies before it.
 
 The picture is a depth buffer at a fraction of the image's size. Every surface point covers a square as wide as its
 thing's points lie apart, so that surfaces are closed as far as they are known; a thing shows where it is the nearest,
@@ -69,7 +69,7 @@ def look(
     max_depth: float | None = None,
     occlusion: bool = True,
 ) -> list[Visibility]:
-    """The instances of which something shows, by id; those of other components than the camera's cannot be seen.
+    """Return the instances of which something shows, by id; those of other components than the camera's cannot be seen.
 
     `instances` are all that may hide or show. `max_depth` is the far end of the frustum, world units along z. Without
     `occlusion` nothing hides anything.
@@ -99,7 +99,7 @@ def look(
 
 
 def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) -> list[Instance]:
-    """What may show or hide in a picture, by id: what the R*Tree finds in the box around the frustum.
+    """Return what may show or hide in a picture, by id: what the R*Tree finds in the box around the frustum.
 
     In a memory of more than `_MANY` things those are left out that are narrower there than two cells of the buffer.
     """
@@ -127,7 +127,7 @@ def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) 
 
 
 def _depths(boxes: NDArray[np.float64], camera: PosedCamera) -> NDArray[np.float64]:
-    """Depths of the corners of boxes (N, 2, 3). Shape (N, 8)."""
+    """Return depths of the corners of boxes (N, 2, 3). Shape (N, 8)."""
     ahead = camera.T_world_cam[:3, 2]
     parts = (boxes - camera.place) * ahead
     sums = parts[:, :, None, None, 0] + parts[:, None, :, None, 1] + parts[:, None, None, :, 2]
@@ -137,7 +137,7 @@ def _depths(boxes: NDArray[np.float64], camera: PosedCamera) -> NDArray[np.float
 def _draw(
     store: Store, camera: PosedCamera, instance: Instance, step: float, size: tuple[int, int], max_depth: float | None
 ) -> _Drawn | None:
-    """The cells that an instance covers when nothing else is there, and its depth in each; None for none."""
+    """Return the cells that an instance covers when nothing else is there, and its depth in each; None for none."""
     R, t = camera.T_world_cam[:3, :3], camera.T_world_cam[:3, 3]
     corners = (instance.box.corners() - t) @ R
     if corners[:, 2].max() <= 0.0 or (max_depth is not None and corners[:, 2].min() > max_depth * 1.05):
@@ -168,7 +168,7 @@ def _splat(
     reach: NDArray[np.int64],
     size: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Least depth in each cell when every point covers `reach` cells to each side; infinite where nothing is."""
+    """Return least depth in each cell when every point covers `reach` cells to each side; infinite where nothing is."""
     height, width = size
     buffer = np.full((height, width), np.inf)
     flat = buffer.ravel()
@@ -187,8 +187,8 @@ def _splat(
 
 
 def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
-    """Surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie apart: of
-    most of them the second neighbour is nearer, so that squares of that width close the surface.
+    """Return the surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie
+    apart: of most of them the second neighbour is nearer, so that squares of that width close the surface.
     """
     points = store.support(instance.id).points.astype(np.float64)
     slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
