@@ -43,7 +43,7 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
 
 def test_find(ask: Any) -> None:
     status, out, err = ask("find", "mug on table")
-    assert status == 0 and "on #2 table" in out and "2 things answer" in err
+    assert status == 0 and "on #2 table" in out and "2 instances match" in err
     found = json.loads(ask("find", "mug on table", "--json")[1])
     assert [m["id"] for m in found["matches"]] == [MUG, TWIN] and found["ambiguous"]
     assert found["matches"][0]["view"]["frame"] == 3
