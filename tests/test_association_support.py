@@ -10,8 +10,8 @@ from list3r.association.overlap.alignment import align
 from list3r.association.overlap.balance import balanced_support
 from list3r.association.overlap.shared_points import Pairs, shared_pairs, shared_samples
 from list3r.association.overlap.support import (
+    EdgeSupportSettings,
     Mask,
-    SupportSettings,
     confident,
     displacement,
     divide,
@@ -28,7 +28,7 @@ from list3r.reconstruction.settings import SampleSettings
 from tests.association_scenes import BOX, BOXES, CAMERA, FLOOR, MOVER, WALL, Thing, film
 
 S_V = Sim3.exp([-0.3, 0.6, 0.1, -0.2, 0.4, 0.9, -0.3])
-SETTINGS = SupportSettings()
+SETTINGS = EdgeSupportSettings()
 PERSON = Thing(MOVER, (-0.6, 0.2, 1.9), (0.35, 1.1), (0.03, 0.0, 0.0))
 
 

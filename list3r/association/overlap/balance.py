@@ -8,12 +8,12 @@ import numpy as np
 
 from list3r.association.overlap.shared_points import Pairs
 from list3r.association.overlap.support import (
+    EdgeSupportSettings,
     Floats,
     Ints,
     Mask,
     Regions,
     StaticSupport,
-    SupportSettings,
     divide,
     median,
     relative_to_frame,
@@ -40,7 +40,9 @@ class BalancedSupport:
     """Pairs that went into them. Shape (N,)."""
 
 
-def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settings: SupportSettings) -> BalancedSupport:
+def balanced_support(
+    pairs: Pairs, static: StaticSupport, camera: Camera, settings: EdgeSupportSettings
+) -> BalancedSupport:
     """Return one correspondence for each patch of what stands still: a block of the picture in one region of one frame.
 
     Pairs of one patch err together, so what a patch is worth does not grow with its pairs for long, and neither a wall
@@ -80,7 +82,7 @@ def balanced_support(pairs: Pairs, static: StaticSupport, camera: Camera, settin
 
 
 def _patches(
-    pairs: Pairs, regions: Regions, usable: Mask, camera: Camera, settings: SupportSettings
+    pairs: Pairs, regions: Regions, usable: Mask, camera: Camera, settings: EdgeSupportSettings
 ) -> tuple[Ints, int]:
     """Return the number of the patch of each usable pair (0 for others), and how many there are; at most `budget`."""
     _, frame = np.unique(pairs.frame, return_inverse=True)
@@ -97,7 +99,7 @@ def _patches(
     return patch, len(values)
 
 
-def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: SupportSettings) -> Floats:
+def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: EdgeSupportSettings) -> Floats:
     """Return trust in each pair: Tukey's biweight of how far along ray it lies from its patch's median. Shape (N,)."""
     trust = np.zeros(len(off))
     rows = np.flatnonzero(usable)
@@ -116,7 +118,7 @@ def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: 
     return trust
 
 
-def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, settings: SupportSettings) -> Floats:
+def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, settings: EdgeSupportSettings) -> Floats:
     """Return information of each pair, relative to its depth: its share of 1 / (t^2 + s^2 / n) of its patch of n pairs.
 
     t is the deviation of whole patches of its region, s that of pairs within them, both robust, and drawn towards those

@@ -16,10 +16,10 @@ from list3r.association.overlap.alignment import Alignment, AlignmentSettings, a
 from list3r.association.overlap.balance import BalancedSupport, balanced_support
 from list3r.association.overlap.shared_points import Pairs, shared_pairs
 from list3r.association.overlap.support import (
+    EdgeSupportSettings,
     Fit,
     Mask,
     StaticSupport,
-    SupportSettings,
     confident,
     static_support,
 )
@@ -43,7 +43,7 @@ class EdgeSettings:
     """Largest share of the confident pairs that may move in an accepted edge."""
     trial_pairs: int = 1500
     """Pairs that a trial alignment works on."""
-    support: SupportSettings = field(default_factory=SupportSettings)
+    support: EdgeSupportSettings = field(default_factory=EdgeSupportSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
 
 
@@ -156,7 +156,7 @@ def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
     return fit
 
 
-def _confident_support(pairs: Pairs, settings: SupportSettings) -> tuple[StaticSupport, BalancedSupport]:
+def _confident_support(pairs: Pairs, settings: EdgeSupportSettings) -> tuple[StaticSupport, BalancedSupport]:
     """Return all pairs that confidence alone would take, weighted by their confidence."""
     sure = confident(pairs, settings)
     none = np.zeros(len(pairs), bool)

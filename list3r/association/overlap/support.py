@@ -33,7 +33,7 @@ Fit = Callable[[Pairs, Mask], Sim3]
 
 
 @dataclass(frozen=True)
-class SupportSettings:
+class EdgeSupportSettings:
     """What counts as confident, as moving, and how the support is spread."""
 
     confidence_share: float = 0.1
@@ -132,13 +132,13 @@ class StaticSupport:
     """Largest delta of a region that stays."""
 
 
-def confident(pairs: Pairs, settings: SupportSettings) -> Mask:
+def confident(pairs: Pairs, settings: EdgeSupportSettings) -> Mask:
     """Return pairs that confidence alone would take. Shape (N,)."""
     least = settings.confidence_share * min(np.median(pairs.confidence_u), np.median(pairs.confidence_v))
     return np.asarray((pairs.confidence_u > least) & (pairs.confidence_v > least))
 
 
-def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: SupportSettings) -> Regions:
+def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: EdgeSupportSettings) -> Regions:
     """Return regions by one chunk's instances, and by blocks of the picture where there is none."""
     columns, rows = settings.blocks
     block = (pairs.pixel % camera.width) * columns // camera.width
@@ -149,7 +149,7 @@ def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: SupportSettin
 
 
 def static_support(
-    pairs: Pairs, camera: Camera, fit: Fit, settings: SupportSettings, known: Mask | None = None
+    pairs: Pairs, camera: Camera, fit: Fit, settings: EdgeSupportSettings, known: Mask | None = None
 ) -> StaticSupport:
     """Find what stands still, and the similarity it agrees on, even where a mover covers half of the pairs.
 
@@ -223,7 +223,7 @@ def displacement(pairs: Pairs, S_v_u: Sim3, camera: Camera, sure: Mask, removed:
 
 
 def inconsistency(
-    off: Displacement, regions: Regions, frame: Ints, camera: Camera, settings: SupportSettings
+    off: Displacement, regions: Regions, frame: Ints, camera: Camera, settings: EdgeSupportSettings
 ) -> Inconsistency:
     """Tell how far each region is off, and whether that is more than what stands still is off by. `frame` has shape
     (N,)."""
@@ -261,7 +261,7 @@ def relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:
 
 
 def _best_hypothesis(
-    pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: SupportSettings
+    pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: EdgeSupportSettings
 ) -> tuple[Sim3, Mask]:
     """Return the similarity that most regions agree with (of all pairs, of what has no instance, and of each large
     region), and the pairs of the regions that do not.
@@ -309,7 +309,7 @@ def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mas
 
 
 def _limit(
-    value: Floats, still: NDArray[np.signedinteger], judged: Mask, settings: SupportSettings, least: float
+    value: Floats, still: NDArray[np.signedinteger], judged: Mask, settings: EdgeSupportSettings, least: float
 ) -> float:
     """Return what a static region is off by at most, from those that were not removed."""
     vote = np.asarray(np.sqrt(still) * judged, np.float64)
