@@ -148,11 +148,12 @@ def keyframe_pictures(store: Store, instance_ids: Sequence[int] | None = None) -
         for frame in frames:
             keeper.setdefault((chunk.session_id, frame), chunk)
             sights.setdefault((chunk.session_id, frame), {})
-        for o in followed.get(chunk_id, []) if frames else []:
-            for frame, sight in _sights(o, store.mask_track(o.chunk_id, o.local_id), frames):
-                seen = sights[(chunk.session_id, frame)]
-                if o.instance_id not in seen or seen[o.instance_id].worth() < sight.worth():
-                    seen[o.instance_id] = sight
+        observations = followed.get(chunk_id, []) if frames else []
+        found = (x for o in observations for x in _sights(o, store.mask_track(o.chunk_id, o.local_id), frames))
+        for frame, sight in found:
+            seen = sights[(chunk.session_id, frame)]
+            if sight.instance_id not in seen or seen[sight.instance_id].worth() < sight.worth():
+                seen[sight.instance_id] = sight
     out = []
     for key in sorted(sights):
         chunk, seen = keeper[key], sights[key]

@@ -86,12 +86,13 @@ def chosen_views(
     s, wanted = settings or PackSettings(), set(listed)
     shows: dict[int, set[int]] = {n: set() for n in range(len(pictures))}
     best: dict[int, tuple[float, int]] = {}
-    for n, picture in enumerate(pictures):
-        for sight in picture.sights:
-            if sight.instance_id in wanted:
-                best[sight.instance_id] = max(best.get(sight.instance_id, (-1.0, 0)), (sight.worth(), -n))
-                if sight.visible_fraction >= s.least_visible and sight.area_px >= s.least_side_px**2:
-                    shows[n].add(sight.instance_id)
+    sights = ((n, sight) for n, picture in enumerate(pictures) for sight in picture.sights)
+    for n, sight in sights:
+        if sight.instance_id not in wanted:
+            continue
+        best[sight.instance_id] = max(best.get(sight.instance_id, (-1.0, 0)), (sight.worth(), -n))
+        if sight.visible_fraction >= s.least_visible and sight.area_px >= s.least_side_px**2:
+            shows[n].add(sight.instance_id)
     readable = set[int]().union(*shows.values())
     for instance_id, (_, n) in best.items():
         if instance_id not in readable:
