@@ -32,11 +32,11 @@ class Edit:
     kind: str
     """merge, split, label, delete, scale, undo."""
     parts: tuple[tuple[Key, ...], ...]
-    """The local instances it speaks of: the two things of a merge, the two parts of a split, else one thing."""
+    """The local instances it speaks of: the two instances of a merge, the two parts of a split, else one instance."""
     through: int
     """The last chunk then."""
     before: tuple[tuple[int, str | None, tuple[Key, ...]], ...]
-    """Ids, labels and local instances of the things it touched, as they were: what an undo brings back."""
+    """Ids, labels and local instances of the instances it touched, as they were: what an undo brings back."""
     text: str | None = None
     """The new label, or the anchor of scale as it was said."""
     target: int | None = None
@@ -111,14 +111,14 @@ class LinkConstraints:
 
 @dataclass(frozen=True)
 class Deletion:
-    """A thing that was taken out of the memory."""
+    """An instance that was taken out of the memory."""
 
     keys: frozenset[Key]
     through: int
-    """The last chunk then: what it or an earlier one saw, and what was not deleted, is another thing."""
+    """The last chunk then: what it or an earlier one saw, and what was not deleted, is another instance."""
 
     def outside(self, keys: Collection[Key]) -> bool:
-        """Whether any of these was there when the thing was deleted, and stayed."""
+        """Whether any of these was there when the instance was deleted, and stayed."""
         return any(k[0] <= self.through and k not in self.keys for k in keys)
 
 
@@ -162,7 +162,7 @@ class Constraints:
         return ConstraintCheck(self)
 
     def forbids(self, a: Collection[Key], b: Collection[Key]) -> str:
-        """Why two whole groups must not be made one thing, or nothing."""
+        """Why two whole groups must not be made one instance, or nothing."""
         if not self:
             return ""
         check = self.check()
@@ -206,7 +206,7 @@ class Constraints:
         return sorted(out), known
 
     def deleted(self, group: Collection[Key]) -> bool:
-        """Whether a group is a thing that was deleted, or what was seen of it later."""
+        """Whether a group is an instance that was deleted, or what was seen of it later."""
         return any(not d.keys.isdisjoint(group) and not d.outside(group) for d in self.deletions)
 
     def shown(self, groups: Sequence[Sequence[Key]], evidence: Iterable[bool]) -> list[bool]:
@@ -217,7 +217,7 @@ class Constraints:
         ]
 
     def remembered(self, groups: Sequence[Sequence[Key]], before: Mapping[Key, int]) -> dict[Key, int]:
-        """The ids of before without those of deleted things."""
+        """The ids of before without those of deleted instances."""
         gone = {k for g in groups if self.deleted(g) for k in g} if self.deletions else set()
         return {k: n for k, n in before.items() if k not in gone}
 

@@ -1,11 +1,11 @@
-"""What has changed between sessions: things seen again, moved, removed, added (design 3.9).
+"""What has changed between sessions: instances seen again, moved, removed, added (design 3.9).
 
-Things of two sessions are one where their surfaces meet, they look alike, and neither session sees through the surface
-of the other. A thing of an earlier session that the new one did not find is asked about in the new session's frames:
-only where they see through its place, or measure there the surface of something new, is it gone, and what no frame
-could see stays unseen. What is new is asked about in the frames of the sessions before in the same
-way. What is gone from one place and new at another is one thing that moved if it looks and measures the same, one to
-one, the best pairs first decided together. A thing that moved keeps what earlier sessions saw of it, but its body is
+Instances of two sessions are one where their surfaces meet, they look alike, and neither session sees through the
+surface of the other. An instance of an earlier session that the new one did not find is asked about in the new
+session's frames: only where they see through its place, or measure there the surface of something new, is it gone, and
+what no frame could see stays unseen. What is new is asked about in the frames of the sessions before in the same way.
+What is gone from one place and new at another is one instance that moved if it looks and measures the same, one to one,
+the best pairs first decided together. An instance that moved keeps what earlier sessions saw of it, but its box is
 that of the place where it is now.
 """
 
@@ -38,7 +38,7 @@ def across_sessions(
     seen: FreeSpaceCarving,
     settings: ChangeSettings,
 ) -> dict[tuple[int, int], PairScores]:
-    """Scores of pairs without those that plainly are two things of two sessions at one place."""
+    """Scores of pairs without those that plainly are two instances of two sessions at one place."""
     if len({s.session_id for s in shapes.values()}) < 2:
         return dict(pairs)
     out = {}
@@ -80,7 +80,7 @@ def find_changes(
 
 
 def as_events(changes: Changes, ids: Mapping[Key, int | None]) -> list[ChangeEvent]:
-    """The events of things that have an id, by the first member of their groups."""
+    """The events of instances that have an id, by the first member of their groups."""
     out = []
     for c in changes.events:
         instance = ids.get(c.first)

@@ -1,7 +1,8 @@
 """How much of each local instance the frames of another session see through: what stayed, and what did not.
 
-Two local instances of two sessions at one place are one thing only if neither session sees through the surface of the
-other. That is asked of depth alone, so it holds for two things that look alike and for one thing in another light.
+Two local instances of two sessions at one place are one instance only if neither session sees through the surface of
+the other. That is asked of depth alone, so it holds for two instances that look alike and for one instance in another
+light.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What was told of changes when a session last ended, in terms of local instances, which never change.
 
-Until the next session ends it stands: its chunks come to the library by overlap alone, what had moved stays one thing
-whose body is where it was last, and what had events stays shown. Then all is told anew (`memory.changes`).
+Until the next session ends it stands: its chunks come to the library by overlap alone, what had moved stays one
+instance whose box is where it was last, and what had events stays shown. Then all is found anew (`change.detection`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Group = tuple[Key, ...]
 
 @dataclass(frozen=True)
 class MovedInstance:
-    """A thing that was at several places."""
+    """An instance that was at several places."""
 
     places: tuple[Group, ...]
     """Groups by overlap."""
@@ -38,7 +38,7 @@ class ChangeLedger:
     """The last session that it tells of."""
     moved: tuple[MovedInstance, ...] = ()
     with_events: frozenset[Key] = frozenset()
-    """A local instance of every thing that has an event."""
+    """A local instance of every instance that has an event."""
 
     @staticmethod
     def of(changes: Changes, places: Sequence[Sequence[Key]], session: int) -> ChangeLedger:
@@ -56,7 +56,7 @@ class ChangeLedger:
         return not self.with_events.isdisjoint(group)
 
     def current(self, group: Sequence[Key]) -> tuple[Key, ...]:
-        """The members of a thing that show it where it is now; all, but for what has moved."""
+        """The members of an instance that show it where it is now; all, but for what has moved."""
         here = set(group)
         for m in self.moved:
             if not here.isdisjoint(m.places[m.now]):
@@ -70,8 +70,8 @@ class ChangeLedger:
     def joined(
         self, groups: Sequence[Sequence[Key]], components: Mapping[int, int]
     ) -> tuple[list[list[Key]], ChangeLedger]:
-        """Groups by overlap with those joined that are the places of one thing, and the ledger with the places as they
-        have become; what it says of things that are not among the groups stands. `components` by chunk id.
+        """Groups by overlap with those joined that are the places of one instance, and the ledger with the places as
+        they have become; what it says of instances that are not among the groups stands. `components` by chunk id.
         """
         home = {key: n for n, group in enumerate(groups) for key in group}
         sets = DisjointSet(range(len(groups)))
@@ -96,13 +96,13 @@ class ChangeLedger:
         return out, ChangeLedger(self.session, tuple(moved), self.with_events)
 
     def state(self, before: str | None, group: Sequence[Key], rows: Mapping[int, ChunkRow]) -> str:
-        """The state of a thing: the one that was told, until a later session sees it."""
+        """The state of an instance: the one that was told, until a later session sees it."""
         later = any(rows[k].session_id > self.session for k in {k for k, _ in group})
         return "present" if before is None or later else before
 
 
 def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> MovedInstance | None:
-    """The places of one thing as groups have become; nothing where they are one by overlap."""
+    """The places of one instance as groups have become; nothing where they are one by overlap."""
     if before is None or len(groups) < 2:
         return None
     there = set(before.places[before.now])

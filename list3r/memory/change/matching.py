@@ -21,7 +21,7 @@ _NEVER = 1e6
 
 @dataclass
 class _PlacedInstance:
-    """One thing and the places it had: groups by overlap, of which one is where it is now."""
+    """One instance and the places it had: groups by overlap, of which one is where it is now."""
 
     places: list[int]
     now: int
@@ -30,14 +30,14 @@ class _PlacedInstance:
 
 @dataclass(frozen=True)
 class _Move:
-    """A thing that is gone from one place and found at another."""
+    """An instance that is gone from one place and found at another."""
 
-    thing: _PlacedInstance
+    placed: _PlacedInstance
     place: int
     deviations: float
     """Sum of squared deviations between what is gone and what is found."""
     chance: float
-    """Of being the same thing rather than one of the other candidates or none, in [0, 1]."""
+    """Of being the same instance rather than one of the other candidates or none, in [0, 1]."""
 
 
 class ChangeMatching:
@@ -52,9 +52,9 @@ class ChangeMatching:
             for n, g in enumerate(places.groups)
         ]
         self._counts = [bool(show) and loose for show, loose in zip(found.shown, self._movable, strict=True)]
-        self._thing = {n: _PlacedInstance([n], n) for n in range(len(places.groups))}
+        self._placed = {n: _PlacedInstance([n], n) for n in range(len(places.groups))}
         self._instead: set[int] = set()
-        """New things that stand where others stood."""
+        """New instances that stand where others stood."""
         self._events: list[tuple[int, Change]] = []
         self._decisions: list[MergeDecision] = []
 
@@ -66,9 +66,9 @@ class ChangeMatching:
         fresh = [n for n in fresh if self._counts[n] and p.known_before(n, session)]
         looks = {n: p.look_before(n, session) for n in fresh}
         gone = self._missing(session, components, [n for n in fresh if looks[n].verdict != "unseen"])
-        left = {thing.now: p.box(thing.now, session, before=True) for thing, _ in gone}
+        left = {placed.now: p.box(placed.now, session, before=True) for placed, _ in gone}
         came = {n: p.box(n, session, before=False) for n in fresh}
-        found_gone = {thing.now: found for thing, found in gone}
+        found_gone = {placed.now: found for placed, found in gone}
         replaced = {n for n in fresh if n in self._instead or self._replaces(n, left, session)}
         eligible = [n for n in fresh if looks[n].verdict != "there" or n in replaced]
         news = {n: came[n] for n in eligible}
@@ -76,20 +76,20 @@ class ChangeMatching:
         lost = [(t, found) for t, found in gone if not self._scrap(t.now, left, session, before=True)]
         for move in self._moves(lost, whole, session):
             fresh.remove(move.place)
-            self._move(move, session, found_gone[move.thing.now])
-        for thing, found in gone:
-            if thing.state == "unseen" and self._counts[thing.now]:
-                if self._scrap(thing.now, left, session, before=True):
-                    thing.state = "removed"
+            self._move(move, session, found_gone[move.placed.now])
+        for placed, found in gone:
+            if placed.state == "unseen" and self._counts[placed.now]:
+                if self._scrap(placed.now, left, session, before=True):
+                    placed.state = "removed"
                 else:
-                    self._remove(thing, session, found)
+                    self._remove(placed, session, found)
         came = {n: box for n, box in came.items() if looks[n].verdict == "gone" or n in replaced}
         for n in fresh:
             if n in came and not self._scrap(n, came, session, before=False):
                 self._add(n, session, looks[n])
 
     def _replaces(self, n: int, left: dict[int, OrientedBox], session: int) -> bool:
-        """Whether a new thing stands where one stood that is gone."""
+        """Whether a new instance stands where one stood that is gone."""
         p, s = self._p, self._s
         return any(
             p.component[n] == p.component[place]
@@ -98,37 +98,37 @@ class ChangeMatching:
         )
 
     def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_PlacedInstance, Look]]:
-        """The things that are gone from where they were; all others that were known are given their state."""
+        """The instances that are gone from where they were; all others that were known are given their state."""
         p = self._p
         gone: list[tuple[_PlacedInstance, Look]] = []
-        for thing in self._things():
-            if p.sessions[thing.now][0] >= session or p.component[thing.now] not in components:
+        for placed in self._instances():
+            if p.sessions[placed.now][0] >= session or p.component[placed.now] not in components:
                 continue
-            seen = [n for n in thing.places if session in p.sessions[n]]
+            seen = [n for n in placed.places if session in p.sessions[n]]
             if seen:
-                self._seen(thing, seen, session)
-            elif thing.state != "removed":
-                found = self._look_for(thing, fresh, session)
-                gone += [] if found is None else [(thing, found)]
+                self._seen(placed, seen, session)
+            elif placed.state != "removed":
+                found = self._look_for(placed, fresh, session)
+                gone += [] if found is None else [(placed, found)]
         return gone
 
-    def _look_for(self, thing: _PlacedInstance, fresh: Sequence[int], session: int) -> Look | None:
-        """What frames tell about the place of a thing that was not found again, if it is gone from there."""
+    def _look_for(self, placed: _PlacedInstance, fresh: Sequence[int], session: int) -> Look | None:
+        """What frames tell about the place of an instance that was not found again, if it is gone from there."""
         p = self._p
-        thing.state = "unseen"
-        if not self._movable[thing.now] or p.frames(thing.now, session) < self._s.least_frames:
+        placed.state = "unseen"
+        if not self._movable[placed.now] or p.frames(placed.now, session) < self._s.least_frames:
             return None
-        found = p.look_after(thing.now, session)
-        other = self._displaced_by(thing.now, fresh, session)
-        if found.verdict == "gone" or other is not None or self._taken(thing.now, found, fresh, session):
+        found = p.look_after(placed.now, session)
+        other = self._displaced_by(placed.now, fresh, session)
+        if found.verdict == "gone" or other is not None or self._taken(placed.now, found, fresh, session):
             self._instead.update([] if other is None else [other])
             return found
-        if found.verdict == "there" and self._counts[thing.now]:
-            self._still_there(thing, session, found)
+        if found.verdict == "there" and self._counts[placed.now]:
+            self._still_there(placed, session, found)
         return None
 
     def _taken(self, n: int, found: Look, fresh: Sequence[int], session: int) -> bool:
-        """Whether something new stands where a thing was: what is not seen through of it lies at that."""
+        """Whether something new stands where an instance was: what is not seen through of it lies at that."""
         p, s = self._p, self._s
         if found.verdict == "unseen" or p.changed(n, session, before=True) < s.seen_through:
             return False
@@ -137,7 +137,7 @@ class ChangeMatching:
         return p.explained(n, new, session) >= s.explained
 
     def _displaced_by(self, n: int, fresh: Sequence[int], session: int) -> int | None:
-        """Something new of other looks that is where most of a thing was: two bodies are never at one place."""
+        """Something new of other looks that is where most of an instance was: two instances are never at one place."""
         p, s = self._p, self._s
         old = p.looks(n, session, before=True).feature
         for m in fresh:
@@ -150,11 +150,11 @@ class ChangeMatching:
                     return m
         return None
 
-    def _things(self) -> list[_PlacedInstance]:
-        return [thing for n, thing in sorted(self._thing.items()) if thing.places[0] == n]
+    def _instances(self) -> list[_PlacedInstance]:
+        return [placed for n, placed in sorted(self._placed.items()) if placed.places[0] == n]
 
     def _scrap(self, n: int, boxes: dict[int, OrientedBox], session: int, *, before: bool) -> bool:
-        """Whether it is a scrap of a larger thing that went or came with it."""
+        """Whether it is a scrap of a larger instance that went or came with it."""
         own = float(np.prod(boxes[n].size))
         return any(
             float(np.prod(box.size)) > own
@@ -163,79 +163,79 @@ class ChangeMatching:
             if m != n and self._p.component[m] == self._p.component[n]
         )
 
-    def _seen(self, thing: _PlacedInstance, places: list[int], session: int) -> None:
+    def _seen(self, placed: _PlacedInstance, places: list[int], session: int) -> None:
         p = self._p
-        place = thing.now if thing.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
-        kind = "seen_again" if place == thing.now else "moved"
-        before = p.box(thing.now, session, before=True, stayed=True)
+        place = placed.now if placed.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
+        kind = "seen_again" if place == placed.now else "moved"
+        before = p.box(placed.now, session, before=True, stayed=True)
         after = p.box(place, session, before=False, stayed=True)
-        thing.now, thing.state = place, "present" if kind == "seen_again" else "moved"
+        placed.now, placed.state = place, "present" if kind == "seen_again" else "moved"
         if self._counts[place]:
             frames = p.frames_in(place, session)
             reason = f"its surface was found at its place in {frames} frames"
             sure = frames / (frames + self._s.half_sure_frames)
             self._record(
-                thing,
-                Change(self._first(thing), session, kind, before, after, p.evidence(place, session), sure, reason),
+                placed,
+                Change(self._first(placed), session, kind, before, after, p.evidence(place, session), sure, reason),
             )
 
-    def _still_there(self, thing: _PlacedInstance, session: int, found: Look) -> None:
-        thing.state = "present"
-        box = self._p.box(thing.now, session, before=True, stayed=True)
+    def _still_there(self, placed: _PlacedInstance, session: int, found: Look) -> None:
+        placed.state = "present"
+        box = self._p.box(placed.now, session, before=True, stayed=True)
         reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
         self._record(
-            thing,
-            Change(self._first(thing), session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason),
+            placed,
+            Change(self._first(placed), session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason),
         )
 
-    def _remove(self, thing: _PlacedInstance, session: int, found: Look) -> None:
-        thing.state = "removed"
-        box = self._p.box(thing.now, session, before=True)
+    def _remove(self, placed: _PlacedInstance, session: int, found: Look) -> None:
+        placed.state = "removed"
+        box = self._p.box(placed.now, session, before=True)
         reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
         self._record(
-            thing, Change(self._first(thing), session, "removed", box, None, found.frames, self._sure(found), reason)
+            placed, Change(self._first(placed), session, "removed", box, None, found.frames, self._sure(found), reason)
         )
 
     def _add(self, place: int, session: int, found: Look) -> None:
-        thing = self._thing[place]
-        thing.state = "added"
+        placed = self._placed[place]
+        placed.state = "added"
         box = self._p.box(place, session, before=False)
         seen = f"{len(found.frames)} frames of an earlier session see through its place"
         known = found.verdict == "gone"
         reason = seen if known else "it stands where something else stood that is gone"
         sure = self._sure(found) if known else 0.5
         self._record(
-            thing,
-            Change(self._first(thing), session, "added", None, box, self._p.evidence(place, session), sure, reason),
+            placed,
+            Change(self._first(placed), session, "added", None, box, self._p.evidence(place, session), sure, reason),
         )
 
     def _move(self, move: _Move, session: int, found: Look) -> None:
-        p, thing, place = self._p, move.thing, move.place
-        old, new = p.box(thing.now, session, before=True), p.box(place, session, before=False)
-        a, b = p.groups[thing.now][0], p.groups[place][0]
+        p, placed, place = self._p, move.placed, move.place
+        old, new = p.box(placed.now, session, before=True), p.box(place, session, before=False)
+        a, b = p.groups[placed.now][0], p.groups[place][0]
         distance = float(np.linalg.norm(new.center - old.center)) / p.unit
         reason = f"gone from its place and found {distance:.2f} m away, of the same look and size"
         scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
         self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
         sure = self._sure(found) * move.chance
         self._record(
-            thing, Change(self._first(thing), session, "moved", old, new, p.evidence(place, session), sure, reason)
+            placed, Change(self._first(placed), session, "moved", old, new, p.evidence(place, session), sure, reason)
         )
-        thing.places.append(place)
-        thing.now, thing.state = place, "moved"
-        del self._thing[place]
+        placed.places.append(place)
+        placed.now, placed.state = place, "moved"
+        del self._placed[place]
 
     def _sure(self, found: Look) -> float:
         """How certain it is that what frames see through is gone."""
         frames = len(found.frames)
         return float(max(found.free, self._s.least_sure) * frames / (frames + 1.0))
 
-    def _first(self, thing: _PlacedInstance) -> Key:
-        return self._p.groups[thing.places[0]][0]
+    def _first(self, placed: _PlacedInstance) -> Key:
+        return self._p.groups[placed.places[0]][0]
 
-    def _record(self, thing: _PlacedInstance, change: Change) -> None:
+    def _record(self, placed: _PlacedInstance, change: Change) -> None:
         change = replace(change, frames=change.frames[:8], confidence=round(change.confidence, 3))
-        self._events.append((thing.places[0], change))
+        self._events.append((placed.places[0], change))
 
     def _moves(self, gone: Sequence[tuple[_PlacedInstance, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
         """Pairs of what is gone and what is new, one to one, of least difference in all."""
@@ -244,18 +244,18 @@ class ChangeMatching:
         p = self._p
         cost = np.full((len(gone), len(fresh)), _NEVER)
         new = [p.looks(n, session, before=False) for n in fresh]
-        for i, (thing, _) in enumerate(gone):
-            old = p.looks(thing.now, session, before=True)
-            taken = {s for n in thing.places for s in p.sessions[n]}
-            own = [k for n in thing.places for k in p.groups[n]]
+        for i, (placed, _) in enumerate(gone):
+            old = p.looks(placed.now, session, before=True)
+            taken = {s for n in placed.places for s in p.sessions[n]}
+            own = [k for n in placed.places for k in p.groups[n]]
             for j, n in enumerate(fresh):
                 if (
-                    p.component[n] == p.component[thing.now]
+                    p.component[n] == p.component[placed.now]
                     and not taken.intersection(p.sessions[n])
                     and not self._constraints.forbids(own, list(p.groups[n]))
                 ):
                     cost[i, j] = min(difference(old, new[j], self._s, p.unit), _NEVER)
-        # For every thing that is gone there is one more column: that it was not found, at the price of the limit.
+        # For every instance that is gone there is one more column: that it was not found, at the price of the limit.
         rest = np.full((len(gone), len(gone)), _NEVER)
         np.fill_diagonal(rest, self._s.moved_most)
         rows, columns = linear_sum_assignment(np.hstack([cost, rest]))
@@ -269,14 +269,14 @@ class ChangeMatching:
         """The groups as the matching leaves them."""
         groups, current, states = [], {}, {}
         names: dict[int, Key] = {}
-        for thing in self._things():
-            keys = sorted(k for n in thing.places for k in self._p.groups[n])
+        for placed in self._instances():
+            keys = sorted(k for n in placed.places for k in self._p.groups[n])
             groups.append(keys)
-            names[thing.places[0]] = keys[0]
-            if len(thing.places) > 1:
-                current[keys[0]] = tuple(self._p.groups[thing.now])
-            if thing.state != "present":
-                states[keys[0]] = thing.state
+            names[placed.places[0]] = keys[0]
+            if len(placed.places) > 1:
+                current[keys[0]] = tuple(self._p.groups[placed.now])
+            if placed.state != "present":
+                states[keys[0]] = placed.state
         events = tuple(replace(c, first=names[n]) for n, c in self._events if n in names)
         return Changes(sorted(groups), current, states, events, self._decisions)
 

@@ -1,4 +1,4 @@
-"""The places of things, session by session: what was seen there, what it looked like, what frames tell about it."""
+"""The places of instances, session by session: what was seen there, what it looked like, what frames tell about it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from list3r.memory.relations.instance_geometry import fit_box
 from list3r.memory.store.store import Store
 
 _SPREAD = 0.02
-"""Share of points outside the box at either end by which things are compared."""
+"""Share of points outside the box at either end by which instances are compared."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Looks:
 
 
 def difference(a: Looks, b: Looks, s: ChangeSettings, unit: float = 1.0) -> float:
-    """Sum of squared deviations between two looks; infinite for two that cannot be one thing."""
+    """Sum of squared deviations between two looks; infinite for two that cannot be one instance."""
     deviation = np.array(s.moved_share) * (a.extent + b.extent) / 2 + s.moved_m * unit
     sides = np.minimum(((a.extent - b.extent) / deviation) ** 2, s.moved_side_most)
     cosine = float(a.feature @ b.feature)
@@ -43,7 +43,7 @@ def difference(a: Looks, b: Looks, s: ChangeSettings, unit: float = 1.0) -> floa
 
 
 class Places:
-    """The groups of local instances as places of things, numbered."""
+    """The groups of local instances as places of instances, numbered."""
 
     def __init__(
         self,
@@ -115,12 +115,12 @@ class Places:
         return float(np.mean(np.all(off <= box.size / 2 + slack_m * self.unit, axis=1)))
 
     def look_after(self, n: int, session: int) -> Look:
-        """What a session's frames see where a thing was before."""
+        """What a session's frames see where an instance was before."""
         points = self.points(n, session, before=True)
         return look(points, self._views_of(session, self.component[n]), self._s.visibility)
 
     def look_before(self, n: int, session: int) -> Look:
-        """What the frames of the last session that could tell saw where a thing is now."""
+        """What the frames of the last session that could tell saw where an instance is now."""
         points = self.points(n, session, before=False)
         for views in self._views_before(n, session):
             found = look(points, views, self._s.visibility)
@@ -135,7 +135,8 @@ class Places:
         return self._changed(self.points(n, session, before=before), n, session, before=before)
 
     def explained(self, n: int, new: Sequence[int], session: int) -> float:
-        """Share of the surface that a thing had which is seen through or lies at what is new there, of what is told."""
+        """Share of the surface that an instance had which is seen through or lies at what is new there, of what is
+        told."""
         points = self.points(n, session, before=True)
         free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
         known = free + met > 0
@@ -155,13 +156,13 @@ class Places:
         return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
-        """The views of the sessions before, in the world of a thing, the last session first."""
+        """The views of the sessions before, in the world of an instance, the last session first."""
         component = self.component[n]
         earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
         return (self._views_of(s, component) for s in sorted(earlier, reverse=True))
 
     def known_before(self, n: int, session: int) -> bool:
-        """Whether an earlier session lies in the same world, so that a thing can be new to it."""
+        """Whether an earlier session lies in the same world, so that an instance can be new to it."""
         return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
 
     def looks(self, n: int, session: int, *, before: bool) -> Looks:
@@ -191,7 +192,8 @@ class Places:
         return np.array([_weighted_median(np.array(sizes)[:, d], np.array(weights)) for d in range(3)])
 
     def _views_across(self, n: int, session: int, *, before: bool) -> list[DepthView]:
-        """The views that tell what of a thing has changed: of this session where it was there before, else before."""
+        """The views that tell what of an instance has changed: of this session where it was there before, else
+        before."""
         return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
 
     def _without_what_stayed(self, points: Array, views: Sequence[DepthView]) -> Array:
@@ -209,15 +211,15 @@ class Places:
         return float(np.mean([self.shapes[k].structure[self._at(k, i)] for k, i in self.groups[n]]))
 
     def frames(self, n: int, before: int) -> int:
-        """Frames of earlier sessions in which a thing was seen."""
+        """Frames of earlier sessions in which an instance was seen."""
         return sum(self.frames_in(n, s) for s in self.sessions[n] if s < before)
 
     def frames_in(self, n: int, session: int) -> int:
-        """Frames of one session in which a thing was seen."""
+        """Frames of one session in which an instance was seen."""
         return len({f for _, f in self._sightings(n, session)})
 
     def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
-        """The frames of a session that see most of a thing."""
+        """The frames of a session that see most of an instance."""
         best: dict[int, int] = {}
         for area, frame in self._sightings(n, session):
             best[frame] = max(area, best.get(frame, 0))

@@ -13,17 +13,17 @@ from list3r.memory.records import MergeDecision
 
 @dataclass(frozen=True)
 class ChangeSettings:
-    """When two sessions show one thing, and when a thing has changed.
+    """When two sessions show one instance, and when an instance has changed.
 
     Chosen on pairs of simulated homes (decision 0023).
     """
 
     small_m: float = 0.7
-    """Diagonal of a thing that a session sees whole."""
+    """Diagonal of an instance that a session sees whole."""
     most_truncated: float = 0.5
-    """Share of its frames in which the border may cut a thing that is seen whole."""
+    """Share of its frames in which the border may cut an instance that is seen whole."""
     other_color: float = 25.0
-    """Between median colours (CIE L*a*b*, lightness at half weight) of two whole things that are not one;"""
+    """Between median colours (CIE L*a*b*, lightness at half weight) of two whole instances that are not one;"""
     other_size: float = 2.0
     """or the ratio of their diagonals."""
     seen_through: float = 0.2
@@ -31,44 +31,45 @@ class ChangeSettings:
     pure: float = 0.5
     """Share of what is seen through, beside the mean of all members, from which a member tells of what changed."""
     moved_share: tuple[float, float, float] = (0.1, 0.35, 0.1)
-    """Deviation of larger side, smaller side and height of one thing in two places, as a share of them,"""
+    """Deviation of larger side, smaller side and height of one instance in two places, as a share of them,"""
     moved_m: float = 0.01
     """and beside that."""
     moved_side_most: float = 3.0
-    """Squared deviations that one side counts at most: what hides a part of a thing says nothing against it."""
+    """Squared deviations that one side counts at most: what hides a part of an instance says nothing against it."""
     least_changed: float = 0.3
-    """Share of a thing's points that must have changed, for the others to be left out of its size."""
+    """Share of an instance's points that must have changed, for the others to be left out of its size."""
     moved_feature: float = 0.01
     """What 1 - cosine of the features counts as one squared deviation;"""
     moved_cosine: float = 0.9
     """and what the cosine must be at least."""
     moved_most: float = 9.5
-    """Sum of squared deviations up to which two are one thing."""
+    """Sum of squared deviations up to which two are one instance."""
     replaced: float = 0.4
-    """Share of a new thing's surface that must lie where a thing stood that is gone, to be new there;"""
+    """Share of a new instance's surface that must lie where an instance stood that is gone, to be new there;"""
     replaced_slack_m: float = 0.02
     """within this."""
     mostly_new: float = 0.5
-    """Share of a new thing's surface that earlier sessions see through, from which it is not mixed with what stood
+    """Share of a new instance's surface that earlier sessions see through, from which it is not mixed with what stood
     there before."""
     displaced: float = 0.5
-    """Share of what a thing showed that lies within something new of other looks, from which that has its place."""
+    """Share of what an instance showed that lies within something new of other looks, from which that has its place."""
     explained: float = 0.7
-    """Share of a thing's surface that must be seen through, or lie at what is new, for that to stand in its place;"""
+    """Share of an instance's surface that must be seen through, or lie at what is new, for that to stand in its
+    place;"""
     replaced_link_m: float = 0.045
     """within this."""
     part: float = 0.7
-    """Share of its surface inside the box of a larger thing of the same fate from which it is a scrap of that."""
+    """Share of its surface inside the box of a larger instance of the same fate from which it is a scrap of that."""
     least_frames: int = 12
-    """Frames in which a thing must have been seen for its absence or presence to be an event."""
+    """Frames in which an instance must have been seen for its absence or presence to be an event."""
     half_sure_frames: float = 4.0
     """Frames that make it half certain that an instance was seen again,"""
     least_sure: float = 0.3
     """and the least certainty, frames aside, that one is gone."""
     most_structure: float = 0.5
-    """Share of its members flagged as structure up to which a thing can come and go."""
+    """Share of its members flagged as structure up to which an instance can come and go."""
     points: int = 200
-    """Surface points of a thing that frames are asked about."""
+    """Surface points of an instance that frames are asked about."""
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
 
 
@@ -85,7 +86,7 @@ class OverlapGroups:
 
 @dataclass(frozen=True)
 class Change:
-    """An event before its thing has an id."""
+    """An event before its instance has an id."""
 
     first: Key
     """First member of the group that it is about."""

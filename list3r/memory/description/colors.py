@@ -1,4 +1,4 @@
-"""What a person would call a colour: the dominant colours of a thing, seen in the light of the whole memory."""
+"""What a person would call a colour: the dominant colours of an instance, seen in the light of the whole memory."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _XYZ = np.array(
 )
 _WHITE = np.array([0.95047, 1.0, 1.08883])
 _SAMPLE = 160
-"""Points of one thing whose colours are compared."""
+"""Points of one instance whose colours are compared."""
 _HALF_LIGHT = np.array([0.5, 1.0, 1.0])
-"""Lightness counts half between two points of one thing: shading changes it most."""
+"""Lightness counts half between two points of one instance: shading changes it most."""
 _ALIKE = 11.0
 """Within this, colours are one colour (CIE L*a*b*, lightness at half weight)."""
 _DARK_L, _DARK_WEIGHT = 22.0, 0.5
-"""What is darker may be shadow or the gap behind a thing, so it counts less when something else is there."""
+"""What is darker may be shadow or the gap behind an instance, so it counts less when something else is there."""
 _NEUTRAL_CHROMA = 14.0
 _FULL_WHITE_L = 96.0
 _MAX_GAIN, _MAX_CAST = 1.5, 6.0
@@ -29,13 +29,13 @@ _MAX_GAIN, _MAX_CAST = 1.5, 6.0
 
 @dataclass(frozen=True)
 class Swatch:
-    """One of the colours of a thing."""
+    """One of the colours of an instance."""
 
     rgb: tuple[int, int, int]
     lab: tuple[float, float, float]
     """CIE L*a*b* (D65) of it."""
     share: float
-    """Of the thing's points, in [0, 1]."""
+    """Of the instance's points, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def scene_reference(lab: Array) -> Reference:
 
 
 def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]:
-    """The colours of a thing, the commonest first: modes of its points' colours. Shape (N, 3); grey for none.
+    """The colours of an instance, the commonest first: modes of its points' colours. Shape (N, 3); grey for none.
 
     A mode is the point with most others alike, and takes them with it; the swatch is their median. What is mixed
     (edges, blur) lies between the modes and is counted to none.
@@ -107,7 +107,7 @@ def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]
 
 
 def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -> tuple[str, tuple[int, int, int]]:
-    """(name, RGB as seen) of the colour that most of a thing has, shades of one name counted together."""
+    """(name, RGB as seen) of the colour that most of an instance has, shades of one name counted together."""
     names = [color_name(s.lab, reference) for s in swatches]
     weight = [s.share * (_DARK_WEIGHT if s.lab[0] < _DARK_L else 1.0) for s in swatches]
     total = {n: sum(w for m, w in zip(names, weight, strict=True) if m == n) for n in names}
@@ -116,7 +116,7 @@ def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -
 
 
 def color_words(swatches: Sequence[Swatch], reference: Reference | None = None) -> str:
-    """The name of the main colour, or "red and white" where two clearly different ones share a thing."""
+    """The name of the main colour, or "red and white" where two clearly different ones share an instance."""
     name, _ = main_color(swatches, reference)
     share = {n: 0.0 for n in (color_name(s.lab, reference) for s in swatches)}
     for s in swatches:
@@ -163,7 +163,7 @@ def color_name(lab: Sequence[float], reference: Reference | None = None) -> str:
 
 
 def _least_chroma(light: float, hue: float) -> float:
-    """What is duller is grey to people: more is asked of what is bright, and of bluish things, as shadows are."""
+    """What is duller is grey to people: more is asked of what is bright, and of bluish ones, as shadows are."""
     least = 5.0 + 0.1 * min(light, 50.0) if light < 82.0 else 11.0
     return least + (2.0 if 150.0 < hue < 300.0 else 0.0)
 

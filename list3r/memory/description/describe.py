@@ -1,4 +1,4 @@
-"""Words for a thing without a label: size, colour and shape, and centimetres where the memory has metres."""
+"""Words for an instance without a label: size, colour and shape, and centimetres where the memory has metres."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from list3r.memory.geometry import Array
 
 _SMALL_M = 0.6
-"""Longest edge of what can be told to be round: of larger things too little is seen."""
+"""Longest edge of what can be told to be round: of larger instances too little is seen."""
 _SURFACE_M = 0.008
 """Deviation of support points from the surface that they lie on."""
 
 
 def shape_word(points: Array, size: Array, unit: float = 1.0) -> str:
-    """What a thing is shaped like, from points (N, 3) in the axes of its box and its full edge lengths (3,).
+    """What an instance is shaped like, from points (N, 3) in the axes of its box and its full edge lengths (3,).
 
-    The third axis stands upright where gravity is known; `unit` is what a metre is. Flat things are a `sheet`, a
+    The third axis stands upright where gravity is known; `unit` is what a metre is. Flat instances are a `sheet`, a
     `panel` (upright and large) or a `slab`; a `table` is a level top with nothing but legs under it; `cylinder` and
     `box` are said of what fits one and not the other; everything else is an `object`.
     """
@@ -49,14 +49,14 @@ def _is_table(points: Array, size: Array, unit: float) -> bool:
 
 
 def _sides(points: Array, size: Array) -> Array:
-    """The points below the top and above the bottom of a thing: those that tell its outline."""
+    """The points below the top and above the bottom of an instance: those that tell its outline."""
     level = points[:, 2] / max(float(size[2]), 1e-9)
     return points[(level < 0.3) & (level > -0.45)]
 
 
 def _on_circle(points: Array, size: Array, tolerance: float) -> float:
     """Share of the sides that lie on the circle that fits them best (Kasa's linear fit, once reweighted); 0 where the
-    circle is not the size of the thing.
+    circle is not the size of the instance.
     """
     sides = _sides(points, size)[:, :2]
     if len(sides) < 20:
@@ -83,7 +83,7 @@ def _on_faces(points: Array, size: Array, tolerance: float) -> float:
 
 
 def describe(shape: str, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
-    """Description of a thing: "small white cylinder, 9 cm".
+    """Description of an instance: "small white cylinder, 9 cm".
 
     `shape` is the `shape_word` and `size` (3,) the full edge lengths of its box, world units; `unit` is what a metre is
     about, also where the memory is not metric, and then no centimetres are told.

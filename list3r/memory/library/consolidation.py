@@ -1,14 +1,14 @@
 """Local instances of all chunks to the global library (paper 3.3): group, keep ids, derive, relate, log.
 
-There is one path (decision 0020). What has to be derived anew is a set of chunks (`DirtySet`): the one that came in and those that
-moved, or all of them where something changed that holds for the whole memory. What lies further away need not be
-looked at:
+There is one path (decision 0020). What has to be derived anew is a set of chunks (`DirtySet`): the one that came in and
+those that moved, or all of them where something changed that holds for the whole memory. What lies further away need
+not be looked at:
 
 - Groups are formed of a set that no edge leaves (`Grouping.partition`).
 - A group is weighed by the pairs of its own chunks.
-- Points that belong to something else are told by the cells of local instances that are new, moved or regrouped.
-- Structure and relations are told by what lies within a few metres, which the R*Tree finds; no instance is longer than
-  `MergeSettings.most_span_m`.
+- Points that belong to something else are decided by the cells of local instances that are new, moved or regrouped.
+- Structure and relations are decided by what lies within a few metres, which the R*Tree finds; no instance is longer
+  than `MergeSettings.most_span_m`.
 - What has changed between sessions is found when one ends, of the chunks that later sessions saw and of those that see
   the same places.
 """

@@ -1,4 +1,4 @@
-"""Which groups are things and which are fragments: what the other chunks say of the same place."""
+"""Which groups are instances and which are fragments: what the other chunks say of the same place."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class EvidenceSettings:
     """When a group of local instances is shown."""
 
     min_frames: int = 12
-    """A thing seen in fewer frames, over all chunks, is not shown; fewer are asked of a short memory."""
+    """An instance seen in fewer frames, over all chunks, is not shown; fewer are asked of a short memory."""
     min_share: float = 0.15
     """Share of all frames that is enough in a short memory, but never fewer than three frames."""
     swallowed: float = 0.75
-    """Share of its surface that another chunk gives to one other thing, to speak against it."""
+    """Share of its surface that another chunk gives to one other instance, to speak against it."""
     min_agreement: float = 0.4
     """Share of the chunks that saw its place and found it too."""
     claim_m: float = 0.1
-    """Edge of the cells in which the claims of things to a place are counted."""
+    """Edge of the cells in which the claims of instances to a place are counted."""
     claims: int = 4
-    """A bit that one chunk alone gives to a thing, and this many to another, is not part of it."""
+    """A bit that one chunk alone gives to an instance, and this many to another, is not part of it."""
     looks: LookSettings = field(default_factory=LookSettings)
-    """When a chunk of computed depth has missed a thing."""
+    """When a chunk of computed depth has missed an instance."""
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,15 @@ class Evidence:
     found: int
     """Chunks that found it."""
     swallowed: int
-    """Chunks that saw its place, but as part of another thing."""
+    """Chunks that saw its place, but as part of another instance."""
     within: tuple[int, ...]
-    """Those other things (numbers of groups), the one named most first."""
+    """Those other instances (numbers of groups), the one named most first."""
     missed: int = 0
     """Chunks of computed depth that looked at it in frames they share with one that found it, and found nothing."""
 
     @property
     def agreement(self) -> float:
-        """Share of the chunks that saw its place and found it as a thing of its own."""
+        """Share of the chunks that saw its place and found it as an instance of its own."""
         return self.found / max(self.found + self.swallowed + self.missed, 1)
 
     def shown(self, s: EvidenceSettings, all_frames: int) -> bool:
@@ -114,8 +114,8 @@ def weigh(
 def without_missed(
     before: Mapping[Key, int], groups: Sequence[Sequence[Key]], evidence: Sequence[Evidence], shown: Sequence[bool]
 ) -> dict[Key, int]:
-    """The ids of before without those of things that others looked at and missed, and that lie within no other: they
-    were never there, so that no thing goes on with their id.
+    """The ids of before without those of instances that others looked at and missed, and that lie within no other: they
+    were never there, so that no instance goes on with their id.
     """
     gone = {
         key
@@ -151,11 +151,12 @@ def contested(
     settings: EvidenceSettings,
     near: Ints | None = None,
 ) -> dict[int, tuple[Ints, NDArray[np.bool_]]]:
-    """The points of each chunk that it alone gives to a thing, while several chunks give their place to another one.
+    """The points of each chunk that it alone gives to an instance, while several chunks give their place to another
+    one.
 
-    Only things that at least three chunks found lose points so: a chair's back that one chunk took for table. Returns
-    by chunk which points were asked about and whether they are dropped, (M,) each; with `near` (keys of cells, see
-    `claim_cells`) only those that lie there are, and every local instance with points there must be in a group.
+    Only instances that at least three chunks found lose points so: a chair's back that one chunk took for table.
+    Returns by chunk which points were asked about and whether they are dropped, (M,) each; with `near` (keys of cells,
+    see `claim_cells`) only those that lie there are, and every local instance with points there must be in a group.
     """
     names = sorted(chunks)
     number = {k: n for n, k in enumerate(names)}

@@ -26,7 +26,7 @@ _KEPT = 400
 
 @dataclass(frozen=True)
 class DeriveSettings:
-    """How much evidence makes a thing certain, and how its extent is measured."""
+    """How much evidence makes an instance certain, and how its extent is measured."""
 
     half_frames: float = 12.0
     """Frames after which half of the doubt is gone."""
@@ -39,9 +39,9 @@ class DeriveSettings:
     flat: float = 0.15
     """Thickness over the second longest extent of what is flat."""
     confirmed: float = 0.25
-    """Share of the members that must have a surface at a point of a small thing of at least four whole views."""
+    """Share of the members that must have a surface at a point of a small instance of at least four whole views."""
     small_m: float = 0.5
-    """Diagonal of a small thing; of a larger one each chunk sees another part."""
+    """Diagonal of a small instance; of a larger one each chunk sees another part."""
     whole_views: int = 4
     """Whole views from which members vote on points,"""
     whole_share: float = 0.7
@@ -60,7 +60,7 @@ class DeriveSettings:
 
 @dataclass(frozen=True)
 class Member:
-    """One local instance of a thing."""
+    """One local instance of an instance."""
 
     shapes: ChunkShapes
     at: int
@@ -92,7 +92,7 @@ class DerivedInstance:
     """(session id, Frame.index) of every frame in which it is seen, in order."""
     best_view: BestView | None
     certainty: float
-    """How sure it is that it exists as one thing, before it is asked who else should have seen it."""
+    """How sure it is that it exists as one instance, before it is asked who else should have seen it."""
     anchor: int
     """Id of the chunk that saw it longest."""
     shape: str
@@ -164,7 +164,7 @@ def derive_instance(
     upright: bool,
     settings: DeriveSettings,
 ) -> DerivedInstance:
-    """All that follows from the members of one thing; `upright` says that z is up."""
+    """All that follows from the members of one instance; `upright` says that z is up."""
     s = settings
     own = [m.own() for m in members]
     points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[k]) for m, k in zip(members, own, strict=True)])
@@ -214,8 +214,8 @@ def _aabb(points: Array, trim: float) -> Array:
 def _confirmed(
     points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings
 ) -> NDArray[np.int64]:
-    """Points that enough of the members agree on: what a single chunk added to a thing that others saw whole is a bit
-    of something else. Members that the image's border cut have no say, and where they are many nothing is dropped.
+    """Points that enough of the members agree on: what a single chunk added to an instance that others saw whole is a
+    bit of something else. Members that the image's border cut have no say, and where they are many nothing is dropped.
     """
     whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
     need = int(np.ceil(s.confirmed * whole.sum()))
@@ -240,7 +240,7 @@ _NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
 def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:
-    """Normal of a thing that is flat in most of its views and as a whole, towards the cameras that saw it."""
+    """Normal of an instance that is flat in most of its views and as a whole, towards the cameras that saw it."""
     flat = [m for m in members if not np.isnan(m.shapes.plane[m.at]).any()]
     if 2 * len(flat) < len(members) or len(points) < 3:
         return None
@@ -254,12 +254,12 @@ def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Arra
 
 
 def with_agreement(found: DerivedInstance, agreement: float) -> DerivedInstance:
-    """The thing with its confidence; `agreement` is the share of the chunks that saw its place and found it."""
+    """The instance with its confidence; `agreement` is the share of the chunks that saw its place and found it."""
     return replace(found, geometry=replace(found.geometry, confidence=round(found.certainty * agreement, 4)))
 
 
 def _certainty(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:
-    """Grows with frames and with chunks that found the thing on their own; stability caps it."""
+    """Grows with frames and with chunks that found the instance on their own; stability caps it."""
     chunks = len({m.shapes.chunk_id for m in members})
     seen = frames / (frames + s.half_frames)
     agreed = 1.0 - 0.5**chunks

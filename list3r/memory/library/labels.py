@@ -1,4 +1,4 @@
-"""What things are called by detectors and by discoverers with class names: votes kept for local instances.
+"""What instances are called by detectors and by discoverers with class names: votes kept for local instances.
 
 Votes are log odds that add up, kept in the key-value table for each chunk and each source, so that labels follow
 whatever becomes of the groups, and a source that looks again replaces what it said itself and nothing else. An
@@ -22,7 +22,8 @@ _CLASSES = "label classes"
 _SCORES = (0.02, 0.98)
 """No score of a discoverer is taken for less or more than this."""
 PRIOR_ODDS = math.log(0.02 / 0.98)
-"""Log odds that a thing is of a given class before anything is seen: some fifty kinds of things stand in rooms."""
+"""Log odds that an instance is of a given class before anything is seen: some fifty kinds of instances stand in
+rooms."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class LabelSettings:
     """When votes make a label."""
 
     min_found: float = 1.2
-    """Independent pictures in which the class was found, weighted by how well they see the thing: one is not enough."""
+    """Independent pictures in which the class was found, weighted by how well they see the instance: one is not
+    enough."""
     min_confidence: float = 0.5
     """Probability of the class."""
     likeness: float = 0.4

@@ -88,10 +88,10 @@ def log_decisions(
         if not held and not store.has_decided(d.kind, d.a, d.b):
             fresh.append(d)
     for old, new in ids.aliases:
-        reason = f"#{old} and #{new} are one thing; the older id stays"
+        reason = f"#{old} and #{new} are one instance; the older id stays"
         fresh.append(MergeDecision("alias", f"#{old}", f"#{new}", {}, reason))
     for old, new in ids.splits:
-        reason = f"what was #{old} is more than one thing; the larger part keeps the id"
+        reason = f"what was #{old} is more than one instance; the larger part keeps the id"
         fresh.append(MergeDecision("split", f"#{old}", f"#{new}", {}, reason))
     store.log_decisions(chunk_id, fresh)
 

@@ -72,7 +72,7 @@ class ConsolidationReport:
     """What changed in the library."""
 
     instances: int
-    """Things in the library now."""
+    """Instances in the library now."""
     structure: int
     """Pieces of structure in it now."""
     new: tuple[int, ...]
@@ -80,14 +80,14 @@ class ConsolidationReport:
     merged: tuple[tuple[int, int], ...]
     """(id that retired, id that it is an alias of)."""
     hidden: int
-    """Groups of local instances that are not shown: seen too little, or fragments of a thing that is."""
+    """Groups of local instances that are not shown: seen too little, or fragments of an instance that is."""
     written: frozenset[int] | None = None
     """Ids that were written anew or are gone; None where all were."""
 
 
 @dataclass(frozen=True)
 class World:
-    """What every thing of a memory is derived with. When it changes, all of them are derived anew."""
+    """What every instance of a memory is derived with. When it changes, all of them are derived anew."""
 
     unit: float
     """What a metre is in world units."""
@@ -101,7 +101,7 @@ class World:
     chunks: int
     """Chunks when this was looked at."""
     posed: int
-    """Posed frames, counted up to 80: fewer are asked of a thing in a short memory."""
+    """Posed frames, counted up to 80: fewer are asked of an instance in a short memory."""
     space: str
     """The embedding space of all chunks; empty where they have several."""
     stamp: int

@@ -16,7 +16,7 @@ from list3r.memory.store.store import Store
 from list3r.memory.store.tables.library import SettledRow
 
 _FAR_M = 0.5
-"""Chunks whose points lie further apart than this share no thing."""
+"""Chunks whose points lie further apart than this share no instance."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How well the position of a thing is known, from how well the chunks that saw it are placed."""
+"""How well the position of an instance is known, from how well the chunks that saw it are placed."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:
 
 
 def position_sigma(center_world: Array, chunks: Iterable[ChunkRow]) -> float | None:
-    """Standard deviation of a thing's position along the worst axis, world units; None where no chunk knows its own.
+    """Standard deviation of an instance's position along the worst axis, world units; None where no chunk knows its
+    own.
 
-    `chunks` are those that saw it. A thing is derived from what all of them saw, and its error is a weighted mean of
-    theirs, which are correlated to an unknown degree: whatever the weights, it is no larger than that of the worst
+    `chunks` are those that saw it. An instance is derived from what all of them saw, and its error is a weighted mean
+    of theirs, which are correlated to an unknown degree: whatever the weights, it is no larger than that of the worst
     placed chunk, and that is what is given. Relative to the first chunk of the component, as the chunks' covariances.
     """
     known = [C for chunk in chunks if (C := position_covariance(chunk, center_world)) is not None]

@@ -28,7 +28,7 @@ _SLACK_M = 0.05
 _REACH_M = 0.85
 """Beyond it nothing stands on, in or beside an instance; above one, see `RelationSettings.above_m`."""
 _RINGS = 3
-"""Whether two instances are related is told by what holds them, and by what holds that."""
+"""Whether two instances are related is decided by what holds them, and by what holds that."""
 
 
 class Writer:

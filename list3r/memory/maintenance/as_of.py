@@ -2,7 +2,7 @@
 
 A connection of its own to the same file, in which temporary tables and views stand before those of the file: nothing
 is written, what sessions saw later is not there, and what they moved is where it was. Sizes and words are those of
-today. Relations among what has not changed since are those of the file; the others are told anew.
+today. Relations among what has not changed since are those of the file; the others are found anew.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _gap(a: Array, b: Array) -> float:
 
 
 def _body(past: Store, instance: Instance, middle: Array) -> InstanceGeometry | None:
-    """A thing as relations see it, from the surface that was known then."""
+    """An instance as relations see it, from the surface that was known then."""
     points = past.surface_points(instance.id).astype(np.float64)
     slack = 1e-3 * float(np.linalg.norm(instance.aabb[1] - instance.aabb[0]))
     points = points[np.all((points >= instance.aabb[0] - slack) & (points <= instance.aabb[1] + slack), axis=1)]

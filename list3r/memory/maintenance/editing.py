@@ -22,7 +22,7 @@ class MemoryEdits:
     """Threads take turns."""
 
     def merge(self, a: int, b: int, *, author: str | None = None) -> EditReport:
-        """Two instances are one thing; the older id stays, the other becomes its alias for ever."""
+        """Two instances are one instance; the older id stays, the other becomes its alias for ever."""
         from list3r.memory.maintenance import edits
 
         with self._lock:

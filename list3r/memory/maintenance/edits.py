@@ -52,7 +52,7 @@ class EditReport:
 
 
 def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport:
-    """Two instances are one thing, whatever their overlap says; the older id stays, the other becomes its alias.
+    """Two instances are one instance, whatever their overlap says; the older id stays, the other becomes its alias.
 
     Raises `UnknownIdError`, and `OptionError` for two that are one already or lie in parts that were never joined.
     """
@@ -71,7 +71,7 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
 
 
 def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, author: str | None = None) -> EditReport:
-    """An instance is two things: `out`, local instances (chunk id, local id) of it, and the rest.
+    """An instance is two instances: `out`, local instances (chunk id, local id) of it, and the rest.
 
     Without `out` it is parted where the evidence parts it best. The larger part keeps the id, the other gets a new one.
     Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.

@@ -16,8 +16,9 @@ _STATES = {"seen_again": "present", "moved": "moved", "removed": "removed", "add
 def world_at(store: Store, session_id: int) -> list[Instance]:
     """The instances known after a session, by id, where they were then and in the state that they had then.
 
-    What was seen only later is left out; a thing that was moved later is where it was before. Sizes and words are those
-    of today, which rest on all that was ever seen of a thing. Raises `OptionError` for a session that there is not.
+    What was seen only later is left out; an instance that was moved later is where it was before. Sizes and words are
+    those of today, which rest on all that was ever seen of an instance. Raises `OptionError` for a session that there
+    is not.
     """
     sessions = [s.session_id for s in store.sessions()]
     if session_id not in sessions:

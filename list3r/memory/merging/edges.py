@@ -1,4 +1,4 @@
-"""Which local instances are one thing: edges of overlap, joined best first (paper 3.3, with complete links)."""
+"""Which local instances are one instance: edges of overlap, joined best first (paper 3.3, with complete links)."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ __all__ = [
 ]
 
 NONE, SAME, PART, PLANE = -1, 0, 1, 2
-"""What two local instances that meet may be: nothing to each other, or one thing for one of three reasons."""
+"""What two local instances that meet may be: nothing to each other, or one instance for one of three reasons."""
 _REASON = (
-    "two views of one thing: the surfaces cover each other",
+    "two views of one instance: the surfaces cover each other",
     "a partial view: its surface lies on that of the whole",
     "two pieces of one plane that touch",
 )
@@ -43,7 +43,7 @@ _PART_SCORE, _PLANE_SCORE, _BY_COVER = 0.3, 0.2, 0.2
 
 @dataclass(frozen=True)
 class Links:
-    """What argues for each of M pairs of local instances that meet being one thing."""
+    """What argues for each of M pairs of local instances that meet being one instance."""
 
     a: Ints
     """Position of the first one: in its chunk, or among the nodes. Shape (M,)."""
@@ -101,7 +101,7 @@ def merge_nodes(
     pairs: Mapping[tuple[int, int], PairScores] | None = None,
     constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """Group local instances into things.
+    """Group local instances into instances.
 
     All chunks given must share one frame of reference. `pairs` are scores already known, by chunk ids (u <= v). The
     partition is the same in whatever order chunks and pairs are given: edges are taken best first, ties by key. Two
@@ -152,7 +152,7 @@ def form_groups(
 
 
 def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
-    """What argues for the local instances of two chunks that meet being one thing; `u` and `v` may be one chunk."""
+    """What argues for the local instances of two chunks that meet being one instance; `u` and `v` may be one chunk."""
     a, b, inside = p.i, p.j, u.keys[:1] == v.keys[:1]
     low, high = np.minimum(p.i_on_j, p.j_on_i), np.maximum(p.i_on_j, p.j_on_i)
     cosine = np.einsum("ij,ij->i", u.feature[a], v.feature[b]).astype(float)

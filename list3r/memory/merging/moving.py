@@ -1,7 +1,7 @@
-"""Which moving local instances are one thing, with what it was where it stood still, and where it is now.
+"""Which moving local instances are one instance, with what it was where it stood still, and where it is now.
 
-A thing that moves has no place of its own, so overlap in space says nothing about it. What does: two chunks saw it in
-the frames that they share; or it looks the same and could have gone from where one track ends to where the other
+An instance that moves has no place of its own, so overlap in space says nothing about it. What does: two chunks saw it
+in the frames that they share; or it looks the same and could have gone from where one track ends to where the other
 begins.
 """
 
@@ -23,7 +23,7 @@ from list3r.memory.records import MergeDecision, MotionTrack
 
 @dataclass(frozen=True)
 class MovingSettings:
-    """What makes two tracks one thing."""
+    """What makes two tracks one instance."""
 
     min_shared_frames: int = 3
     """Frames of two chunks in which both see it."""
@@ -47,7 +47,7 @@ class MovingSettings:
     rest_m: float = 0.08
     """Places within this of the last one are one place of rest."""
     rest_s: float = 1.0
-    """A thing that stayed there this long is put down."""
+    """An instance that stayed there this long is put down."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class PlacedChunks:
 
 @dataclass(frozen=True)
 class Mover:
-    """A thing that was seen moving."""
+    """An instance that was seen moving."""
 
     last: tuple[Key, ...]
     """The members that show where it is now."""
@@ -93,7 +93,7 @@ class _Node:
 def without_moving(
     pairs: Mapping[tuple[int, int], PairScores], shapes: Mapping[int, ChunkShapes], motions: Mapping[Key, object]
 ) -> dict[tuple[int, int], PairScores]:
-    """Scores of the pairs of which both stay: where a thing passed says nothing about what it passed."""
+    """Scores of the pairs of which both stay: where an instance passed says nothing about what it passed."""
     if not motions:
         return dict(pairs)
     moves = {k: np.array([(k, int(n)) in motions for n in s.local_id], bool) for k, s in shapes.items()}
@@ -226,7 +226,7 @@ class _Scene:
         return placed.apply(motion.positions[nearest])
 
     def edge(self, x: _Node, y: _Node) -> tuple[float, dict[str, float], str] | None:
-        """What speaks for two nodes being one thing: (score, scores, reason)."""
+        """What speaks for two nodes being one instance: (score, scores, reason)."""
         best: tuple[float, dict[str, float], str] | None = None
         for a in x.keys:
             for b in y.keys:
@@ -285,7 +285,7 @@ class _Scene:
         return bool(np.mean(np.diagonal(box_iou(boxes_a, boxes_b))) < self._s.apart_iou)
 
     def now(self, nodes: Sequence[_Node]) -> Mover:
-        """Where a thing is: where it was put down, or where its last track ends."""
+        """Where an instance is: where it was put down, or where its last track ends."""
         order = sorted(nodes, key=lambda n: (n.session, n.last_s, n.keys))
         last = order[-1]
         if not last.moves:

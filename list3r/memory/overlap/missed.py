@@ -1,4 +1,4 @@
-"""Which chunks of computed depth looked at a thing of another one in the frames that they share.
+"""Which chunks of computed depth looked at an instance of another one in the frames that they share.
 
 What computed depth shows of far or plain surfaces in one chunk is not there in the next; a sensor repeats itself.
 That the other found nothing is judged by its masks in those frames, not by where its instances lie, which follows the
@@ -33,18 +33,18 @@ def frames_beside(chunks: Mapping[int, ChunkShapes], pairs: Collection[tuple[int
 
 @dataclass(frozen=True)
 class LookSettings:
-    """When another chunk has looked at the place of a thing and missed it."""
+    """When another chunk has looked at the place of an instance and missed it."""
 
     least_frames: int = 8
-    """Frames that two chunks share in which one must see a thing and the other look at its place: as many as a track
-    of a chunk of 100 frames needs."""
+    """Frames that two chunks share in which one must see an instance and the other look at its place: as many as a
+    track of a chunk of 100 frames needs."""
     least_share: float = 0.25
-    """Share of a thing in a frame where the other has depth, to look at its place: a part of it would do."""
+    """Share of an instance in a frame where the other has depth, to look at its place: a part of it would do."""
     least_area: float = 0.4
-    """Share of its largest area that a thing must show in such a frame: what was found close by may well be missed from
-    afar or at the border of the picture."""
+    """Share of its largest area that an instance must show in such a frame: what was found close by may well be missed
+    from afar or at the border of the picture."""
     same_iou: float = 0.5
-    """What the other found there is the thing itself where their masks in those frames agree so well, though the
+    """What the other found there is the instance itself where their masks in those frames agree so well, though the
     surfaces may not meet in space."""
 
 

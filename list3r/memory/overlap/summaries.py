@@ -18,7 +18,7 @@ from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 ROOM_DEPTH_M = 2.0
-"""How far things are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
+"""How far instances are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
 
 
 _COLORS = 1000
@@ -43,7 +43,7 @@ class ChunkSummary:
 
 _KEPT_BYTES = 48 << 20
 """Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
-with chunks. Of a chunk with 12 things it takes 0.2 MB, of one with 50 a megabyte."""
+with chunks. Of a chunk with 12 instances it takes 0.2 MB, of one with 50 a megabyte."""
 _SAMPLED = 64
 """Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
 
@@ -121,7 +121,7 @@ def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> Summ
 
 
 def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:
-    """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is told by them."""
+    """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is decided by them."""
     step = max(1, -(-len(chunks) // _SAMPLED))
     return list(chunks[::step])
 

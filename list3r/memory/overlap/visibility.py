@@ -1,7 +1,7 @@
 """What the frames of a session saw at a place: a surface there, free space through it, or nothing at all.
 
 The keyframes' small depth images are asked. A pixel speaks only together with its neighbours, so that neither the edge
-of a thing nor a small error of alignment looks like free space.
+of an instance nor a small error of alignment looks like free space.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class VisibilitySettings:
     most_depth_m: float = 4.5
     """Beyond this depth is too coarse to tell."""
     least_points: int = 8
-    """Points of a thing that a frame must tell about."""
+    """Points of an instance that a frame must tell about."""
     least_share: float = 0.4
-    """Share of a thing's points that a frame must tell about."""
+    """Share of an instance's points that a frame must tell about."""
     gone: float = 0.55
-    """Share of what is told that must be free space for a thing to be gone from there;"""
+    """Share of what is told that must be free space for an instance to be gone from there;"""
     there: float = 0.2
     """and up to which it is still there."""
     least_frames: int = 4
@@ -97,7 +97,7 @@ def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> 
 
 
 def look(points: Array, views: Iterable[DepthView], settings: VisibilitySettings | None = None) -> Look:
-    """Ask frames about surface points of one thing, world coordinates, shape (N, 3)."""
+    """Ask frames about surface points of one instance, world coordinates, shape (N, 3)."""
     s = settings or VisibilitySettings()
     told = []
     for view in views:

@@ -13,7 +13,7 @@ from list3r.memory.geometry import Array, OrientedBox, upright_box
 
 @dataclass(frozen=True)
 class InstanceGeometry:
-    """One thing in the world."""
+    """One instance in the world."""
 
     id: int
     points: Array
@@ -27,7 +27,7 @@ class InstanceGeometry:
     normal: Array | None
     """Unit normal where it is flat, towards the cameras. Shape (3,)."""
     structure: str | None = None
-    """floor, ceiling, wall, plane, or None for a thing."""
+    """floor, ceiling, wall, plane, or None for an instance."""
     flagged: float = 0.0
     """Share of its points that the chunks themselves took for structure."""
     component: int = 0
@@ -51,7 +51,7 @@ def neighbours_of(points: Array, tree: cKDTree, count: int = 1) -> tuple[Array, 
 
 def without_strays(points: Array, neighbours: int = 4, factor: float = 4.0) -> NDArray[np.int64]:
     """Positions of the points that keep company: what lies `factor` times further from its neighbours than is usual
-    for the thing is depth noise at an edge, or a bit of something else. Shape (N, 3) -> (M,).
+    for the instance is depth noise at an edge, or a bit of something else. Shape (N, 3) -> (M,).
     """
     if len(points) < 4 * neighbours:
         return np.arange(len(points))
@@ -61,7 +61,7 @@ def without_strays(points: Array, neighbours: int = 4, factor: float = 4.0) -> N
 
 
 def fit_box(points: Array, *, upright: bool, trim: float = 0.01) -> OrientedBox:
-    """The box of a thing: upright where gravity is known, else along its own principal axes, longest first."""
+    """The box of an instance: upright where gravity is known, else along its own principal axes, longest first."""
     if upright:
         return upright_box(points, trim)
     center = points.mean(axis=0)

@@ -1,14 +1,14 @@
-"""How things stand to each other: deterministic geometry, each relation with confidence and margin.
+"""How instances stand to each other: deterministic geometry, each relation with confidence and margin.
 
 Vertical relations (on, in, above, under, and their inverses; attached_to) exist only where gravity is known or
 estimated. Inverses are relations of their own, so that a reader never has to know which is which: `on` comes with
 `supports`, `in` with `contains`, `above` with `below`; `next_to` and `near` come in both directions.
 
-`near`: the gap between two things is at most half their mean size, in any direction. `next_to`: the same, and they
+`near`: the gap between two instances is at most half their mean size, in any direction. `next_to`: the same, and they
 stand side by side (they share heights). Size is the longest edge; bounds in metres stand in the settings. Neither is
-said of structure, nor of two things of which one holds the other, nor where it is hardly likelier than not.
+said of structure, nor of two instances of which one holds the other, nor where it is hardly likelier than not.
 
-The gap is that of the nearest points, without readings amidst an edge, and with the backs of round things (decision
+The gap is that of the nearest points, without readings amidst an edge, and with the backs of round instances (decision
 0021).
 """
 
@@ -87,13 +87,13 @@ def _both(instances: Sequence[InstanceGeometry], predicate: str, found: Found) -
 
 
 def _overhead(scene: RelationScene, support: set[tuple[int, int]]) -> list[Relation]:
-    """above and below for things apart in height, under for what stands beneath a surface of another."""
+    """above and below for instances apart in height, under for what stands beneath a surface of another."""
     s, unit = scene.s, scene.unit
     out: list[Relation] = []
     low, high = scene.low, scene.high
     meet = np.all(low[:, None, :2] <= high[None, :, :2], axis=2)
     pairs = meet & meet.T & np.isfinite(scene.box_gap) & (high[:, None, 2] > high[None, :, 2])
-    pairs &= (low[:, None, 2] - high[None, :, 2] <= s.above_m * unit) & scene.thing[:, None] & scene.thing[None]
+    pairs &= (low[:, None, 2] - high[None, :, 2] <= s.above_m * unit) & scene.in_room[:, None] & scene.in_room[None]
     noise = s.noise_m * unit
     for a, b in np.argwhere(pairs).tolist():
         found = None if (a, b) in support else scene.measure("over", a, b, _over)
@@ -131,7 +131,7 @@ def _over(scene: RelationScene, a: int, b: int) -> tuple[float, float, float] | 
 
 
 def _attached(scene: RelationScene, held: set[int]) -> list[Relation]:
-    """Things that hang on a wall: touching it, standing on nothing."""
+    """Instances that hang on a wall: touching it, standing on nothing."""
     limit = scene.s.attached_m * scene.unit
     out = []
     for a, instance in enumerate(scene.instances):
@@ -153,7 +153,7 @@ def _beside(scene: RelationScene, support: set[tuple[int, int]], gravity_known: 
     close = np.clip(0.5 * mean, s.next_to_m[0] * unit, s.next_to_m[1] * unit)
     reach = np.maximum(np.clip(0.5 * mean, s.near_m[0] * unit, s.near_m[1] * unit), close)
     in_reach = scene.box_gap <= reach + _SLACK_M * unit
-    pairs = np.triu(scene.thing[:, None] & scene.thing[None] & in_reach, 1)
+    pairs = np.triu(scene.in_room[:, None] & scene.in_room[None] & in_reach, 1)
     out: list[Relation] = []
     for a, b in np.argwhere(pairs).tolist():
         if (a, b) in support:
@@ -169,7 +169,7 @@ def _beside(scene: RelationScene, support: set[tuple[int, int]], gravity_known: 
 
 
 def _side_by_side(scene: RelationScene, a: int, b: int) -> bool:
-    """Whether two things share a good part of their heights, and neither is a rug."""
+    """Whether two instances share a good part of their heights, and neither is a rug."""
     if scene.covering[a] or scene.covering[b]:
         return False
     low = max(scene.foot[a], scene.foot[b])

@@ -76,11 +76,11 @@ class RelationScene:
         self.box_gap[component[:, None] != component[None]] = np.inf
         self.low, self.high = low, high
         self.foot = low[:, 2].copy()
-        """Where each body ends below; down to the floor for what stands on it."""
+        """Where each instance ends below; down to the floor for what stands on it."""
         self.covering = np.zeros(len(instances), dtype=bool)
-        """Whether each body is a rug."""
+        """Whether each is a rug."""
         self.size = np.array([b.size for b in instances])
-        self.thing = np.array([b.structure is None for b in instances], dtype=bool)
+        self.in_room = np.array([b.structure is None for b in instances], dtype=bool)
 
     def tree(self, n: int) -> cKDTree:
         """KD-tree of an instance's points."""
@@ -93,7 +93,7 @@ class RelationScene:
         return self._measured.get(what, self.instances[a], self.instances[b], lambda: compute(self, a, b))
 
     def touch(self, a: int, b: int) -> float:
-        """Distance of a few hundred points of the smaller body to the nearest of the other."""
+        """Distance of a few hundred points of the smaller instance to the nearest of the other."""
         return self.measure("touch", min(a, b), max(a, b), _touch)
 
     def gap(self, a: int, b: int) -> float:
@@ -104,7 +104,7 @@ class RelationScene:
         """What is known of an instance's surface: its points, and for what is round its hidden sides too."""
         if n not in self._surfaces:
             points = self.instances[n].points
-            axis = self.measure("axis", n, n, _axis) if self._upright and self.thing[n] else None
+            axis = self.measure("axis", n, n, _axis) if self._upright and self.in_room[n] else None
             if axis is not None:
                 points = turned(points[:: -(-len(points) // _TURNED)], axis)
             tree = self.tree(n) if axis is None else cKDTree(points)
@@ -132,7 +132,7 @@ def _axis(scene: RelationScene, a: int, _: int) -> Array | None:
 
 
 def _gap(scene: RelationScene, a: int, b: int) -> float:
-    """Of the nearest points that keep company; a reading amidst the edge between two things is no surface."""
+    """Of the nearest points that keep company; a reading amidst the edge between two instances is no surface."""
     small, large = sorted((scene.surface(a), scene.surface(b)), key=lambda s: len(s.points))
     near = _nearest(small.points, large.tree)
     away, at = neighbours_of(small.points[near], large.tree, min(_COMPANY, large.tree.n))
@@ -187,7 +187,7 @@ def certainty(margin: float, noise: float) -> float:
 
 
 def wall_touched(scene: RelationScene, a: int) -> tuple[float, int] | None:
-    """The wall that a thing touches: (gap, position), the nearest one."""
+    """The wall that an instance touches: (gap, position), the nearest one."""
     limit = scene.s.attached_m * scene.unit
     walls = [
         (scene.touch(a, b), b)

@@ -89,29 +89,30 @@ class RelationSettings:
     noise_m: float = 0.015
     """Standard deviation of a height or gap: depth noise and drift between chunks."""
     computed_noise_m: float = 0.03
-    """The same where depth was computed from colour: 2 % at 1.5 m, alike over a thing and other in each chunk."""
+    """The same where depth was computed from colour: 2 % at 1.5 m, alike over an instance and other in each chunk."""
     contact_m: float = 0.035
-    """A thing may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
+    """An instance may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
     contact_per_height: float = 0.12
-    """More of it for tall things, whose thin legs are seldom seen."""
+    """More of it for tall instances, whose thin legs are seldom seen."""
     hidden_feet: float = 0.6
-    """A thing that stands on nothing and touches no wall stands on the floor if its lowest visible point is nearer to
-    it than this share of its longest edge: legs under a table are often not seen."""
+    """An instance that stands on nothing and touches no wall stands on the floor if its lowest visible point is nearer
+    to it than this share of its longest edge: legs under a table are often not seen."""
     hidden_feet_m: float = 0.8
     """And nearer than this."""
     least_base: float = 0.25
-    """Least area of the surface under a thing over the thing's own footprint: a floor does not stand on table legs."""
+    """Least area of the surface under an instance over the instance's own footprint: a floor does not stand on table
+    legs."""
     enclosed_deg: float = 75.0
-    """A container goes round a thing but for at most this: the back and arms of a sofa leave more."""
+    """A container goes round an instance but for at most this: the back and arms of a sofa leave more."""
     inside: float = 0.8
-    """Share of a thing's points inside its container's box."""
+    """Share of an instance's points inside its container's box."""
     hollow: float = 0.5
     """Share of the surface over the middle of an open container that lies well below its rim, where it is seen."""
     overhead: float = 0.4
-    """Share of a thing's points that have something over them, to be under it."""
+    """Share of an instance's points that have something over them, to be under it."""
     most_wider: float = 3.0
-    """A container that holds a thing by its sides alone, without the thing being inside its box, is at most this much
-    wider than the thing: a bowl, not a sofa with arms."""
+    """A container that holds an instance by its sides alone, without the instance being inside its box, is at most this
+    much wider than the instance: a bowl, not a sofa with arms."""
     around: float = 0.4
     """Share of directions in which such a container has a side: of a bowl, only the far half is often seen."""
     uneven: float = 0.35
@@ -121,7 +122,7 @@ class RelationSettings:
     above_m: float = 1.5
     """Higher than this over something is no longer said to be above it."""
     covering_m: float = 0.06
-    """What lies on the floor and is lower than this is a rug: things stand on it or near it, not next to it."""
+    """What lies on the floor and is lower than this is a rug: instances stand on it or near it, not next to it."""
     next_to_m: tuple[float, float] = (0.1, 0.4)
     """Gap between surfaces: half the mean size of the two, within these."""
     near_m: tuple[float, float] = (0.15, 0.4)

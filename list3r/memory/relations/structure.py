@@ -18,7 +18,7 @@ class StructureSettings:
     level_deg: float = 15.0
     """A surface this near to level or upright counts as that."""
     thickness_m: float = 0.12
-    """A thing thicker than this is not a surface,"""
+    """An instance thicker than this is not a surface,"""
     thickness: float = 0.04
     """nor one thicker than this share of its second longest edge: depth noise grows with the room."""
     floor_band_m: float = 0.12

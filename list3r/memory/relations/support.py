@@ -1,4 +1,4 @@
-"""What a thing stands on and what it is in."""
+"""What an instance stands on and what it is in."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from list3r.memory.relations.settings import SupportSettings
 
 
 def supports(scene: RelationScene, taken: set[int]) -> list[Found]:
-    """Each thing on at most one other: the one whose surface it touches best."""
+    """Each instance on at most one other: the one whose surface it touches best."""
     s, out = scene.s.on, []
     holds = np.array([b.structure not in ("wall", "ceiling") for b in scene.instances], dtype=bool)
     for a, instance in enumerate(scene.instances):
@@ -51,8 +51,8 @@ def supports(scene: RelationScene, taken: set[int]) -> list[Found]:
 
 
 def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
-    """Things that must stand on the floor or on the thing under them, for nothing else holds them, though their feet
-    were not seen.
+    """Instances that must stand on the floor or on the instance under them, for nothing else holds them, though their
+    feet were not seen.
     """
     s = scene.s
     out = []
@@ -77,12 +77,12 @@ def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
 
 
 def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
-    """(clearance, position) of the things wholly below a that have a surface under its middle and are wide enough to
+    """(clearance, position) of the instances wholly below a that have a surface under its middle and are wide enough to
     bear it.
     """
     s, middle = scene.s.on, scene.instances[a].box.center[:2]
     bottom = float(np.quantile(scene.instances[a].points[:, 2], s.lowest))
-    below = scene.thing & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
+    below = scene.in_room & (scene.high[:, 2] < bottom) & np.isfinite(scene.box_gap[a])
     slack = s.aside_m * scene.unit
     below &= np.all((scene.low[:, :2] - slack <= middle) & (scene.high[:, :2] + slack >= middle), axis=1)
     base = float(np.prod(scene.instances[a].box.size[:2]))
@@ -136,8 +136,8 @@ def _stands_on(scene: RelationScene, a: int, b: int) -> Sure | None:
 
 
 def _steady(subject: InstanceGeometry, around: Array, s: SupportSettings) -> float:
-    """1 where the surface is seen all round the thing's middle, less where only on one side of it: what lies beside
-    a thing on a table is as high as the table, to the noise, but does not go round it.
+    """1 where the surface is seen all round the instance's middle, less where only on one side of it: what lies beside
+    an instance on a table is as high as the table, to the noise, but does not go round it.
     """
     away = around[:, :2] - subject.points[:, :2].mean(axis=0)
     sectors = np.unique(np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * 8).astype(int) % 8)
@@ -148,7 +148,7 @@ def _steady(subject: InstanceGeometry, around: Array, s: SupportSettings) -> flo
 
 
 def containments(scene: RelationScene) -> list[Found]:
-    """Each thing in at most one container, the smallest that encloses it."""
+    """Each instance in at most one container, the smallest that encloses it."""
     out = []
     for a, instance in enumerate(scene.instances):
         if instance.structure is not None:
@@ -156,7 +156,7 @@ def containments(scene: RelationScene) -> list[Found]:
         volume = float(np.prod(instance.box.size))
         holders = [
             (float(np.prod(scene.instances[b].box.size)), b)
-            for b in np.flatnonzero(scene.thing & (scene.box_gap[a] == 0.0)).tolist()
+            for b in np.flatnonzero(scene.in_room & (scene.box_gap[a] == 0.0)).tolist()
             if a != b and volume <= scene.s.within.most_volume * float(np.prod(scene.instances[b].box.size))
         ]
         for _, b in sorted(holders):
@@ -192,7 +192,7 @@ def _held_inside(scene: RelationScene, a: int, b: int) -> Sure | None:
 
 @dataclass(frozen=True)
 class _Sides:
-    """Where round a thing its holder has a surface."""
+    """Where round an instance its holder has a surface."""
 
     share: float
     """Share of the directions in which there is one."""

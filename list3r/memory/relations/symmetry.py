@@ -1,4 +1,4 @@
-"""Things that are round about the vertical: what was seen of one from the front tells its back."""
+"""Instances that are round about the vertical: what was seen of one from the front tells its back."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ _LAYERS, _SAMPLE, _STEPS = 8, 200, 6
 def round_axis(points: Array, noise: float, settings: SymmetrySettings | None = None) -> Array | None:
     """Return where the vertical axis stands about which an instance is round, None if it is not. z is up.
 
-    Cut into level layers, the points of a round thing have one distance from the axis in each: balls, bowls, vases,
+    Cut into level layers, the points of a round instance have one distance from the axis in each: balls, bowls, vases,
     baskets. The axis is the one for which those distances vary least (Gauss-Newton, weights for absolute deviations,
-    from the algebraic circles). A thing counts as round when they vary by less than the `noise` of a point and little
-    for its size, and when the circles are not much wider than what was seen, as a flat side would make them. What has a
-    lid or a bottom in sight does not; its outline is seen anyway.
-    Shape (N, 3) -> (2,), world.
+    from the algebraic circles). An instance counts as round when they vary by less than the `noise` of a point and
+    little for its size, and when the circles are not much wider than what was seen, as a flat side would make them.
+    What has a lid or a bottom in sight does not; its outline is seen anyway. Shape (N, 3) -> (2,), world.
     """
     s = settings or SymmetrySettings()
     p = points[:: -(-len(points) // _SAMPLE)]
@@ -46,7 +45,8 @@ def round_axis(points: Array, noise: float, settings: SymmetrySettings | None = 
 
 
 def turned(points: Array, axis: Array) -> Array:
-    """The points of a round thing with those that three quarter turns about its axis make of them. (N, 3) -> (4N, 3)"""
+    """The points of a round instance with those that three quarter turns about its axis make of them. (N, 3) -> (4N,
+    3)"""
     x, y = (points[:, :2] - axis).T
     quarters = [np.column_stack([a, b]) for a, b in ((x, y), (-y, x), (-x, -y), (y, -x))]
     return np.concatenate([np.column_stack([q + axis, points[:, 2]]) for q in quarters])

@@ -172,7 +172,9 @@ def _length(store: Store, anchor: ScaleAnchor, chunks: list[ChunkRow]) -> tuple[
     if anchor.kind == "camera":
         estimate = store.get_value("gravity_estimate")
         if not upright or estimate is None or estimate["floor_height"] is None:
-            raise OptionError(f"{store.path} knows no floor to measure camera_height from; anchor a thing by its ID")
+            raise OptionError(
+                f"{store.path} knows no floor to measure camera_height from; anchor an instance by its ID"
+            )
         return float(np.median(cameras_of(store, chunks).translation[:, 2])), ()
     instance = store.instance(store.resolve(anchor.instance_id))
     if instance.component != chunks[0].component:
