@@ -381,3 +381,28 @@ def _camera_info(put_: _Put, time_s: float, frame: str, size: tuple[int, int]) -
         distortion_model="plumb_bob", d=np.zeros(5), k=k[:3, :3].ravel(), r=np.eye(3).ravel(),
         p=k[:3, :4].ravel(), binning_x=0, binning_y=0, roi=roi,
     )  # fmt: skip
+
+
+def write_euroc(root: Path) -> Path:
+    """Grey pictures of one camera that is turned on its body; ground truth of the body every 5 ms."""
+    T_body_cam = np.eye(4)
+    T_body_cam[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    T_body_cam[:3, 3] = 0.05, -0.02, 0.01
+    listing, truth = ["#timestamp [ns],filename"], ["#timestamp, p, q wxyz, v"]
+    for k, shot in enumerate(shots()):
+        stamp = 1_403_636_579_763_555_584 + 50_000_000 * k
+        listing.append(f"{stamp},{stamp}.png")
+        put(root / f"mav0/cam0/data/{stamp}.png", png(cv2.cvtColor(shot.color, cv2.COLOR_RGB2GRAY)))
+        T = shot.T_world_cam @ np.linalg.inv(T_body_cam)
+        q = np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)
+        truth.append(",".join([str(stamp), *(f"{v:.9f}" for v in (*T[:3, 3], *q)), "0", "0", "0"]))
+    put(root / "mav0/cam0/data.csv", "\n".join(listing))
+    put(root / "mav0/state_groundtruth_estimate0/data.csv", "\n".join(truth))
+    rows = ",\n         ".join(", ".join(f"{v:.9f}" for v in row) for row in T_body_cam)
+    put(
+        root / "mav0/cam0/sensor.yaml",
+        f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\nrate_hz: 20\n"
+        f"resolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\nintrinsics: [{', '.join(map(str, K))}]\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n",
+    )
+    return root

@@ -21,6 +21,7 @@ from tests.recordings import (
     put,
     shots,
     write_colmap,
+    write_euroc,
     write_nerfstudio,
     write_polycam,
     write_record3d,
@@ -241,3 +242,14 @@ def test_arkit_poses_are_flipped_once(tmp_path: Path) -> None:
 
     assert np.allclose(pose_of_arkit(arkit(T)), T)
     assert not np.allclose(pose_of_arkit(T), T)
+
+
+def test_poses_of_a_body_are_carried_to_its_camera(tmp_path: Path) -> None:
+    path = write_euroc(tmp_path / "walk")
+    info = open_source(path).info
+    assert info.kind == "euroc" and info.has_poses and info.fps == pytest.approx(20.0)
+    for frame, shot in zip(frames_of(path), shots(), strict=True):
+        assert np.allclose(frame.T_source_cam, shot.T_world_cam, atol=1e-5)
+    put(path / "mav0/cam0/sensor.yaml", "intrinsics: [1, 2]\n")
+    with pytest.raises(SourceError, match="four numbers fx,fy,cx,cy"):
+        open_source(path)

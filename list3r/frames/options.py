@@ -23,6 +23,7 @@ KINDS = (
     "arkitscenes",
     "scannet",
     "rosbag",
+    "euroc",
     "nerfstudio",
     "7scenes",
     "tum",

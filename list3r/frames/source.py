@@ -13,6 +13,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.readers import (
     arkitscenes,
     colmap,
+    euroc,
     images,
     nerfstudio,
     polycam,
@@ -33,6 +34,7 @@ FOLDERS: dict[str, Callable[[Path, SourceOptions], FolderLayout | None]] = {
     "polycam": polycam.find,
     "arkitscenes": arkitscenes.find,
     "scannet": scannet.find,
+    "euroc": euroc.find,
     "nerfstudio": nerfstudio.find,
     "7scenes": seven_scenes.find,
     "tum": tum.find,
