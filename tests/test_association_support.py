@@ -8,16 +8,10 @@ import numpy as np
 
 from list3r.association.overlap.alignment import align
 from list3r.association.overlap.balance import balanced_support
+from list3r.association.overlap.inconsistency import displacement, inconsistency
+from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confident, divide
 from list3r.association.overlap.shared_points import Pairs, shared_pairs, shared_samples
-from list3r.association.overlap.support import (
-    EdgeSupportSettings,
-    Mask,
-    confident,
-    displacement,
-    divide,
-    inconsistency,
-    static_support,
-)
+from list3r.association.overlap.support import static_support
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.masks import encode_mask

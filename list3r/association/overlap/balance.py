@@ -6,18 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from list3r.association.overlap.inconsistency import relative_to_frame
+from list3r.association.overlap.regions import EdgeSupportSettings, Floats, Ints, Mask, Regions, divide, median
 from list3r.association.overlap.shared_points import Pairs
-from list3r.association.overlap.support import (
-    EdgeSupportSettings,
-    Floats,
-    Ints,
-    Mask,
-    Regions,
-    StaticSupport,
-    divide,
-    median,
-    relative_to_frame,
-)
+from list3r.association.overlap.support import StaticSupport
 from list3r.frames.base import Camera
 
 _CHI2_MEDIAN = 0.455

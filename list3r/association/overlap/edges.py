@@ -14,15 +14,9 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.alignment import Alignment, AlignmentSettings, align
 from list3r.association.overlap.balance import BalancedSupport, balanced_support
+from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confident
 from list3r.association.overlap.shared_points import Pairs, shared_pairs
-from list3r.association.overlap.support import (
-    EdgeSupportSettings,
-    Fit,
-    Mask,
-    StaticSupport,
-    confident,
-    static_support,
-)
+from list3r.association.overlap.support import Fit, StaticSupport, static_support
 from list3r.frames.base import Camera
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
