@@ -26,7 +26,7 @@ class Bend:
 
     @staticmethod
     def none() -> Bend:
-        """A chunk that does not bend."""
+        """Return a chunk that does not bend."""
         return Bend(np.zeros(1), np.zeros((1, 7)))
 
     @staticmethod

@@ -46,7 +46,7 @@ class Edit:
 
 
 def standing(edits: Sequence[Edit]) -> list[Edit]:
-    """The edits that hold, oldest first: those that no undo that holds itself has taken back."""
+    """Return the edits that hold, oldest first: those that no undo that holds itself has taken back."""
     undone: set[int] = set()
     kept = []
     for edit in sorted(edits, key=lambda e: -e.entry):
@@ -118,7 +118,7 @@ class Deletion:
     """The last chunk then: what it or an earlier one saw, and what was not deleted, is another instance."""
 
     def outside(self, keys: Collection[Key]) -> bool:
-        """Whether any of these was there when the instance was deleted, and stayed."""
+        """Return whether any of these was there when the instance was deleted, and stayed."""
         return any(k[0] <= self.through and k not in self.keys for k in keys)
 
 
@@ -139,7 +139,7 @@ class Constraints:
 
     @staticmethod
     def of(edits: Sequence[Edit]) -> Constraints:
-        """What edits (undone ones among them) come to."""
+        """Return what edits (undone ones among them) come to."""
         links, deletions, labels, touched = LinkConstraints(), [], [], set()
         for edit in reversed(standing(edits)):
             keys = [k for part in edit.parts for k in part]
@@ -162,7 +162,7 @@ class Constraints:
         return ConstraintCheck(self)
 
     def forbids(self, a: Collection[Key], b: Collection[Key]) -> str:
-        """Why two whole groups must not be made one instance, or nothing."""
+        """Return why two whole groups must not be made one instance, or nothing."""
         if not self:
             return ""
         check = self.check()
@@ -206,23 +206,25 @@ class Constraints:
         return sorted(out), known
 
     def deleted(self, group: Collection[Key]) -> bool:
-        """Whether a group is an instance that was deleted, or what was seen of it later."""
+        """Return whether a group is an instance that was deleted, or what was seen of it later."""
         return any(not d.keys.isdisjoint(group) and not d.outside(group) for d in self.deletions)
 
     def shown(self, groups: Sequence[Sequence[Key]], evidence: Iterable[bool]) -> list[bool]:
-        """Which groups are shown, given which ones the evidence would show."""
+        """Return which groups are shown, given which ones the evidence would show."""
         return [
             not self.deleted(g) and (seen or not self.touched.isdisjoint(g))
             for g, seen in zip(groups, evidence, strict=True)
         ]
 
     def remembered(self, groups: Sequence[Sequence[Key]], before: Mapping[Key, int]) -> dict[Key, int]:
-        """The ids of before without those of deleted instances."""
+        """Return the ids of before without those of deleted instances."""
         gone = {k for g in groups if self.deleted(g) for k in g} if self.deletions else set()
         return {k: n for k, n in before.items() if k not in gone}
 
     def labels_of(self, groups: Sequence[Sequence[Key]], weights: Mapping[Key, int]) -> dict[int, str | None]:
-        """Labels by group number: each goes to the group with most of what it was given to; the last word wins."""
+        """Return labels by group number: each goes to the group with most of what it was given to; the last word
+        wins.
+        """
         home = {key: n for n, group in enumerate(groups) for key in group} if self.labels else {}
         out: dict[int, str | None] = {}
         for keys, text in self.labels:

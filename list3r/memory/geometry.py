@@ -23,7 +23,7 @@ _NODES, _NODE_WEIGHTS = (_NODES + 1.0) / 2.0, _NODE_WEIGHTS / 2.0
 
 
 def skew(v: Array) -> Array:
-    """Cross-product matrices of vectors. Shape (..., 3) -> (..., 3, 3)."""
+    """Return cross-product matrices of vectors. Shape (..., 3) -> (..., 3, 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
@@ -31,25 +31,25 @@ def skew(v: Array) -> Array:
 
 
 def rotation_exp(rotvec: Array) -> Array:
-    """Rotation matrices of rotation vectors in radians. Shape (..., 3) -> (..., 3, 3)."""
+    """Return rotation matrices of rotation vectors in radians. Shape (..., 3) -> (..., 3, 3)."""
     flat = Rotation.from_rotvec(np.reshape(rotvec, (-1, 3))).as_matrix()
     return np.asarray(flat.reshape(*rotvec.shape[:-1], 3, 3))
 
 
 def rotation_log(rotation: Array) -> Array:
-    """Rotation vectors in radians of rotation matrices. Shape (..., 3, 3) -> (..., 3)."""
+    """Return rotation vectors in radians of rotation matrices. Shape (..., 3, 3) -> (..., 3)."""
     flat = Rotation.from_matrix(np.reshape(rotation, (-1, 3, 3))).as_rotvec()
     return np.asarray(flat.reshape(*rotation.shape[:-2], 3))
 
 
 def quat_wxyz_from_rotation(rotation: Array) -> Array:
-    """Unit quaternions, w >= 0. Shape (..., 3, 3) -> (..., 4)."""
+    """Return unit quaternions, w >= 0. Shape (..., 3, 3) -> (..., 4)."""
     xyzw = Rotation.from_matrix(np.reshape(rotation, (-1, 3, 3))).as_quat(canonical=True)
     return np.asarray(np.roll(xyzw, 1, axis=-1).reshape(*rotation.shape[:-2], 4))
 
 
 def rotation_from_quat_wxyz(quat_wxyz: Array) -> Array:
-    """Rotation matrices of quaternions (normalised here). Shape (..., 4) -> (..., 3, 3)."""
+    """Return rotation matrices of quaternions (normalised here). Shape (..., 4) -> (..., 3, 3)."""
     xyzw = np.roll(np.reshape(quat_wxyz, (-1, 4)), -1, axis=-1)
     return np.asarray(Rotation.from_quat(xyzw).as_matrix().reshape(*quat_wxyz.shape[:-1], 3, 3))
 
@@ -85,7 +85,7 @@ class Sim3:
 
     @staticmethod
     def identity() -> Sim3:
-        """The similarity that changes nothing."""
+        """Return the similarity that changes nothing."""
         return Sim3(np.ones(()), np.eye(3), np.zeros(3))
 
     @staticmethod
@@ -104,13 +104,13 @@ class Sim3:
         return Sim3(np.exp(sigma), rotation_exp(omega), translation)
 
     def log(self) -> Array:
-        """Tangents (rho, omega, sigma), the inverse of `exp` for rotations under a half turn. Shape (..., 7)."""
+        """Return tangents (rho, omega, sigma), the inverse of `exp` for rotations under a half turn. Shape (..., 7)."""
         omega, sigma = rotation_log(self.rotation), np.log(self.scale)
         rho = np.linalg.solve(_left_integral(omega, sigma), self.translation[..., None])[..., 0]
         return np.concatenate([rho, omega, np.asarray(sigma)[..., None]], axis=-1)
 
     def as_matrix(self) -> Array:
-        """Homogeneous matrices. Shape (..., 4, 4)."""
+        """Return homogeneous matrices. Shape (..., 4, 4)."""
         m = np.zeros((*self.rotation.shape[:-2], 4, 4))
         m[..., :3, :3] = np.asarray(self.scale)[..., None, None] * self.rotation
         m[..., :3, 3], m[..., 3, 3] = self.translation, 1.0
@@ -125,20 +125,20 @@ class Sim3:
         )
 
     def inverse(self) -> Sim3:
-        """The similarity back from a to b."""
+        """Return the similarity back from a to b."""
         rotation, scale = np.swapaxes(self.rotation, -1, -2), 1.0 / self.scale
         translation = -np.asarray(scale)[..., None] * (rotation @ self.translation[..., None])[..., 0]
         return Sim3(scale, rotation, translation)
 
     def apply(self, points: ArrayLike) -> Array:
-        """Points of frame b in frame a. Shape (..., N, 3) -> (..., N, 3)."""
+        """Return points of frame b in frame a. Shape (..., N, 3) -> (..., N, 3)."""
         p = np.asarray(points, dtype=np.float64)
         turned = p @ np.swapaxes(self.rotation, -1, -2)
         return np.asarray(np.asarray(self.scale)[..., None, None] * turned + self.translation[..., None, :])
 
 
 def umeyama(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None, *, with_scale: bool) -> Sim3:
-    """The similarity (rigid when `with_scale` is false) that minimises sum w |S source - target|^2.
+    """Return the similarity (rigid when `with_scale` is false) that minimises sum w |S source - target|^2.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, with weights.
     `source` and `target` have shape (N, 3), `weights` (N,). Raises `DegenerateError` for fewer than three points and
@@ -173,13 +173,13 @@ class OrientedBox:
     """R_world_object: columns are the box's axes in the world. Shape (3, 3)."""
 
     def corners(self) -> Array:
-        """The eight corners in the world. Shape (8, 3)."""
+        """Return the eight corners in the world. Shape (8, 3)."""
         signs = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
         return np.asarray(self.center + (signs * self.size) @ self.rotation.T)
 
 
 def upright_box(points: ArrayLike, trim: float = 0.0) -> OrientedBox:
-    """The box of least footprint that stands upright (its third axis is world z), the first axis the longer one.
+    """Return the box of least footprint that stands upright (its third axis is world z), the first axis the longer one.
 
     `points` has shape (N, 3), N >= 1. `trim` is the fraction of points left outside at either end of each axis, a
     guard against stray points.
@@ -197,7 +197,7 @@ def upright_box(points: ArrayLike, trim: float = 0.0) -> OrientedBox:
 
 
 def _least_footprint_angle(xy: Array) -> float:
-    """Direction of one side of the least-area rectangle round points in the plane, radians in [0, pi/2)."""
+    """Return the direction of one side of the least-area rectangle round points in the plane, radians in [0, pi/2)."""
     try:
         hull = xy[ConvexHull(xy).vertices]
     except (QhullError, ValueError):

@@ -16,7 +16,7 @@ def encode_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint32]:
 
 
 def decode_mask(runs: NDArray[np.uint32], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The mask of run lengths. Shape (R,) -> (H, W). Raises `ValueError` when the runs do not fill the shape."""
+    """Return the mask of run lengths. Shape (R,) -> (H, W). Raises `ValueError` when the runs do not fill the shape."""
     if int(runs.astype(np.uint64).sum()) > shape[0] * shape[1]:
         raise ValueError(f"runs of {int(runs.sum())} pixels do not fit a mask of {shape[1]}x{shape[0]}")
     flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)

@@ -137,7 +137,7 @@ class FrameSamples:
 
     @staticmethod
     def empty() -> FrameSamples:
-        """No samples at all."""
+        """Return no samples at all."""
         return FrameSamples(
             frame=np.zeros(0, np.int64),
             pixel=np.zeros(0, np.int32),

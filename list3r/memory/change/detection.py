@@ -38,7 +38,7 @@ def across_sessions(
     seen: FreeSpaceCarving,
     settings: ChangeSettings,
 ) -> dict[tuple[int, int], PairScores]:
-    """Scores of pairs without those that plainly are two instances of two sessions at one place."""
+    """Return scores of pairs without those that plainly are two instances of two sessions at one place."""
     if len({s.session_id for s in shapes.values()}) < 2:
         return dict(pairs)
     out = {}
@@ -80,7 +80,7 @@ def find_changes(
 
 
 def as_events(changes: Changes, ids: Mapping[Key, int | None]) -> list[ChangeEvent]:
-    """The events of instances that have an id, by the first member of their groups."""
+    """Return the events of instances that have an id, by the first member of their groups."""
     out = []
     for c in changes.events:
         instance = ids.get(c.first)

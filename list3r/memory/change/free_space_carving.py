@@ -47,7 +47,7 @@ class FreeSpaceCarving:
         return out
 
     def _views_of(self, shapes: ChunkShapes) -> list[DepthView]:
-        """The keyframes of a chunk, in its own coordinates."""
+        """Return the keyframes of a chunk, in its own coordinates."""
         k = shapes.chunk_id
         if k not in self._views:
             self._views[k] = chunk_views(shapes.session_id, self._store.keyframes(k), shapes.unit)

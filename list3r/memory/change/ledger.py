@@ -42,7 +42,7 @@ class ChangeLedger:
 
     @staticmethod
     def of(changes: Changes, places: Sequence[Sequence[Key]], session: int) -> ChangeLedger:
-        """What was found, given the groups by overlap that it was found for."""
+        """Return what was found, given the groups by overlap that it was found for."""
         home = {key: tuple(g) for g in places for key in g}
         moved = []
         for group in changes.groups:
@@ -52,11 +52,11 @@ class ChangeLedger:
         return ChangeLedger(session, tuple(moved), frozenset(e.first for e in changes.events))
 
     def shows(self, group: Collection[Key]) -> bool:
-        """Whether a group has an event, so that it is shown however little was seen of it."""
+        """Return whether a group has an event, so that it is shown however little was seen of it."""
         return not self.with_events.isdisjoint(group)
 
     def current(self, group: Sequence[Key]) -> tuple[Key, ...]:
-        """The members of an instance that show it where it is now; all, but for what has moved."""
+        """Return the members of an instance that show it where it is now; all, but for what has moved."""
         here = set(group)
         for m in self.moved:
             if not here.isdisjoint(m.places[m.now]):
@@ -64,14 +64,15 @@ class ChangeLedger:
         return tuple(group)
 
     def keys(self) -> set[Key]:
-        """All local instances that it speaks of."""
+        """Return all local instances that it speaks of."""
         return {k for m in self.moved for place in m.places for k in place} | self.with_events
 
     def joined(
         self, groups: Sequence[Sequence[Key]], components: Mapping[int, int]
     ) -> tuple[list[list[Key]], ChangeLedger]:
-        """Groups by overlap with those joined that are the places of one instance, and the ledger with the places as
-        they have become; what it says of instances that are not among the groups stands. `components` by chunk id.
+        """Return groups by overlap with those joined that are the places of one instance, and the ledger with the
+        places as they have become; what it says of instances that are not among the groups stands. `components` by
+        chunk id.
         """
         home = {key: n for n, group in enumerate(groups) for key in group}
         sets = DisjointSet(range(len(groups)))
@@ -96,13 +97,13 @@ class ChangeLedger:
         return out, ChangeLedger(self.session, tuple(moved), self.with_events)
 
     def state(self, before: str | None, group: Sequence[Key], rows: Mapping[int, ChunkRow]) -> str:
-        """The state of an instance: the one that was told, until a later session sees it."""
+        """Return the state of an instance: the one that was told, until a later session sees it."""
         later = any(rows[k].session_id > self.session for k in {k for k, _ in group})
         return "present" if before is None or later else before
 
 
 def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> MovedInstance | None:
-    """The places of one instance as groups have become; nothing where they are one by overlap."""
+    """Return the places of one instance as groups have become; nothing where they are one by overlap."""
     if before is None or len(groups) < 2:
         return None
     there = set(before.places[before.now])
@@ -114,7 +115,7 @@ def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> M
 
 
 def read_ledger(store: Store, chunks: Sequence[ChunkRow]) -> ChangeLedger | None:
-    """What stands of changes; None where several sessions have ended and nothing is written down of them."""
+    """Return what stands of changes; None where several sessions have ended and nothing is written down of them."""
     told = store.get_value(_NAME)
     if told is not None:
         moved = (MovedInstance(tuple(_keys(p) for p in m["places"]), int(m["now"])) for m in told["moved"])

@@ -89,7 +89,7 @@ class ChangeMatching:
                 self._add(n, session, looks[n])
 
     def _replaces(self, n: int, left: dict[int, OrientedBox], session: int) -> bool:
-        """Whether a new instance stands where one stood that is gone."""
+        """Return whether a new instance stands where one stood that is gone."""
         p, s = self._p, self._s
         return any(
             p.component[n] == p.component[place]
@@ -98,7 +98,7 @@ class ChangeMatching:
         )
 
     def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_PlacedInstance, Look]]:
-        """The instances that are gone from where they were; all others that were known are given their state."""
+        """Return the instances that are gone from where they were; all others that were known are given their state."""
         p = self._p
         gone: list[tuple[_PlacedInstance, Look]] = []
         for placed in self._instances():
@@ -113,7 +113,7 @@ class ChangeMatching:
         return gone
 
     def _look_for(self, placed: _PlacedInstance, fresh: Sequence[int], session: int) -> Look | None:
-        """What frames tell about the place of an instance that was not found again, if it is gone from there."""
+        """Return what frames tell about the place of an instance that was not found again, if it is gone from there."""
         p = self._p
         placed.state = "unseen"
         if not self._movable[placed.now] or p.frames(placed.now, session) < self._s.least_frames:
@@ -128,7 +128,7 @@ class ChangeMatching:
         return None
 
     def _taken(self, n: int, found: Look, fresh: Sequence[int], session: int) -> bool:
-        """Whether something new stands where an instance was: what is not seen through of it lies at that."""
+        """Return whether something new stands where an instance was: what is not seen through of it lies at that."""
         p, s = self._p, self._s
         if found.verdict == "unseen" or p.changed(n, session, before=True) < s.seen_through:
             return False
@@ -154,7 +154,7 @@ class ChangeMatching:
         return [placed for n, placed in sorted(self._placed.items()) if placed.places[0] == n]
 
     def _scrap(self, n: int, boxes: dict[int, OrientedBox], session: int, *, before: bool) -> bool:
-        """Whether it is a scrap of a larger instance that went or came with it."""
+        """Return whether it is a scrap of a larger instance that went or came with it."""
         own = float(np.prod(boxes[n].size))
         return any(
             float(np.prod(box.size)) > own
@@ -226,7 +226,7 @@ class ChangeMatching:
         del self._placed[place]
 
     def _sure(self, found: Look) -> float:
-        """How certain it is that what frames see through is gone."""
+        """Return how certain it is that what frames see through is gone."""
         frames = len(found.frames)
         return float(max(found.free, self._s.least_sure) * frames / (frames + 1.0))
 
@@ -238,7 +238,7 @@ class ChangeMatching:
         self._events.append((placed.places[0], change))
 
     def _moves(self, gone: Sequence[tuple[_PlacedInstance, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
-        """Pairs of what is gone and what is new, one to one, of least difference in all."""
+        """Return pairs of what is gone and what is new, one to one, of least difference in all."""
         if not gone or not fresh:
             return []
         p = self._p
@@ -266,7 +266,7 @@ class ChangeMatching:
         ]
 
     def result(self) -> Changes:
-        """The groups as the matching leaves them."""
+        """Return the groups as the matching leaves them."""
         groups, current, states = [], {}, {}
         names: dict[int, Key] = {}
         for placed in self._instances():
@@ -282,7 +282,9 @@ class ChangeMatching:
 
 
 def _chance(cost: Array, i: int, j: int, none: float) -> float:
-    """How likely a pair is, beside the other candidates of either and that there is none, by their deviations."""
+    """Return how likely a pair is, beside the other candidates of either and that there is none, by their
+    deviations.
+    """
     others = np.concatenate([np.delete(cost[i], j), np.delete(cost[:, j], i), [none]])
     odds = float(np.exp(-0.5 * (others - cost[i, j])).sum())
     return round(1.0 / (1.0 + odds), 3)

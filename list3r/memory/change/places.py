@@ -34,7 +34,7 @@ class Looks:
 
 
 def difference(a: Looks, b: Looks, s: ChangeSettings, unit: float = 1.0) -> float:
-    """Sum of squared deviations between two looks; infinite for two that cannot be one instance."""
+    """Return the sum of squared deviations between two looks; infinite for two that cannot be one instance."""
     deviation = np.array(s.moved_share) * (a.extent + b.extent) / 2 + s.moved_m * unit
     sides = np.minimum(((a.extent - b.extent) / deviation) ** 2, s.moved_side_most)
     cosine = float(a.feature @ b.feature)
@@ -66,7 +66,9 @@ class Places:
         self.component = [self.rows[g[0][0]].component for g in groups]
 
     def members(self, n: int, session: int, *, before: bool, stayed: bool = False) -> list[Key]:
-        """Members of the last session before, or of this one; those that tell of the change, if it has not `stayed`."""
+        """Return members of the last session before, or of this one; those that tell of the change, if it has not
+        `stayed`.
+        """
         owner = [self.rows[k].session_id for k, _ in self.groups[n]]
         wanted = session
         if before:
@@ -76,7 +78,9 @@ class Places:
         return inside if stayed else self._pure(n, inside, session, before=before)
 
     def _pure(self, n: int, members: list[Key], session: int, *, before: bool) -> list[Key]:
-        """Those that hold least of what stayed, where what they show has changed: not what is mixed with a table."""
+        """Return those that hold least of what stayed, where what they show has changed: not what is mixed with a
+        table.
+        """
         if len(members) < 2:
             return members
         shares = np.array([self._shares(key, n, session, before=before) for key in members])
@@ -86,20 +90,20 @@ class Places:
         return [k for k, share in zip(members, shares.tolist(), strict=True) if share >= self._s.pure * common]
 
     def _shares(self, key: Key, n: int, session: int, *, before: bool) -> float:
-        """Share of the surface of one member that is seen through."""
+        """Return the share of the surface of one member that is seen through."""
         name = (key, session, before)
         if name not in self._share:
             self._share[name] = self._changed(self._points_of(key), n, session, before=before)
         return self._share[name]
 
     def points(self, n: int, session: int, *, before: bool, stayed: bool = False) -> Array:
-        """Some surface points, world coordinates. Shape (N, 3)."""
+        """Return some surface points, world coordinates. Shape (N, 3)."""
         parts = [self._points_of(key) for key in self.members(n, session, before=before, stayed=stayed)]
         points = np.concatenate(parts) if parts else np.zeros((0, 3))
         return points[:: max(1, len(points) // self._s.points)]
 
     def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
-        """The box of what was seen of it; unless it has stayed, of what of that has changed."""
+        """Return the box of what was seen of it; unless it has stayed, of what of that has changed."""
         points = self.points(n, session, before=before, stayed=stayed)
         if not stayed:
             points = self._without_what_stayed(points, self._views_across(n, session, before=before))
@@ -107,7 +111,7 @@ class Places:
         return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
 
     def inside(self, n: int, box: OrientedBox, slack_m: float, session: int, *, before: bool) -> float:
-        """Share of its surface points that lie in a box."""
+        """Return the share of its surface points that lie in a box."""
         points = self.points(n, session, before=before)
         if len(points) == 0:
             return 0.0
@@ -115,12 +119,12 @@ class Places:
         return float(np.mean(np.all(off <= box.size / 2 + slack_m * self.unit, axis=1)))
 
     def look_after(self, n: int, session: int) -> Look:
-        """What a session's frames see where an instance was before."""
+        """Return what a session's frames see where an instance was before."""
         points = self.points(n, session, before=True)
         return look(points, self._views_of(session, self.component[n]), self._s.visibility)
 
     def look_before(self, n: int, session: int) -> Look:
-        """What the frames of the last session that could tell saw where an instance is now."""
+        """Return what the frames of the last session that could tell saw where an instance is now."""
         points = self.points(n, session, before=False)
         for views in self._views_before(n, session):
             found = look(points, views, self._s.visibility)
@@ -129,14 +133,15 @@ class Places:
         return Look("unseen", 0.0, ())
 
     def changed(self, n: int, session: int, *, before: bool) -> float:
-        """Share of its surface that is seen through, of what is told: of what was, by a session that comes after;
-        of what is, by the sessions before.
+        """Return the share of its surface that is seen through, of what is told: of what was, by a session that comes
+        after; of what is, by the sessions before.
         """
         return self._changed(self.points(n, session, before=before), n, session, before=before)
 
     def explained(self, n: int, new: Sequence[int], session: int) -> float:
-        """Share of the surface that an instance had which is seen through or lies at what is new there, of what is
-        told."""
+        """Return the share of the surface that an instance had which is seen through or lies at what is new there, of
+        what is told.
+        """
         points = self.points(n, session, before=True)
         free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
         known = free + met > 0
@@ -156,17 +161,17 @@ class Places:
         return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
-        """The views of the sessions before, in the world of an instance, the last session first."""
+        """Return the views of the sessions before, in the world of an instance, the last session first."""
         component = self.component[n]
         earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
         return (self._views_of(s, component) for s in sorted(earlier, reverse=True))
 
     def known_before(self, n: int, session: int) -> bool:
-        """Whether an earlier session lies in the same world, so that an instance can be new to it."""
+        """Return whether an earlier session lies in the same world, so that an instance can be new to it."""
         return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
 
     def looks(self, n: int, session: int, *, before: bool) -> Looks:
-        """Its looks, the views that show most of it first; what is there all along is left out of its size.
+        """Return its looks, the views that show most of it first; what is there all along is left out of its size.
 
         `before` a session that does not show it there any more, else in the first session that does.
         """
@@ -178,7 +183,9 @@ class Places:
         return Looks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
 
     def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[DepthView]) -> Array:
-        """Weighted median over its whole views, so that what one view took from its surroundings does not count."""
+        """Return the weighted median over its whole views, so that what one view took from its surroundings does not
+        count.
+        """
         whole = [self.shapes[k].truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
         sizes, weights = [], []
         for key, is_whole, w in zip(keys, whole, weight, strict=True):
@@ -192,12 +199,13 @@ class Places:
         return np.array([_weighted_median(np.array(sizes)[:, d], np.array(weights)) for d in range(3)])
 
     def _views_across(self, n: int, session: int, *, before: bool) -> list[DepthView]:
-        """The views that tell what of an instance has changed: of this session where it was there before, else
-        before."""
+        """Return the views that tell what of an instance has changed: of this session where it was there before, else
+        before.
+        """
         return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
 
     def _without_what_stayed(self, points: Array, views: Sequence[DepthView]) -> Array:
-        """The points that have changed, where that is enough of them."""
+        """Return the points that have changed, where that is enough of them."""
         changed = points[changed_points(points, views, self._s.visibility)]
         return changed if len(changed) >= self._s.least_changed * len(points) else points
 
@@ -207,19 +215,19 @@ class Places:
         return np.array([*np.sort(box.size[:2])[::-1], box.size[2]])
 
     def flagged(self, n: int) -> float:
-        """Share of its members that are flagged as structure."""
+        """Return the share of its members that are flagged as structure."""
         return float(np.mean([self.shapes[k].structure[self._at(k, i)] for k, i in self.groups[n]]))
 
     def frames(self, n: int, before: int) -> int:
-        """Frames of earlier sessions in which an instance was seen."""
+        """Return frames of earlier sessions in which an instance was seen."""
         return sum(self.frames_in(n, s) for s in self.sessions[n] if s < before)
 
     def frames_in(self, n: int, session: int) -> int:
-        """Frames of one session in which an instance was seen."""
+        """Return frames of one session in which an instance was seen."""
         return len({f for _, f in self._sightings(n, session)})
 
     def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
-        """The frames of a session that see most of an instance."""
+        """Return the frames of a session that see most of an instance."""
         best: dict[int, int] = {}
         for area, frame in self._sightings(n, session):
             best[frame] = max(area, best.get(frame, 0))

@@ -48,14 +48,14 @@ class Reference:
     """CIE a*, b* of them."""
 
     def corrected(self, lab: Sequence[float]) -> tuple[float, float, float]:
-        """A colour as it would look in white light that shows white as white."""
+        """Return a colour as it would look in white light that shows white as white."""
         gain = float(np.clip(_FULL_WHITE_L / max(self.white_l, 1e-6), 1.0, _MAX_GAIN))
         lightness, share = min(100.0, lab[0] * gain), min(1.0, lab[0] / max(self.white_l, 1e-6))
         return lightness, gain * (lab[1] - share * self.cast_ab[0]), gain * (lab[2] - share * self.cast_ab[1])
 
 
 def lab_from_rgb(rgb: NDArray[np.uint8]) -> Array:
-    """CIE L*a*b* (D65) of sRGB colours. Shape (..., 3) -> (..., 3)."""
+    """Return CIE L*a*b* (D65) of sRGB colours. Shape (..., 3) -> (..., 3)."""
     c = np.asarray(rgb, dtype=np.float64) / 255.0
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     t = linear @ _XYZ.T / _WHITE
@@ -64,7 +64,8 @@ def lab_from_rgb(rgb: NDArray[np.uint8]) -> Array:
 
 
 def scene_reference(lab: Array) -> Reference:
-    """White patch and grey world, both bounded: the light from a sample of all surfaces, CIE L*a*b*. Shape (N, 3).
+    """Return the white patch and grey world, both bounded: the light from a sample of all surfaces, CIE L*a*b*. Shape
+    (N, 3).
 
     White is the 98th percentile of lightness among the nearly neutral points; the cast is the median of the bright ones
     among them. Where hardly anything is neutral nothing is corrected.
@@ -80,7 +81,8 @@ def scene_reference(lab: Array) -> Reference:
 
 
 def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]:
-    """The colours of an instance, the commonest first: modes of its points' colours. Shape (N, 3); grey for none.
+    """Return the colours of an instance, the commonest first: modes of its points' colours. Shape (N, 3); grey for
+    none.
 
     A mode is the point with most others alike, and takes them with it; the swatch is their median. What is mixed
     (edges, blur) lies between the modes and is counted to none.
@@ -107,7 +109,7 @@ def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]
 
 
 def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -> tuple[str, tuple[int, int, int]]:
-    """(name, RGB as seen) of the colour that most of an instance has, shades of one name counted together."""
+    """Return (name, RGB as seen) of the colour that most of an instance has, shades of one name counted together."""
     names = [color_name(s.lab, reference) for s in swatches]
     weight = [s.share * (_DARK_WEIGHT if s.lab[0] < _DARK_L else 1.0) for s in swatches]
     total = {n: sum(w for m, w in zip(names, weight, strict=True) if m == n) for n in names}
@@ -116,7 +118,7 @@ def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -
 
 
 def color_words(swatches: Sequence[Swatch], reference: Reference | None = None) -> str:
-    """The name of the main colour, or "red and white" where two clearly different ones share an instance."""
+    """Return the name of the main colour, or "red and white" where two clearly different ones share an instance."""
     name, _ = main_color(swatches, reference)
     share = {n: 0.0 for n in (color_name(s.lab, reference) for s in swatches)}
     for s in swatches:
@@ -149,7 +151,7 @@ _HUES = (
 
 
 def color_name(lab: Sequence[float], reference: Reference | None = None) -> str:
-    """The everyday name of one colour, CIE L*a*b* as seen, in the light of the reference."""
+    """Return the everyday name of one colour, CIE L*a*b* as seen, in the light of the reference."""
     light, a, b = (reference or Reference()).corrected(lab)
     chroma, hue = float(np.hypot(a, b)), float(np.degrees(np.arctan2(b, a)) % 360.0)
     if (light < 14.0 and chroma < 20.0) or chroma < _least_chroma(light, hue):
@@ -176,7 +178,7 @@ def _grey(light: float) -> str:
 
 
 def _warm(family: str, light: float, chroma: float, hue: float) -> str:
-    """Red, orange and yellow; when dull or dark, people see pink, brown, tan and beige."""
+    """Name a colour among red, orange and yellow; when dull or dark, people see pink, brown, tan and beige."""
     if family == "red" and light > 66.0 and chroma < 55.0:
         return "pink" if hue < 35.0 or hue >= 345.0 else "tan" if light < 76.0 else "beige"
     if family == "red" and (hue < 28.0 or hue >= 345.0 or chroma > 12.0 + 0.5 * light):

@@ -13,7 +13,7 @@ _SURFACE_M = 0.008
 
 
 def shape_word(points: Array, size: Array, unit: float = 1.0) -> str:
-    """What an instance is shaped like, from points (N, 3) in the axes of its box and its full edge lengths (3,).
+    """Return what an instance is shaped like, from points (N, 3) in the axes of its box and its full edge lengths (3,).
 
     The third axis stands upright where gravity is known; `unit` is what a metre is. Flat instances are a `sheet`, a
     `panel` (upright and large) or a `slab`; a `table` is a level top with nothing but legs under it; `cylinder` and
@@ -39,7 +39,7 @@ def shape_word(points: Array, size: Array, unit: float = 1.0) -> str:
 
 
 def _is_table(points: Array, size: Array, unit: float) -> bool:
-    """A level top that most of the points lie on, wide, and high over the lowest of them."""
+    """Return whether it is a level top that most of the points lie on, wide, and high over the lowest of them."""
     if size[2] < 0.35 * unit or min(size[0], size[1]) < 0.35 * unit or len(points) < 40:
         return False
     top = points[:, 2] > float(np.quantile(points[:, 2], 0.95)) - 0.06 * unit
@@ -49,14 +49,14 @@ def _is_table(points: Array, size: Array, unit: float) -> bool:
 
 
 def _sides(points: Array, size: Array) -> Array:
-    """The points below the top and above the bottom of an instance: those that tell its outline."""
+    """Return the points below the top and above the bottom of an instance: those that tell its outline."""
     level = points[:, 2] / max(float(size[2]), 1e-9)
     return points[(level < 0.3) & (level > -0.45)]
 
 
 def _on_circle(points: Array, size: Array, tolerance: float) -> float:
-    """Share of the sides that lie on the circle that fits them best (Kasa's linear fit, once reweighted); 0 where the
-    circle is not the size of the instance.
+    """Return the share of the sides that lie on the circle that fits them best (Kasa's linear fit, once reweighted); 0
+    where the circle is not the size of the instance.
     """
     sides = _sides(points, size)[:, :2]
     if len(sides) < 20:
@@ -75,7 +75,7 @@ def _on_circle(points: Array, size: Array, tolerance: float) -> float:
 
 
 def _on_faces(points: Array, size: Array, tolerance: float) -> float:
-    """Share of the sides that lie on the upright faces of the box."""
+    """Return the share of the sides that lie on the upright faces of the box."""
     sides = _sides(points, size)[:, :2]
     if len(sides) < 20:
         return 0.0
@@ -83,7 +83,7 @@ def _on_faces(points: Array, size: Array, tolerance: float) -> float:
 
 
 def describe(shape: str, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
-    """Description of an instance: "small white cylinder, 9 cm".
+    """Return the description of an instance: "small white cylinder, 9 cm".
 
     `shape` is the `shape_word` and `size` (3,) the full edge lengths of its box, world units; `unit` is what a metre is
     about, also where the memory is not metric, and then no centimetres are told.

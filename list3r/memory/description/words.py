@@ -29,7 +29,8 @@ _SYNONYMS = {
 
 
 def vocabulary(label: str | None, structure: str | None, description: str, color_name: str) -> dict[str, float]:
-    """The words that an instance bears, singular and in one word for many, with how well each names it, in (0, 1].
+    """Return the words that an instance bears, singular and in one word for many, with how well each names it, in (0,
+    1].
 
     Of the description only what stands before the first comma counts.
     """
@@ -48,7 +49,7 @@ def vocabulary(label: str | None, structure: str | None, description: str, color
 
 
 def split_words(text: str) -> list[str]:
-    """The words of a text in lower case, plurals as singulars, synonyms as one word."""
+    """Return the words of a text in lower case, plurals as singulars, synonyms as one word."""
     return [_singular(w) for w in re.findall(r"[^\W_]+", text.lower())]
 
 

@@ -86,7 +86,7 @@ def consolidate(
 
 
 def _standing_world(store: Store, summaries: Summaries, s: ConsolidationSettings, *, ended: bool) -> World | None:
-    """What the instances were derived with, where that still holds; None for a short memory."""
+    """Return what the instances were derived with, where that still holds; None for a short memory."""
     chunks = store.chunks()
     world = known_world(store, chunks, s) if len(chunks) > s.whole_chunks else None
     if world is None or len(chunks) < 2 * world.chunks or not (ended or len(chunks) <= _LOOKED_AT):
@@ -96,14 +96,14 @@ def _standing_world(store: Store, summaries: Summaries, s: ConsolidationSettings
 
 
 def _replaced(store: Store, settled: Collection[int]) -> set[int] | None:
-    """Chunks that were placed since the last derivation; None where that is not known."""
+    """Return chunks that were placed since the last derivation; None where that is not known."""
     if store.touched is None:
         return None
     return store.touched | {c.chunk_id for c in store.chunks()[-1:] if c.chunk_id not in settled}
 
 
 def _most_moved(store: Store, moved: Collection[int], known: int, world: World, s: ConsolidationSettings) -> bool:
-    """Whether so many chunks have moved that all are derived anew, or one has another feature space."""
+    """Return whether so many chunks have moved that all are derived anew, or one has another feature space."""
     other_space = world.space and any(store.feature_space(k) != world.space for k in moved)
     return bool(other_space) or len(moved) > max(2, s.whole_share * known)
 
@@ -143,7 +143,7 @@ def _derive(
 
 
 def _told_otherwise(group: Group, before: ChangeLedger, now: ChangeLedger) -> bool:
-    """Whether an instance has moved, or come to have events, or the other way round."""
+    """Return whether an instance has moved, or come to have events, or the other way round."""
     return before.current(group) != now.current(group) or before.shows(group) != now.shows(group)
 
 

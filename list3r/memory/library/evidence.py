@@ -69,7 +69,7 @@ def weigh(
     settings: EvidenceSettings,
     wanted: Collection[int] | None = None,
 ) -> list[Evidence]:
-    """The evidence for each group, from the scores of all pairs of chunks.
+    """Return the evidence for each group, from the scores of all pairs of chunks.
 
     With `wanted` only these groups are weighed, by the pairs of their chunks, and the others are left without any;
     every local instance of those chunks must be in a group.
@@ -114,8 +114,8 @@ def weigh(
 def without_missed(
     before: Mapping[Key, int], groups: Sequence[Sequence[Key]], evidence: Sequence[Evidence], shown: Sequence[bool]
 ) -> dict[Key, int]:
-    """The ids of before without those of instances that others looked at and missed, and that lie within no other: they
-    were never there, so that no instance goes on with their id.
+    """Return the ids of before without those of instances that others looked at and missed, and that lie within no
+    other: they were never there, so that no instance goes on with their id.
     """
     gone = {
         key
@@ -127,13 +127,13 @@ def without_missed(
 
 
 def _bounds(chunks: Mapping[int, ChunkShapes], key: Key) -> bool:
-    """Whether a local instance is a surface that bounds the room, of which each chunk sees what it sees."""
+    """Return whether a local instance is a surface that bounds the room, of which each chunk sees what it sees."""
     chunk = chunks.get(key[0])
     return chunk is not None and bool(chunk.structure[int(np.searchsorted(chunk.local_id, key[1]))])
 
 
 def _frames_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes]) -> set[tuple[int, int]]:
-    """(session id, Frame.index) of the frames in which a group is seen."""
+    """Return (session id, Frame.index) of the frames in which a group is seen."""
     seen: set[tuple[int, int]] = set()
     for chunk_id, local_id in group:
         if chunk_id in chunks:
@@ -151,8 +151,8 @@ def contested(
     settings: EvidenceSettings,
     near: Ints | None = None,
 ) -> dict[int, tuple[Ints, NDArray[np.bool_]]]:
-    """The points of each chunk that it alone gives to an instance, while several chunks give their place to another
-    one.
+    """Return the points of each chunk that it alone gives to an instance, while several chunks give their place to
+    another one.
 
     Only instances that at least three chunks found lose points so: a chair's back that one chunk took for table.
     Returns by chunk which points were asked about and whether they are dropped, (M,) each; with `near` (keys of cells,
@@ -184,14 +184,14 @@ def contested(
 
 
 def claim_cells(chunk: ChunkShapes, S_world_chunk: Sim3, unit: float, settings: EvidenceSettings) -> Ints:
-    """Key of the cell in which each representative point of a chunk lies. Shape (R,)."""
+    """Return the key of the cell in which each representative point of a chunk lies. Shape (R,)."""
     cell = np.floor(S_world_chunk.apply(chunk.points) / (settings.claim_m * unit)).astype(np.int64) + (1 << 20)
     c = np.clip(cell, 0, (1 << 21) - 1)
     return np.asarray(c[:, 0] << 42 | c[:, 1] << 21 | c[:, 2])
 
 
 def _among(keys: Ints, wanted: Ints) -> NDArray[np.bool_]:
-    """Whether each key is one of the wanted ones, which ascend."""
+    """Return whether each key is one of the wanted ones, which ascend."""
     if len(wanted) == 0:
         return np.zeros(len(keys), dtype=bool)
     at = np.minimum(np.searchsorted(wanted, keys), len(wanted) - 1)

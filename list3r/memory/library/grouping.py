@@ -92,12 +92,12 @@ class Grouping:
             keys |= left
 
     def _closed(self, keys: Collection[Key]) -> set[Key]:
-        """All local instances that were in one group with any of these."""
+        """Return all local instances that were in one group with any of these."""
         self.look_up({k for k, _ in keys})
         return {m for key in keys for m in (*self.before.get(key, ()), key) if m[0] in self.region.rows}
 
     def _tied(self, keys: Collection[Key], inside: Collection[Key]) -> set[Key]:
-        """Local instances outside that an edge, or motion, ties to one of these."""
+        """Return local instances outside that an edge, or motion, ties to one of these."""
         numbering, links = self.region.links_of(self.region.pairs_of({k for k, _ in keys}))
         here, outside = numbering.flags(keys), ~numbering.flags(inside)
         tied = links.kind != NONE
@@ -117,7 +117,7 @@ class Grouping:
         return tied_movers(sorted(keys), sorted(others), placed, tracks, region.settings.moving)
 
     def _form(self, keys: Collection[Key]) -> tuple[list[Group], list[MergeDecision]]:
-        """The groups of some local instances alone, and the decisions."""
+        """Return the groups of some local instances alone, and the decisions."""
         if not keys:
             return [], []
         region = self.region

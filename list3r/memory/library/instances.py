@@ -76,7 +76,7 @@ class Member:
         return int(start), int(stop)
 
     def own(self) -> NDArray[np.int64]:
-        """Positions of the points of the chunk's shapes that are its surface. Shape (M,)."""
+        """Return positions of the points of the chunk's shapes that are its surface. Shape (M,)."""
         start, stop = self.span
         return np.asarray(start + np.flatnonzero(~self.dropped[start:stop]))
 
@@ -164,7 +164,7 @@ def derive_instance(
     upright: bool,
     settings: DeriveSettings,
 ) -> DerivedInstance:
-    """All that follows from the members of one instance; `upright` says that z is up."""
+    """Return all that follows from the members of one instance; `upright` says that z is up."""
     s = settings
     own = [m.own() for m in members]
     points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[k]) for m, k in zip(members, own, strict=True)])
@@ -203,7 +203,7 @@ def derive_instance(
 
 
 def _metre(members: Sequence[Member]) -> float:
-    """What a metre is about in the world, as its chunks tell."""
+    """Return what a metre is about in the world, as its chunks tell."""
     return float(np.median([m.shapes.unit * float(m.S_world_chunk.scale) for m in members]))
 
 
@@ -214,8 +214,9 @@ def _aabb(points: Array, trim: float) -> Array:
 def _confirmed(
     points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings
 ) -> NDArray[np.int64]:
-    """Points that enough of the members agree on: what a single chunk added to an instance that others saw whole is a
-    bit of something else. Members that the image's border cut have no say, and where they are many nothing is dropped.
+    """Return points that enough of the members agree on: what a single chunk added to an instance that others saw whole
+    is a bit of something else. Members that the image's border cut have no say, and where they are many nothing is
+    dropped.
     """
     whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
     need = int(np.ceil(s.confirmed * whole.sum()))
@@ -240,7 +241,9 @@ _NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
 def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:
-    """Normal of an instance that is flat in most of its views and as a whole, towards the cameras that saw it."""
+    """Return the normal of an instance that is flat in most of its views and as a whole, towards the cameras that saw
+    it.
+    """
     flat = [m for m in members if not np.isnan(m.shapes.plane[m.at]).any()]
     if 2 * len(flat) < len(members) or len(points) < 3:
         return None
@@ -254,7 +257,9 @@ def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Arra
 
 
 def with_agreement(found: DerivedInstance, agreement: float) -> DerivedInstance:
-    """The instance with its confidence; `agreement` is the share of the chunks that saw its place and found it."""
+    """Return the instance with its confidence; `agreement` is the share of the chunks that saw its place and found
+    it.
+    """
     return replace(found, geometry=replace(found.geometry, confidence=round(found.certainty * agreement, 4)))
 
 
@@ -267,7 +272,7 @@ def _certainty(frames: int, stability: float, members: Sequence[Member], s: Deri
 
 
 def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:
-    """The frame with the largest mask, weighted down where the border cuts it or something hides it."""
+    """Return the frame with the largest mask, weighted down where the border cuts it or something hides it."""
     best: tuple[float, int, int] | None = None
     box: Array = np.zeros(4)
     for m in members:

@@ -99,7 +99,7 @@ def put_votes(
 
 
 def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
-    """What a discoverer with class names says of a local instance, from its names and scores on the anchors.
+    """Return what a discoverer with class names says of a local instance, from its names and scores on the anchors.
 
     A score is taken for the probability of the class; anchors that follow one another see nearly the same view with the
     same mistakes, so each has half a voice.
@@ -130,7 +130,7 @@ def decide(
     known: Mapping[str, Collection[str] | None] | None = None,
     settings: LabelSettings | None = None,
 ) -> tuple[str, float, float] | None:
-    """(class, its probability, frames in which it was found), None where no class is likely enough.
+    """Return (class, its probability, frames in which it was found), None where no class is likely enough.
 
     `votes` are those of each source, `known` the classes that each knows, None or absent for one that speaks of every
     class. The classes exclude one another and all of them may be wrong, which has the odds of 1.
@@ -152,20 +152,22 @@ def decide(
 
 
 def _said(votes: Votes, name: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:
-    """Pictures in which a source found a class, and its log odds for it; one that it does not know is not missed."""
+    """Return pictures in which a source found a class, and its log odds for it; one that it does not know is not
+    missed.
+    """
     found, got = votes.classes.get(name, (0.0, 0.0))
     missed = votes.missed if known is None or name in known else 0.0
     return found, (got - missed) / (1.0 + likeness * max(votes.looks - 1.0, 0.0))
 
 
 def detected_labels(store: Store) -> dict[int, DetectedLabel]:
-    """The labels that instances have from detectors and discoverers, by id."""
+    """Return the labels that instances have from detectors and discoverers, by id."""
     rows: dict[str, list[Any]] = store.get_value("detected labels", {})
     return {int(n): DetectedLabel(str(r[0]), float(r[1]), float(r[2]), str(r[3])) for n, r in rows.items()}
 
 
 def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str, Any]:
-    """Who gave an instance its label and how sure that is, for JSON; nothing for one without a label."""
+    """Return who gave an instance its label and how sure that is, for JSON; nothing for one without a label."""
     if instance.label is None:
         return {}
     if detected is None:
@@ -214,7 +216,7 @@ def apply_labels(
 
 
 def _home(store: Store, ids: Iterable[int] | None) -> dict[Key, int]:
-    """Which instance each local instance belongs to, of all instances or of some."""
+    """Return which instance each local instance belongs to, of all instances or of some."""
     rows = store.observations() if ids is None else [o for n in ids for o in store.observations(n)]
     return {(o.chunk_id, o.local_id): o.instance_id for o in rows}
 
@@ -238,7 +240,7 @@ def _label(
 
 
 def _named_by_operators(store: Store, home: Mapping[Key, int]) -> Collection[int]:
-    """Instances of which an operator said what they are called, or that they are called nothing."""
+    """Return instances of which an operator said what they are called, or that they are called nothing."""
     return {home[k] for keys, _ in store.constraints().labels for k in keys if k in home}
 
 

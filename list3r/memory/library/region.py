@@ -231,7 +231,7 @@ class Region:
         return {k for k in out if any(self.rows[k].component == self.rows[j].component for j in chunk_ids)}
 
     def _meet_in_time(self, a: int, b: int) -> bool:
-        """Whether two chunks of one session lie so near in time that what moves may be the same."""
+        """Return whether two chunks of one session lie so near in time that what moves may be the same."""
         if self.store.chunk(a).session_id != self.store.chunk(b).session_id:
             return False
         one, two = (list(self.times_of(k).values()) or [0.0] for k in (a, b))

@@ -25,7 +25,7 @@ _SCORES = np.dtype(
 
 
 def pack_scores(p: PairScores) -> bytes:
-    """Scores of a pair of chunks as one blob."""
+    """Return scores of a pair of chunks as one blob."""
     out: NDArray[np.void] = np.zeros(len(p.i), _SCORES)
     for name in _SCORES.names or ():
         out[name] = getattr(p, name)
@@ -33,7 +33,7 @@ def pack_scores(p: PairScores) -> bytes:
 
 
 def unpack_scores(blob: bytes) -> PairScores:
-    """The inverse of `pack_scores`."""
+    """Return the inverse of `pack_scores`."""
     found = np.frombuffer(blob, _SCORES)
     i, j, shared = (found[name].astype(np.int64) for name in ("i", "j", "shared"))
     return PairScores(i, j, found["i_on_j"].copy(), found["j_on_i"].copy(), shared, found["frame_iou"].copy())
@@ -71,7 +71,7 @@ def record_of(
 
 
 def moved(instance: Instance, S: Sim3) -> Instance:
-    """The instance where its chunk lies to the last digit, not where it was settled; or the way back."""
+    """Return the instance where its chunk lies to the last digit, not where it was settled; or the way back."""
     by = S.apply(instance.center[None])[0] - instance.center
     box = replace(instance.box, center=instance.box.center + by)
     return replace(instance, center=instance.center + by, aabb=instance.aabb + by, box=box)

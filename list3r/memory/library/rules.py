@@ -116,7 +116,9 @@ class World:
         return {**plain, "light": light}
 
     def near(self, other: World) -> bool:
-        """Whether what was derived with the other one holds: the light, the unit and the floor may differ a little."""
+        """Return whether what was derived with the other one holds: the light, the unit and the floor may differ a
+        little.
+        """
         if (self.upright, self.first, self.posed, self.space, self.stamp) != (
             other.upright,
             other.first,
@@ -139,7 +141,7 @@ _WHITE_L, _CAST = 3.0, 2.0
 
 
 def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s: ConsolidationSettings) -> World:
-    """What holds for the whole memory now; a sample of at most 64 chunks tells."""
+    """Return what holds for the whole memory now; a sample of at most 64 chunks tells."""
     first = min(c.component for c in chunks)
     upright = _upright(store)
     inside = [c for c in chunks if c.component == first]
@@ -160,7 +162,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
 
 
 def known_world(store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) -> World | None:
-    """What the library was derived with, where that still holds as far as can be told without looking at all."""
+    """Return what the library was derived with, where that still holds as far as can be told without looking at all."""
     told = store.get_value("library")
     if not told:
         return None

@@ -75,7 +75,7 @@ def _near(a: Sim3, b: Sim3, unit: float, s: HysteresisSettings) -> bool:
 
 
 def _extent(summary: ChunkSummary, S_graph_chunk: Sim3, slack: float) -> Array:
-    """Axis-aligned box of a chunk's points in the graph's frame, grown. Shape (2, 3)."""
+    """Return the axis-aligned box of a chunk's points in the graph's frame, grown. Shape (2, 3)."""
     if len(summary.shapes.points) == 0:
         return np.array([[np.inf] * 3, [-np.inf] * 3])
     p = S_graph_chunk.apply(summary.shapes.points)
@@ -85,7 +85,7 @@ def _extent(summary: ChunkSummary, S_graph_chunk: Sim3, slack: float) -> Array:
 def neighbours(
     rows: Mapping[int, SettledRow], chunk_id: int, here: SettledRow | None = None, extents: Array | None = None
 ) -> list[int]:
-    """Ids of the chunks of one component that lie near a chunk, itself among them, in order.
+    """Return ids of the chunks of one component that lie near a chunk, itself among them, in order.
 
     `here` is where the chunk lies, where that is not what `rows` says; `extents` are those of the rows, (N, 2, 3), for
     who asks often.

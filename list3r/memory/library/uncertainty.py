@@ -11,7 +11,8 @@ from list3r.memory.records import ChunkRow
 
 
 def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:
-    """Covariance of a point that is fixed to a chunk, world units, from the chunk's own. Shape (3,) -> (3, 3).
+    """Return the covariance of a point that is fixed to a chunk, world units, from the chunk's own. Shape (3,) -> (3,
+    3).
 
     S_true = S_world_chunk exp(x), x = (rho, omega, sigma), moves the point p of the chunk by rho + omega x p + sigma p
     (first order). None where the chunk's covariance is not known.
@@ -26,8 +27,8 @@ def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:
 
 
 def position_sigma(center_world: Array, chunks: Iterable[ChunkRow]) -> float | None:
-    """Standard deviation of an instance's position along the worst axis, world units; None where no chunk knows its
-    own.
+    """Return the standard deviation of an instance's position along the worst axis, world units; None where no chunk
+    knows its own.
 
     `chunks` are those that saw it. An instance is derived from what all of them saw, and its error is a weighted mean
     of theirs, which are correlated to an unknown degree: whatever the weights, it is no larger than that of the worst

@@ -92,7 +92,7 @@ class Weighing:
             out.shown[g] = show
 
     def _looked_at(self) -> set[Group]:
-        """Groups in frames that chunks of computed depth share with a dirty one, which may miss them."""
+        """Return groups in frames that chunks of computed depth share with a dirty one, which may miss them."""
         pairs = self._region.pairs_of(self._g.dirty.chunks)
         shapes = {k: self._region.shapes(k) for k in sorted({k for pair in pairs for k in pair})}
         beside = frames_beside(shapes, pairs)
@@ -105,7 +105,7 @@ class Weighing:
         return out
 
     def _against(self, groups: Collection[Group]) -> set[Group]:
-        """Groups of which a member lies on a member of one of these."""
+        """Return groups of which a member lies on a member of one of these."""
         pairs = self._region.pairs_of(chunks_of(groups))
         chunks = {k for pair in pairs for k in pair}
         self._g.look_up(chunks)
@@ -162,8 +162,8 @@ class Weighing:
         return out
 
     def _regrouped(self, changed: Sequence[Group]) -> dict[int, list[int]]:
-        """Local instances, by chunk, whose place may be claimed otherwise now: all of a group, but of a large one that
-        only grew those that came to it.
+        """Return local instances, by chunk, whose place may be claimed otherwise now: all of a group, but of a large
+        one that only grew those that came to it.
         """
         before, out = self._g.before, dict[int, list[int]]()
         for g in changed:

@@ -87,7 +87,7 @@ class Writer:
         self._states |= {n: s for n, s in states.items() if n in self._states}
 
     def _derive(self, instance_id: int, group: Group, structure: str | None = None) -> DerivedInstance:
-        """An instance, with its agreement still to be said."""
+        """Return an instance, with its agreement still to be said."""
         region = self._region
         chunks = {k: (region.shapes(k), region.pose(k), self._weighing.dropped_of(k)) for k in {k for k, _ in group}}
         mover = self._g.mover(group)
@@ -99,7 +99,7 @@ class Writer:
         return replace(found, geometry=replace(found.geometry, structure=structure))
 
     def _stored(self, ids: Iterable[int]) -> list[InstanceGeometry]:
-        """Geometries of instances as they are in the store."""
+        """Return geometries of instances as they are in the store."""
         for instance in self._store.instances_of(sorted(n for n in ids if n not in self._derived)):
             group = self._group_of(instance.id)
             if group:
@@ -120,8 +120,8 @@ class Writer:
         )
 
     def _edited_labels(self, fresh: Mapping[int, Group]) -> dict[int, str | None]:
-        """Labels that edits gave to instances that are written: each goes to the group with most of what it was given
-        to, be that written or not.
+        """Return labels that edits gave to instances that are written: each goes to the group with most of what it was
+        given to, be that written or not.
         """
         here = {k: n for n, g in fresh.items() for k in g}
         labels, rows = self._g.constraints.labels, self._region.rows
@@ -161,7 +161,7 @@ class Writer:
     # ------------------------------------------------------------------ structure and relations
 
     def _near(self, box: Array, reach: Array) -> list[int]:
-        """Ids of the instances whose boxes come within `reach` of a box, along each axis."""
+        """Return ids of the instances whose boxes come within `reach` of a box, along each axis."""
         slack = reach + _SLACK_M * self._world.unit
         return self._store.ids_in_box(box[0] - slack, box[1] + slack)
 
@@ -189,7 +189,9 @@ class Writer:
         return classify_structure([geometry], world.floor, self._eye_level, world.unit, self._s.structure, still)[0]
 
     def _eye_level(self, geometry: InstanceGeometry) -> float:
-        """Height that 90 % of the cameras that saw an instance lie below; without cameras everything is below."""
+        """Return the height that 90 % of the cameras that saw an instance lie below; without cameras everything is
+        below.
+        """
         rows = [self._region.settled_chunk(k) for k in dict.fromkeys(k for k, _ in self._group_of(geometry.id))]
         heights = cameras_of(self._store, rows).translation[:, 2]
         return float(np.quantile(heights, self._s.structure.eye_level)) if len(heights) else np.inf

@@ -33,7 +33,9 @@ _REACH_M = 2.0
 
 
 def store_at(store: Store, session_id: int) -> Store:
-    """A store to read, as it was after a session; close it like any other. Raises `OptionError` for no such session."""
+    """Return a store to read, as it was after a session; close it like any other. Raises `OptionError` for no such
+    session.
+    """
     past = _PastStore.open(store.path)
     past.session_id = session_id
     try:
@@ -140,13 +142,13 @@ def _has_changed(then: Instance, now: Instance | None) -> bool:
 
 
 def _kept(known: Sequence[Relation], then: Sequence[Instance], changed: set[int]) -> list[Relation]:
-    """Relations among what was there then and has not changed since."""
+    """Return relations among what was there then and has not changed since."""
     same = {i.id for i in then} - changed
     return [r for r in known if r.subject in same and r.object in same]
 
 
 def _told_anew(past: Store, then: Sequence[Instance], changed: set[int], vertical: bool) -> list[Relation]:
-    """Relations of what has changed since."""
+    """Return relations of what has changed since."""
     out: list[Relation] = []
     first = min((c.component for c in past.chunks()), default=0)
     for component in sorted({i.component for i in then if i.id in changed}):
@@ -166,7 +168,7 @@ def _gap(a: Array, b: Array) -> float:
 
 
 def _body(past: Store, instance: Instance, middle: Array) -> InstanceGeometry | None:
-    """An instance as relations see it, from the surface that was known then."""
+    """Return an instance as relations see it, from the surface that was known then."""
     points = past.surface_points(instance.id).astype(np.float64)
     slack = 1e-3 * float(np.linalg.norm(instance.aabb[1] - instance.aabb[0]))
     points = points[np.all((points >= instance.aabb[0] - slack) & (points <= instance.aabb[1] + slack), axis=1)]

@@ -22,7 +22,7 @@ class MemoryEdits:
     """Threads take turns."""
 
     def merge(self, a: int, b: int, *, author: str | None = None) -> EditReport:
-        """Two instances are one instance; the older id stays, the other becomes its alias for ever."""
+        """Say that two instances are one; the older id stays, the other becomes its alias for ever."""
         from list3r.memory.maintenance import edits
 
         with self._lock:
@@ -31,7 +31,8 @@ class MemoryEdits:
     def split(
         self, instance_id: int, out: Sequence[tuple[int, int]] | None = None, *, author: str | None = None
     ) -> EditReport:
-        """An instance is two: `out` (chunk id, local id) leaves it, or what the evidence parts from it best."""
+        """Say that an instance is two: `out` (chunk id, local id) leaves it, or what the evidence parts from it
+        best."""
         from list3r.memory.maintenance import edits
 
         with self._lock:
@@ -66,7 +67,7 @@ class MemoryEdits:
             return edits.undo(self._writable(), entry, author)
 
     def merges(self, instance_id: int | None = None) -> list[LogEntry]:
-        """The merge log, oldest first; only what concerns one instance where asked. Raises `UnknownIdError`."""
+        """Return the merge log, oldest first; only what concerns one instance where asked. Raises `UnknownIdError`."""
         from list3r.memory.maintenance.merge_log import merge_log
 
         with self._lock:

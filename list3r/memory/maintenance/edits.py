@@ -52,7 +52,7 @@ class EditReport:
 
 
 def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport:
-    """Two instances are one instance, whatever their overlap says; the older id stays, the other becomes its alias.
+    """Say that two instances are one, whatever their overlap says; the older id stays, the other becomes its alias.
 
     Raises `UnknownIdError`, and `OptionError` for two that are one already or lie in parts that were never joined.
     """
@@ -71,7 +71,7 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
 
 
 def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, author: str | None = None) -> EditReport:
-    """An instance is two instances: `out`, local instances (chunk id, local id) of it, and the rest.
+    """Say that an instance is two: `out`, local instances (chunk id, local id) of it, and the rest.
 
     Without `out` it is parted where the evidence parts it best. The larger part keeps the id, the other gets a new one.
     Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.
@@ -158,7 +158,7 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
 
 
 def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
-    """What merging decided is decided otherwise, by an edit of the two local instances that it spoke of."""
+    """Decide otherwise what merging decided, by an edit of the two local instances that it spoke of."""
     found = next((e for e in store.log_entries() if e.entry == entry), None)
     if found is None:
         raise OptionError(f"the log has no entry {entry}; `list3r merges {store.path}` shows all")
@@ -192,7 +192,7 @@ def _edit(kind: str, parts: tuple[tuple[Key, ...], ...], before: Before, author:
 
 
 def _line(text: str, what: str) -> str:
-    """The text on one line. Raises `OptionError` when it is none that people can read."""
+    """Return the text on one line. Raises `OptionError` when it is none that people can read."""
     line = " ".join(text.split())
     if len(line) > _LONGEST or not line.isprintable():
         raise OptionError(f"the {what} is one line of at most {_LONGEST} printable characters")
@@ -207,14 +207,14 @@ def _user() -> str:
 
 
 def _as_they_are(store: Store, ids: Sequence[int]) -> Before:
-    """What an undo brings back: ids, labels and local instances of instances."""
+    """Return what an undo brings back: ids, labels and local instances of instances."""
     return tuple(
         (n, store.instance(n).label, tuple((o.chunk_id, o.local_id) for o in store.observations(n))) for n in ids
     )
 
 
 def _owners(store: Store, keys: Sequence[Key]) -> Before:
-    """The same of all instances that any of these local instances belong to."""
+    """Return the same of all instances that any of these local instances belong to."""
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
     return _as_they_are(store, sorted({home[k] for k in keys if k in home}))
 
@@ -262,7 +262,7 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
 
 
 def _of_scale(store: Store, edit: Edit) -> bool:
-    """Whether it anchors the scale, or takes an anchor back, or brings one back."""
+    """Return whether it anchors the scale, or takes an anchor back, or brings one back."""
     edits = {e.entry: e for e in store.edits()}
     while edit.kind == "undo" and edit.target in edits:
         edit = edits[edit.target]
@@ -292,7 +292,7 @@ def _check_effect(edit: Edit, home: Mapping[Key, int]) -> None:
 def _retired(
     store: Store, before: Before, home: Mapping[Key, int], now: Mapping[int, str | None], merged: Mapping[int, int]
 ) -> dict[int, int]:
-    """Ids that were touched, name no instance now and have no alias yet: what most of them has become."""
+    """Return ids that were touched, name no instance now and have no alias yet: what most of them has become."""
     out = {}
     known = store.aliases()
     for instance_id, _, keys in before:

@@ -14,7 +14,7 @@ _STATES = {"seen_again": "present", "moved": "moved", "removed": "removed", "add
 
 
 def world_at(store: Store, session_id: int) -> list[Instance]:
-    """The instances known after a session, by id, where they were then and in the state that they had then.
+    """Return the instances known after a session, by id, where they were then and in the state that they had then.
 
     What was seen only later is left out; an instance that was moved later is where it was before. Sizes and words are
     those of today, which rest on all that was ever seen of an instance. Raises `OptionError` for a session that there
@@ -60,7 +60,7 @@ def _state(told: list[ChangeEvent], seen: set[int], session_id: int, latest: int
 
 
 def _where(instance: Instance, told: list[ChangeEvent], session_id: int) -> Instance:
-    """The instance where it was before the first move after the session."""
+    """Return the instance where it was before the first move after the session."""
     moves = [e for e in told if e.session_id > session_id and e.kind == "moved" and e.from_box is not None]
     if not moves:
         return instance

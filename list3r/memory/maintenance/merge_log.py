@@ -8,7 +8,7 @@ from list3r.memory.store.tables.edits import LogEntry
 
 
 def merge_log(store: Store, instance_id: int | None = None) -> list[LogEntry]:
-    """The log, oldest first; with an id, the entries that name it, an id that became it, or a part of it.
+    """Return the log, oldest first; with an id, the entries that name it, an id that became it, or a part of it.
 
     Raises `UnknownIdError` for an id that the memory does not hold.
     """

@@ -160,7 +160,7 @@ def _damage(copy: Path) -> list[str]:
 
 
 def _connect(path: Path, copy: Path, lost: _Lost) -> sqlite3.Connection:
-    """The damaged file as SQLite sees it; its schema must be ours, the rest need not.
+    """Return the damaged file as SQLite sees it; its schema must be ours, the rest need not.
 
     Of a file of an older schema what is not as it was written is left out, and the rest is brought forward.
     """
@@ -257,7 +257,7 @@ def _salvage(damaged: sqlite3.Connection, store: Store, lost: _Lost) -> None:
 
 
 def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) -> dict[Row, Row]:
-    """Rows of a table by key that match the checksums written of them."""
+    """Return rows of a table by key that match the checksums written of them."""
     try:
         sums, _ = stored_sums(damaged, table)
     except FAILURES:
@@ -283,7 +283,9 @@ def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) ->
 
 
 def _readable(damaged: sqlite3.Connection, table: SummedTable, parts: list[int]) -> Iterator[tuple[int, Row, Row]]:
-    """(part, key, row) of all rows that SQLite can still reach: from both ends of the table, then part by part."""
+    """Return (part, key, row) of all rows that SQLite can still reach: from both ends of the table, then part by
+    part.
+    """
     keys = [table.columns.index(c) for c in table.key]
     whole = True
     select = f"SELECT {table.part_of(table.name)}, {', '.join(table.columns)} FROM {table.name}"

@@ -20,8 +20,8 @@ _SEEN_APART = 4.0
 
 
 def propose_split(store: Store, keys: Sequence[Key]) -> tuple[Key, ...]:
-    """The smaller of the two parts, by average linkage over how little two local instances cover each other, how far
-    apart they lie for their size, how unlike they look, and whether they were seen side by side.
+    """Return the smaller of the two parts, by average linkage over how little two local instances cover each other, how
+    far apart they lie for their size, how unlike they look, and whether they were seen side by side.
     """
     distance = _distances(store, keys)
     part = fcluster(linkage(squareform(distance, checks=False), "average"), 2, "maxclust")

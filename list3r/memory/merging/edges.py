@@ -64,7 +64,7 @@ class Links:
 
     @staticmethod
     def join(parts: Sequence[tuple[int, int, Links]]) -> Links:
-        """Those of many pairs of chunks, each with the numbers of the first nodes of its two chunks."""
+        """Return those of many pairs of chunks, each with the numbers of the first nodes of its two chunks."""
         sizes = [len(p.a) for _, _, p in parts]
         starts = [np.repeat(np.array([p[n] for p in parts], np.int64), sizes) for n in (0, 1)]
         return Links(
@@ -79,7 +79,7 @@ class Links:
         )
 
     def among(self, number: Ints) -> Links:
-        """Those of which both nodes have a new number, which is -1 for the others."""
+        """Return those of which both nodes have a new number, which is -1 for the others."""
         a, b = number[self.a], number[self.b]
         kept = np.flatnonzero((a >= 0) & (b >= 0))
         rest = (getattr(self, name)[kept] for name in ("kind", "score", "low", "high", "cosine", "frame_iou"))
@@ -131,7 +131,8 @@ def form_groups(
     settings: MergeSettings,
     constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """The same as `merge_nodes`, from links of pairs of chunks that are known; of a `region` only, where one is given.
+    """Return the same as `merge_nodes`, from links of pairs of chunks that are known; of a `region` only, where one is
+    given.
 
     `tables` are the local instances of each chunk.
     """
@@ -152,7 +153,9 @@ def form_groups(
 
 
 def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
-    """What argues for the local instances of two chunks that meet being one instance; `u` and `v` may be one chunk."""
+    """Return what argues for the local instances of two chunks that meet being one instance; `u` and `v` may be one
+    chunk.
+    """
     a, b, inside = p.i, p.j, u.keys[:1] == v.keys[:1]
     low, high = np.minimum(p.i_on_j, p.j_on_i), np.maximum(p.i_on_j, p.j_on_i)
     cosine = np.einsum("ij,ij->i", u.feature[a], v.feature[b]).astype(float)
@@ -269,14 +272,14 @@ def _join(
 
 
 def _too_long(t: Nodes, clusters: _Clusters, a: int, b: int, s: MergeSettings) -> str:
-    """Why two clusters would reach too far together, or nothing."""
+    """Return why two clusters would reach too far together, or nothing."""
     span = clusters.span(a, b)
     unit = max(t.unit[clusters.members[a][0]], t.unit[clusters.members[b][0]])
     return f"together they would reach over {span:.0f} m" if span > s.most_span_m * unit else ""
 
 
 def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps, s: MergeSettings) -> str:
-    """Why two clusters must stay apart, or nothing."""
+    """Return why two clusters must stay apart, or nothing."""
     members = clusters.members[a], clusters.members[b]
     seen_apart = clusters.foes[a].intersection(members[1])
     if seen_apart:

@@ -93,7 +93,7 @@ class _Node:
 def without_moving(
     pairs: Mapping[tuple[int, int], PairScores], shapes: Mapping[int, ChunkShapes], motions: Mapping[Key, object]
 ) -> dict[tuple[int, int], PairScores]:
-    """Scores of the pairs of which both stay: where an instance passed says nothing about what it passed."""
+    """Return scores of the pairs of which both stay: where an instance passed says nothing about what it passed."""
     if not motions:
         return dict(pairs)
     moves = {k: np.array([(k, int(n)) in motions for n in s.local_id], bool) for k, s in shapes.items()}
@@ -156,7 +156,7 @@ class _Edge:
 
 
 def _edges(nodes: Sequence[_Node], scene: _Scene) -> list[_Edge]:
-    """What ties the nodes that move to others of their session and component, best first, ties by number."""
+    """Return what ties the nodes that move to others of their session and component, best first, ties by number."""
     out = []
     for (a, x), (b, y) in combinations(enumerate(nodes), 2):
         if (x.moves or y.moves) and x.session == y.session and scene.component(x) == scene.component(y):
@@ -217,7 +217,9 @@ class _Scene:
         return float(self._shapes[key[0]].unit * self._placed[key[0]].scale)
 
     def places(self, key: Key, frames: NDArray[np.int64]) -> Array:
-        """Where a local instance was in these frames, world: along its track, or where its surface lies. (N, 3)."""
+        """Return where a local instance was in these frames, world: along its track, or where its surface lies. (N,
+        3).
+        """
         motion = self._tracks.motions.get(key)
         placed, shape = self._placed[key[0]], self._shapes[key[0]]
         if motion is None or len(motion.frames) == 0:
@@ -226,7 +228,7 @@ class _Scene:
         return placed.apply(motion.positions[nearest])
 
     def edge(self, x: _Node, y: _Node) -> tuple[float, dict[str, float], str] | None:
-        """What speaks for two nodes being one instance: (score, scores, reason)."""
+        """Return what speaks for two nodes being one instance: (score, scores, reason)."""
         best: tuple[float, dict[str, float], str] | None = None
         for a in x.keys:
             for b in y.keys:
@@ -276,7 +278,7 @@ class _Scene:
         return 0.5 * cosine, scores, "it looks the same and could have gone from one place to the other"
 
     def seen_apart(self, a: Key, b: Key) -> bool:
-        """Whether two local instances have frames in common in which they are two."""
+        """Return whether two local instances have frames in common in which they are two."""
         common, at_a, at_b = np.intersect1d(self.frames(a), self.frames(b), return_indices=True)
         if self._shapes[a[0]].session_id != self._shapes[b[0]].session_id or len(common) < self._s.min_shared_frames:
             return False
@@ -285,7 +287,7 @@ class _Scene:
         return bool(np.mean(np.diagonal(box_iou(boxes_a, boxes_b))) < self._s.apart_iou)
 
     def now(self, nodes: Sequence[_Node]) -> Mover:
-        """Where an instance is: where it was put down, or where its last track ends."""
+        """Return where an instance is: where it was put down, or where its last track ends."""
         order = sorted(nodes, key=lambda n: (n.session, n.last_s, n.keys))
         last = order[-1]
         if not last.moves:
@@ -304,7 +306,7 @@ class _Scene:
 
 
 def _objection(left: Sequence[_Node], right: Sequence[_Node], enemies: set[frozenset[Key]], scene: _Scene) -> str:
-    """Why two instances must stay apart, or nothing."""
+    """Return why two instances must stay apart, or nothing."""
     for x, y in product(left, right):
         for a, b in product(x.keys, y.keys):
             if frozenset((a, b)) in enemies or scene.seen_apart(a, b):

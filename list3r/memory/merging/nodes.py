@@ -69,7 +69,7 @@ class Nodes:
 
     @staticmethod
     def join(parts: Sequence[Nodes]) -> Nodes:
-        """Those of several chunks, in the order of the chunks."""
+        """Return those of several chunks, in the order of the chunks."""
         start: dict[int, int] = {}
         count = 0
         for p in parts:
@@ -81,13 +81,15 @@ class Nodes:
         return Nodes(keys=[k for p in parts for k in p.keys], start=start, feature=feature, **joined)
 
     def only(self, keys: Collection[Key]) -> Nodes:
-        """Some of them."""
+        """Return some of them."""
         at = np.array([n for n, k in enumerate(self.keys) if k in keys], np.int64)
         chosen: dict[str, Any] = {name: getattr(self, name)[at] for name in (*_COLUMNS, "feature")}
         return Nodes(keys=[self.keys[n] for n in at], start={}, **chosen)
 
     def coplanar(self, a: Ints, b: Ints, angle_deg: float, other: Nodes | None = None) -> NDArray[np.bool_]:
-        """Whether pairs of flat nodes lie in one plane; false where one is not flat. `b` are of the `other` table."""
+        """Return whether pairs of flat nodes lie in one plane; false where one is not flat. `b` are of the `other`
+        table.
+        """
         other = other or self
         one, two = self.plane[a], other.plane[b]
         cosine = np.einsum("ij,ij->i", one[:, :3], two[:, :3])

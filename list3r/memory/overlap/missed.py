@@ -55,7 +55,7 @@ def misses(
     beside: Mapping[int, Mapping[int, Ints]],
     settings: LookSettings,
 ) -> bool:
-    """Whether another chunk looked at a group in the frames that they share, and found nothing like it."""
+    """Return whether another chunk looked at a group in the frames that they share, and found nothing like it."""
     s, seen = settings, set[int]()
     for chunk_id, local_id in group:
         if other not in beside.get(chunk_id, {}):
@@ -73,7 +73,7 @@ def misses(
 
 
 def _mask_iou(mine: Ints, frames: Ints, other: ChunkShapes) -> float:
-    """The best IoU of some pixels with those of one local instance of another chunk, over some frames."""
+    """Return the best IoU of some pixels with those of one local instance of another chunk, over some frames."""
     owners = other.sample_owner[np.searchsorted(other.samples, mine)]
     if not (owners >= 0).any():
         return 0.0
@@ -90,8 +90,8 @@ def bears_out(
     beside: Mapping[int, Mapping[int, Ints]],
     least_share: float,
 ) -> bool:
-    """Whether pixels agree that a local instance is part of one of another chunk of computed depth: in the frames that
-    both saw, at least `least_share` of its pixels are the other's. True where they saw none together.
+    """Return whether pixels agree that a local instance is part of one of another chunk of computed depth: in the
+    frames that both saw, at least `least_share` of its pixels are the other's. True where they saw none together.
 
     Surfaces that meet do not tell: what computed depth makes too wide reaches over what stands beside it.
     """

@@ -51,7 +51,7 @@ def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3, grown: GrownCells |
 
 
 def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> dict[tuple[int, int], PairScores]:
-    """The scores of all pairs of chunks, by chunk ids (u <= v)."""
+    """Return the scores of all pairs of chunks, by chunk ids (u <= v)."""
     out, grown = {}, GrownCells()
     for n, u in enumerate(chunks):
         for v in chunks[n:]:
@@ -80,7 +80,7 @@ def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
 
 
 def box_iou(a: Array, b: Array) -> Array:
-    """IoU of boxes xyxy. Shape (A, 4), (B, 4) -> (A, B)."""
+    """Return IoU of boxes xyxy. Shape (A, 4), (B, 4) -> (A, B)."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     inter = np.prod(np.clip(high - low, 0, None), axis=2)
@@ -104,13 +104,13 @@ class Numbering:
         return len(self.keys)
 
     def flags(self, keys: Collection[Key]) -> NDArray[np.bool_]:
-        """Which of them are among some local instances. Shape (N,)."""
+        """Return which of them are among some local instances. Shape (N,)."""
         out = np.zeros(len(self.keys), bool)
         out[[self._at[k] for k in keys if k in self._at]] = True
         return out
 
     def homes(self, groups: Iterable[Sequence[Key]]) -> Ints:
-        """The number of the group that each is in, -1 for none. Shape (N,)."""
+        """Return the number of the group that each is in, -1 for none. Shape (N,)."""
         out = np.full(len(self.keys), -1, np.int64)
         for n, group in enumerate(groups):
             out[[self._at[k] for k in group if k in self._at]] = n
@@ -132,7 +132,7 @@ class PairTable:
 
     @staticmethod
     def of(pairs: Mapping[tuple[int, int], PairScores], numbering: Numbering) -> PairTable:
-        """Those of pairs of chunks (u <= v) that are in the numbering."""
+        """Return those of pairs of chunks (u <= v) that are in the numbering."""
         known = [(u, v, p) for (u, v), p in pairs.items() if u in numbering.start and v in numbering.start]
         sizes = [len(p.i) for _, _, p in known]
         start_u = np.repeat(np.array([numbering.start[u] for u, _, _ in known], np.int64), sizes)
@@ -146,5 +146,5 @@ class PairTable:
 
 
 def joined(parts: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
-    """Arrays one after another; an empty one of a type where there are none."""
+    """Concatenate arrays; an empty one of a type where there are none."""
     return np.concatenate(parts) if parts else np.zeros(0, dtype)

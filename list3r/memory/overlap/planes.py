@@ -30,7 +30,9 @@ class Planes:
 
 
 def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
-    """The flat local instances of one chunk, and at most about `sample` points of each local instance; its frame."""
+    """Return the flat local instances of one chunk, and at most about `sample` points of each local instance; its
+    frame.
+    """
     normals: list[Array] = []
     centers, areas, points, owner = [], [], [], []
     for node in nodes:
@@ -55,7 +57,7 @@ def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
 
 
 def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
-    """The planes of several chunks in one frame: each with its `S_graph_chunk`."""
+    """Return the planes of several chunks in one frame: each with its `S_graph_chunk`."""
     if not parts:
         return Planes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
     start = np.cumsum([0, *(len(p.area) for p, _ in parts)])
@@ -69,7 +71,7 @@ def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
 
 
 def planar_area(points: Array, normal: Array) -> float:
-    """Area of the convex hull of points seen along a normal, square units; 0 for fewer than three."""
+    """Return the area of the convex hull of points seen along a normal, square units; 0 for fewer than three."""
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)

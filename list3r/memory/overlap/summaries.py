@@ -49,7 +49,7 @@ _SAMPLED = 64
 
 
 def _bytes_of(summary: ChunkSummary) -> int:
-    """What the arrays of a summary take, about."""
+    """Return what the arrays of a summary take, about."""
     parts: list[object] = [summary.cannot_link, summary.lab]
     for value in (*vars(summary.shapes).values(), *vars(summary.planes).values()):
         parts += value if isinstance(value, tuple) else [value]
@@ -154,7 +154,7 @@ def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
 
 
 def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> float:
-    """What a metre is in world units: 1 for a metric memory, what an anchor says, or what the distances tell."""
+    """Return what a metre is in world units: 1 for a metric memory, what an anchor says, or what the distances tell."""
     known = getattr(summaries, "metre", None)
     if known is not None:
         return float(known)
@@ -165,12 +165,12 @@ def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
 
 
 def light_of(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> Reference:
-    """The light of a memory, from the colours of its chunks."""
+    """Return the light of a memory, from the colours of its chunks."""
     return scene_reference(np.concatenate([summaries[c.chunk_id].lab for c in sample_of(chunks)] or [np.zeros((0, 3))]))
 
 
 def cameras_of(store: Store, chunks: Sequence[ChunkRow]) -> Sim3:
-    """Poses `S_world_cam` of all posed frames of these chunks, batched over frames."""
+    """Return poses `S_world_cam` of all posed frames of these chunks, batched over frames."""
     placed = {c.chunk_id: c.S_world_chunk for c in chunks}
     frames = [f for c in chunks for f in store.frames_of(c) if f.state == "posed"]
     if not frames:

@@ -71,7 +71,7 @@ class Look:
 
 
 def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyframe]], unit: float) -> list[DepthView]:
-    """The keyframes of chunks that have depth, as they are placed now; `unit` is a metre in world units."""
+    """Return the keyframes of chunks that have depth, as they are placed now; `unit` is a metre in world units."""
     out = []
     for c in chunks:
         for k in keyframes[c.chunk_id]:
@@ -87,7 +87,9 @@ def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyfra
 
 
 def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> list[DepthView]:
-    """The keyframes of one chunk that have depth, with the chunk's own frame as the world; `unit` is a metre there."""
+    """Return the keyframes of one chunk that have depth, with the chunk's own frame as the world; `unit` is a metre
+    there.
+    """
     kept = [k for k in keyframes if k.depth_small.size]
     S_cam_chunk = [Sim3.from_matrix(k.T_chunk_cam).inverse() for k in kept]
     return [
@@ -124,7 +126,7 @@ UNTOLD, MET, FREE = 0, 1, 2
 
 
 def tell(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.int8]:
-    """What one frame tells about each point of a surface, world coordinates. Shapes (N, 3) -> (N,)."""
+    """Return what one frame tells about each point of a surface, world coordinates. Shapes (N, 3) -> (N,)."""
     out = np.zeros(len(points), np.int8)
     p = view.S_cam_world.apply(points)
     fx, fy, cx, cy = view.camera
@@ -148,13 +150,15 @@ def tell(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.in
 
 
 def changed_points(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> NDArray[np.bool_]:
-    """The points of a surface of which no more frames say that they are still there than that they are not. (N,)."""
+    """Return the points of a surface of which no more frames say that they are still there than that they are not.
+    (N,).
+    """
     free, met = tally(points, views, s)
     return np.asarray(free >= met)
 
 
 def tally(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> tuple[Ints, Ints]:
-    """How many frames see through each point of a surface, and how many see it. Shapes (N,), (N,)."""
+    """Return how many frames see through each point of a surface, and how many see it. Shapes (N,), (N,)."""
     free, met = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
         told = tell(points, view, s)
@@ -164,13 +168,15 @@ def tally(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> t
 
 
 def seen_through_share(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> float | None:
-    """Share of a surface that more frames see through than see, of what they tell of; None where that is too little."""
+    """Return the share of a surface that more frames see through than see, of what they tell of; None where that is too
+    little.
+    """
     free, met = tally(points, views, s)
     known = free + met > 0
     return float(np.mean(free[known] > met[known])) if known.sum() >= s.least_points else None
 
 
 def _told(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
-    """How many points of a surface one frame sees where they should be, and through how many it sees further."""
+    """Return how many points of a surface one frame sees where they should be, and through how many it sees further."""
     told = tell(points, view, s)
     return int((told == MET).sum()), int((told == FREE).sum())

@@ -117,7 +117,7 @@ class ChunkShapes:
     """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
 
     def spans(self, S_world_chunk: Sim3) -> tuple[Array, Array]:
-        """Corners of the boxes of the instances' points, world; the origin of the chunk for those without any.
+        """Return corners of the boxes of the instances' points, world; the origin of the chunk for those without any.
         Shape (N, 3) each.
         """
         low = np.tile(S_world_chunk.translation, (len(self.local_id), 1)).astype(np.float64)
@@ -205,7 +205,7 @@ PIXEL_BITS = 24
 
 
 def _sampled(samples: FrameSamples, local_id: Sequence[int]) -> tuple[Ints, NDArray[np.int32]]:
-    """Keys of the samples of every third frame, ascending, and the instance of each."""
+    """Return keys of the samples of every third frame, ascending, and the instance of each."""
     kept = np.flatnonzero((samples.frame % SAMPLED_FRAMES == 0) & (samples.confidence > 0))
     keys = samples.frame[kept] << PIXEL_BITS | samples.pixel[kept].astype(np.int64)
     place = {n: k for k, n in enumerate(local_id)}
@@ -215,7 +215,7 @@ def _sampled(samples: FrameSamples, local_id: Sequence[int]) -> tuple[Ints, NDAr
 
 
 def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, grown: GrownCells | None = None) -> Array:
-    """Share of each source instance's points that lie on each target instance. Shape (N_source, N_target).
+    """Return the share of each source instance's points that lie on each target instance. Shape (N_source, N_target).
 
     On means within the tolerance of the target's support and, where the target is flat, of its plane.
     """
@@ -276,7 +276,7 @@ def _grown(shapes: ChunkShapes) -> _Grown:
 
 
 def _distinct(keys: Ints) -> Ints:
-    """Keys in order, each once: what `np.unique` returns, in a twentieth of the time."""
+    """Return keys in order, each once: what `np.unique` returns, in a twentieth of the time."""
     keys = np.sort(keys)
     first = np.ones(len(keys), bool)
     np.not_equal(keys[1:], keys[:-1], out=first[1:])
@@ -284,7 +284,7 @@ def _distinct(keys: Ints) -> Ints:
 
 
 def _own_grid(points: Array, grain: float, crowd: float, at_least: int) -> tuple[int, Ints, Ints]:
-    """The finest level whose cells the points fill: (level, occupied cells (M, 3), one point of each (M,))."""
+    """Return the finest level whose cells the points fill: (level, occupied cells (M, 3), one point of each (M,))."""
     for level in range(at_least, LEVELS):
         cell = np.floor(points / (grain * 2.0**level)).astype(np.int64)
         _, first = np.unique(_key(cell, 0), return_index=True)
@@ -299,8 +299,8 @@ def _key(cells: Ints, level: int) -> Ints:
 
 
 def seen_xyxy(boxes: Sequence[NDArray[np.float32]], image_size: tuple[int, int], blind: float) -> Array:
-    """The part of the image in which anything is seen: its borders, or further in by at most the share `blind` where
-    no box reaches them. Boxes xyxy of shape (V, 4) each, (height, width) -> (4,).
+    """Return the part of the image in which anything is seen: its borders, or further in by at most the share `blind`
+    where no box reaches them. Boxes xyxy of shape (V, 4) each, (height, width) -> (4,).
     """
     height, width = image_size
     image = np.array([0.0, 0.0, width - 1.0, height - 1.0])

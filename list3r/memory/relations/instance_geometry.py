@@ -43,15 +43,15 @@ class InstanceGeometry:
 
 
 def neighbours_of(points: Array, tree: cKDTree, count: int = 1) -> tuple[Array, NDArray[np.int64]]:
-    """Distances to, and numbers of, the nearest points of a tree. Shape (N, D) -> (N, count) each."""
+    """Return distances to, and numbers of, the nearest points of a tree. Shape (N, D) -> (N, count) each."""
     distance, at = tree.query(points, k=count)
     shape = (len(points), count)
     return np.asarray(distance).reshape(shape), np.asarray(at, dtype=np.int64).reshape(shape)
 
 
 def without_strays(points: Array, neighbours: int = 4, factor: float = 4.0) -> NDArray[np.int64]:
-    """Positions of the points that keep company: what lies `factor` times further from its neighbours than is usual
-    for the instance is depth noise at an edge, or a bit of something else. Shape (N, 3) -> (M,).
+    """Return positions of the points that keep company: what lies `factor` times further from its neighbours than is
+    usual for the instance is depth noise at an edge, or a bit of something else. Shape (N, 3) -> (M,).
     """
     if len(points) < 4 * neighbours:
         return np.arange(len(points))
@@ -61,7 +61,9 @@ def without_strays(points: Array, neighbours: int = 4, factor: float = 4.0) -> N
 
 
 def fit_box(points: Array, *, upright: bool, trim: float = 0.01) -> OrientedBox:
-    """The box of an instance: upright where gravity is known, else along its own principal axes, longest first."""
+    """Return the box of an instance: upright where gravity is known, else along its own principal axes, longest
+    first.
+    """
     if upright:
         return upright_box(points, trim)
     center = points.mean(axis=0)

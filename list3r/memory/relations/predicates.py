@@ -48,7 +48,7 @@ def relations(
     settings: RelationSettings | None = None,
     measured: PairMeasures | None = None,
 ) -> list[Relation]:
-    """All relations among instances, in the order of (subject, predicate, object).
+    """Return all relations among instances, in the order of (subject, predicate, object).
 
     `unit` is what a metre is in world units (1 for a metric memory). Instances of different components have none.
     `measured` holds what a run before found for the same instances, unit and settings.
@@ -76,7 +76,7 @@ def relations(
 
 
 def _both(instances: Sequence[InstanceGeometry], predicate: str, found: Found) -> list[Relation]:
-    """A relation and its inverse."""
+    """Return a relation and its inverse."""
     a, b, confidence, margin = found
     x, y = instances[a].id, instances[b].id
     c, m = round(min(max(confidence, 0.0), 1.0), 4), round(margin, 5)
@@ -112,7 +112,7 @@ def _overhead(scene: RelationScene, support: set[tuple[int, int]]) -> list[Relat
 
 
 def _over(scene: RelationScene, a: int, b: int) -> tuple[float, float, float] | None:
-    """How far a is over b: (share of the smaller footprint where it is, share of the lower one's points
+    """Return how far a is over b: (share of the smaller footprint where it is, share of the lower one's points
     that it covers, clearance there), None where it is nowhere.
     """
     s, upper, lower = scene.s, scene.plan(a), scene.plan(b)
@@ -131,7 +131,7 @@ def _over(scene: RelationScene, a: int, b: int) -> tuple[float, float, float] | 
 
 
 def _attached(scene: RelationScene, held: set[int]) -> list[Relation]:
-    """Instances that hang on a wall: touching it, standing on nothing."""
+    """Return instances that hang on a wall: touching it, standing on nothing."""
     limit = scene.s.attached_m * scene.unit
     out = []
     for a, instance in enumerate(scene.instances):
@@ -169,7 +169,7 @@ def _beside(scene: RelationScene, support: set[tuple[int, int]], gravity_known: 
 
 
 def _side_by_side(scene: RelationScene, a: int, b: int) -> bool:
-    """Whether two instances share a good part of their heights, and neither is a rug."""
+    """Return whether two instances share a good part of their heights, and neither is a rug."""
     if scene.covering[a] or scene.covering[b]:
         return False
     low = max(scene.foot[a], scene.foot[b])

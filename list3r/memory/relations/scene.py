@@ -31,7 +31,7 @@ class PairMeasures:
         self._before, self._used = self._used, {}
 
     def get(self, what: str, a: InstanceGeometry, b: InstanceGeometry, compute: Callable[[], T]) -> T:
-        """The measure `what` of a and b, computed if it is new."""
+        """Return the measure `what` of a and b, computed if it is new."""
         if not (a.stamp and b.stamp):
             return compute()
         key = (what, a.stamp, b.stamp, a.structure, b.structure)
@@ -83,25 +83,25 @@ class RelationScene:
         self.in_room = np.array([b.structure is None for b in instances], dtype=bool)
 
     def tree(self, n: int) -> cKDTree:
-        """KD-tree of an instance's points."""
+        """Return the KD-tree of an instance's points."""
         if n not in self._trees:
             self._trees[n] = cKDTree(self.instances[n].points)
         return self._trees[n]
 
     def measure(self, what: str, a: int, b: int, compute: Callable[[RelationScene, int, int], T]) -> T:
-        """A measure of two instances, from memory where it is known."""
+        """Return a measure of two instances, from memory where it is known."""
         return self._measured.get(what, self.instances[a], self.instances[b], lambda: compute(self, a, b))
 
     def touch(self, a: int, b: int) -> float:
-        """Distance of a few hundred points of the smaller instance to the nearest of the other."""
+        """Return the distance of a few hundred points of the smaller instance to the nearest of the other."""
         return self.measure("touch", min(a, b), max(a, b), _touch)
 
     def gap(self, a: int, b: int) -> float:
-        """Distance between surfaces."""
+        """Return the distance between surfaces."""
         return self.measure("upright gap" if self._upright else "gap", min(a, b), max(a, b), _gap)
 
     def surface(self, n: int) -> SampledSurface:
-        """What is known of an instance's surface: its points, and for what is round its hidden sides too."""
+        """Return what is known of an instance's surface: its points, and for what is round its hidden sides too."""
         if n not in self._surfaces:
             points = self.instances[n].points
             axis = self.measure("axis", n, n, _axis) if self._upright and self.in_room[n] else None
@@ -114,7 +114,7 @@ class RelationScene:
         return self._surfaces[n]
 
     def plan(self, n: int) -> Footprint:
-        """An instance as it is seen from above."""
+        """Return an instance as it is seen from above."""
         if n not in self._plans:
             points = self.instances[n].points
             sample = points[:: -(-len(points) // _SAMPLE)]
@@ -142,7 +142,9 @@ def _gap(scene: RelationScene, a: int, b: int) -> float:
 
 
 def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
-    """Positions of the few dozen points that are nearest to those of a tree; looks first where its box is near."""
+    """Return positions of the few dozen points that are nearest to those of a tree; looks first where its box is
+    near.
+    """
     at_least = np.linalg.norm(np.maximum(0.0, np.maximum(tree.mins - points, points - tree.maxes)), axis=1)
     order = np.argsort(at_least, kind="stable")
     away = np.sort(neighbours_of(points[order[: 2 * _NEAR]], tree)[0][:, 0])
@@ -152,7 +154,7 @@ def _nearest(points: Array, tree: cKDTree) -> NDArray[np.int64]:
 
 
 def _in_company(surface: SampledSurface, at: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether points of a surface have others about them as is usual for it."""
+    """Return whether points of a surface have others about them as is usual for it."""
     away = neighbours_of(surface.points[at], surface.tree, min(_COMPANY + 1, surface.tree.n))[0][:, -1]
     return np.asarray(away <= 2.0 * surface.company)
 
@@ -182,12 +184,12 @@ class Footprint:
 
 
 def certainty(margin: float, noise: float) -> float:
-    """How likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
+    """Return how likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
     return 1.0 / (1.0 + math.exp(-min(1.7 * margin / max(noise, 1e-12), 700.0)))
 
 
 def wall_touched(scene: RelationScene, a: int) -> tuple[float, int] | None:
-    """The wall that an instance touches: (gap, position), the nearest one."""
+    """Return the wall that an instance touches: (gap, position), the nearest one."""
     limit = scene.s.attached_m * scene.unit
     walls = [
         (scene.touch(a, b), b)
@@ -203,7 +205,7 @@ def contact_of(scene: RelationScene, a: int) -> float:
 
 
 def spacing_of(points: Array) -> float:
-    """Typical distance between neighbouring points of a layer."""
+    """Return the typical distance between neighbouring points of a layer."""
     if len(points) < 3:
         return 0.0
     sample = points[:: max(1, len(points) // 100)]
@@ -211,7 +213,9 @@ def spacing_of(points: Array) -> float:
 
 
 def hull_under(point: Array, xy: Array) -> tuple[float, float]:
-    """How far a point lies outside the convex hull of others in the plane, 0 inside, and the area of the hull."""
+    """Return how far a point lies outside the convex hull of others in the plane, 0 inside, and the area of the
+    hull.
+    """
     try:
         hull = ConvexHull(xy)
     except (QhullError, ValueError):

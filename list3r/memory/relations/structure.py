@@ -122,7 +122,7 @@ def _classify(
 
 
 def _bounds(instance: InstanceGeometry, cloud: Array, unit: float, s: StructureSettings) -> bool:
-    """Whether (nearly) nothing stands just behind the surface; what lies further back may be another room."""
+    """Return whether (nearly) nothing stands just behind the surface; what lies further back may be another room."""
     assert instance.normal is not None
     depth = float(np.median(instance.points @ instance.normal)) - cloud @ instance.normal
     just_behind = (depth > s.behind_m * unit) & (depth < s.depth_m * unit)

@@ -51,8 +51,8 @@ def supports(scene: RelationScene, taken: set[int]) -> list[Found]:
 
 
 def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
-    """Instances that must stand on the floor or on the instance under them, for nothing else holds them, though their
-    feet were not seen.
+    """Return instances that must stand on the floor or on the instance under them, for nothing else holds them, though
+    their feet were not seen.
     """
     s = scene.s
     out = []
@@ -77,8 +77,8 @@ def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
 
 
 def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
-    """(clearance, position) of the instances wholly below a that have a surface under its middle and are wide enough to
-    bear it.
+    """Return (clearance, position) of the instances wholly below a that have a surface under its middle and are wide
+    enough to bear it.
     """
     s, middle = scene.s.on, scene.instances[a].box.center[:2]
     bottom = float(np.quantile(scene.instances[a].points[:, 2], s.lowest))
@@ -98,7 +98,7 @@ def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
 
 
 def _stands_on(scene: RelationScene, a: int, b: int) -> Sure | None:
-    """Whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
+    """Return whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
     s, subject, other = scene.s.on, scene.instances[a], scene.instances[b]
     z = subject.points[:, 2]
     bottom, tolerance = float(np.quantile(z, s.lowest)), contact_of(scene, a)
@@ -168,8 +168,8 @@ def containments(scene: RelationScene) -> list[Found]:
 
 
 def _held_inside(scene: RelationScene, a: int, b: int) -> Sure | None:
-    """Whether a is in b: inside its box, with b's sides round it or b's boards under and over it, or down in an open
-    container whose sides go round it as far as they are seen. A seat or a table top holds nothing so.
+    """Return whether a is in b: inside its box, with b's sides round it or b's boards under and over it, or down in an
+    open container whose sides go round it as far as they are seen. A seat or a table top holds nothing so.
     """
     subject, holder = scene.instances[a], scene.instances[b]
     local = (subject.points - holder.box.center) @ holder.box.rotation
@@ -203,7 +203,7 @@ class _Sides:
 
 
 def _sides_round(scene: RelationScene, a: int, b: int, *, sunk: bool = False) -> _Sides:
-    """b's surfaces round a at a's height, above a's lowest part.
+    """Return b's surfaces round a at a's height, above a's lowest part.
 
     Of what is `sunk` in a container only the upper part is seen, so surfaces somewhat below it count too, of which
     the farthest are the rim.
@@ -228,13 +228,14 @@ def _sides_round(scene: RelationScene, a: int, b: int, *, sunk: bool = False) ->
 
 
 def _is_hollow(scene: RelationScene, b: int) -> bool:
-    """Whether b is seen to be open above: over its middle most of its surface lies below its rim."""
+    """Return whether b is seen to be open above: over its middle most of its surface lies below its rim."""
     seen = _within(scene, b)
     return seen is not None and seen >= scene.s.hollow
 
 
 def _within(scene: RelationScene, b: int) -> float | None:
-    """Share of the surface over the middle of b that lies well below its rim; None where hardly any is seen."""
+    """Return the share of the surface over the middle of b that lies well below its rim; None where hardly any is
+    seen."""
     holder = scene.instances[b]
     aside = np.abs((holder.points - holder.box.center) @ holder.box.rotation)[:, :2]
     z = holder.points[np.all(aside < scene.s.within.middle * holder.box.size[:2], axis=1), 2]
@@ -247,7 +248,7 @@ def _rim(scene: RelationScene, b: int) -> float:
 
 
 def _heights(scene: RelationScene, n: int) -> tuple[float, float]:
-    """Height of the lowest and of the highest points of an instance."""
+    """Return the height of the lowest and of the highest points of an instance."""
     trim = scene.s.within.trim
     low, high = np.quantile(scene.instances[n].points[:, 2], [trim, 1.0 - trim])
     return float(low), float(high)
@@ -260,7 +261,7 @@ def _rests_on(scene: RelationScene, a: int, b: int) -> bool:
 
 
 def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> float | None:
-    """How far the board over a is above it, where b has surfaces both under a and over it: a shelf.
+    """Return how far the board over a is above it, where b has surfaces both under a and over it: a shelf.
 
     Where b is not round a on more than one side (`walled`), what is over a's border alone is no board: a headboard
     rises behind a pillow.
@@ -279,7 +280,7 @@ def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> fl
 
 
 def _down_in(scene: RelationScene, a: int, b: int) -> bool:
-    """Whether a sits below the rim of an open container not much wider than it, over the container's middle."""
+    """Return whether a sits below the rim of an open container not much wider than it, over the container's middle."""
     subject, holder = scene.instances[a], scene.instances[b]
     width, noise = float(np.max(subject.box.size[:2])), scene.s.noise_m * scene.unit
     footprints = float(np.prod(subject.box.size[:2])) / max(float(np.prod(holder.box.size[:2])), 1e-12)

@@ -45,16 +45,17 @@ def round_axis(points: Array, noise: float, settings: SymmetrySettings | None = 
 
 
 def turned(points: Array, axis: Array) -> Array:
-    """The points of a round instance with those that three quarter turns about its axis make of them. (N, 3) -> (4N,
-    3)"""
+    """Return the points of a round instance with those that three quarter turns about its axis make of them. (N, 3) ->
+    (4N, 3)
+    """
     x, y = (points[:, :2] - axis).T
     quarters = [np.column_stack([a, b]) for a, b in ((x, y), (-y, x), (-x, -y), (y, -x))]
     return np.concatenate([np.column_stack([q + axis, points[:, 2]]) for q in quarters])
 
 
 def _around(xy: Array, axis: Array, layer: Array, weight: Array) -> tuple[Array, Array, float]:
-    """How the distances from the axis, less their mean in the layer, change with the axis (N, 2); those (N,); and the
-    largest such mean.
+    """Return how the distances from the axis, less their mean in the layer, change with the axis (N, 2); those (N,);
+    and the largest such mean.
     """
     away = xy - axis
     distance = np.linalg.norm(away, axis=1)

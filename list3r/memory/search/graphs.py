@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 
 
 def relation_graph(store: Store) -> networkx.MultiDiGraph:
-    """Instances as nodes (attributes: description, label, center, size, structure, confidence, state), relations as
-    edges from subject to object, keyed by predicate (attributes: predicate, confidence, margin).
+    """Return instances as nodes (attributes: description, label, center, size, structure, confidence, state), relations
+    as edges from subject to object, keyed by predicate (attributes: predicate, confidence, margin).
     """
     import networkx
 
@@ -36,7 +36,7 @@ def relation_graph(store: Store) -> networkx.MultiDiGraph:
 
 
 def merge_graph(store: Store) -> networkx.Graph:
-    """Local instances as nodes named `chunk:local` (attribute: instance), the merges that hold as edges.
+    """Return local instances as nodes named `chunk:local` (attribute: instance), the merges that hold as edges.
 
     Edges carry the scores and the reason of the log. A merge is left out when its two sides have come apart since;
     the connected components are then the instances, as far as the log tells how they came about.

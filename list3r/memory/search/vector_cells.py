@@ -36,12 +36,12 @@ _MOST_FILES = 16
 
 
 def cell_count(count: int) -> int:
-    """How many cells so many vectors fall into."""
+    """Return how many cells so many vectors fall into."""
     return int(_CELLS_BY_ROOT * np.sqrt(count))
 
 
 def sample_size(count: int) -> int:
-    """How many vectors the cells are learned on."""
+    """Return how many vectors the cells are learned on."""
     return _PER_CELL * cell_count(count)
 
 
@@ -65,7 +65,7 @@ class Cells:
 
     @staticmethod
     def learned(sample: NDArray[np.float32], count: int) -> Cells:
-        """Cells for `count` vectors, learned on a sample (n, D) of unit vectors."""
+        """Return cells for `count` vectors, learned on a sample (n, D) of unit vectors."""
         import faiss
 
         kmeans = faiss.Kmeans(
@@ -87,7 +87,7 @@ class Cells:
         )
 
     def of(self, quantizer: faiss.Index, ids: NDArray[np.int64], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
-        """The cells of unit vectors (n, D) of some ids; those that are not known are looked for. Shape (n,)."""
+        """Return the cells of unit vectors (n, D) of some ids; those that are not known are looked for. Shape (n,)."""
         marks = _marks(vectors)
         at = np.minimum(np.searchsorted(self.ids, ids), max(len(self.ids) - 1, 0))
         if len(self.ids):
@@ -124,7 +124,7 @@ class Cells:
 
     @staticmethod
     def load(path: Path, dimension: int, count: int) -> Cells | None:
-        """What was kept; None where there is nothing, or nothing of use for `count` vectors of a dimension."""
+        """Return what was kept; None where there is nothing, or nothing of use for `count` vectors of a dimension."""
         try:
             arrays = unpack(path.read_bytes(), str(path))
             kept = Cells(
@@ -145,7 +145,7 @@ class Cells:
 
 
 def cache_file(memory: Path, space: str) -> Path:
-    """Where the cells of a space of a memory are kept: `$LIST3R_CACHE`, else the user's cache."""
+    """Return where the cells of a space of a memory are kept: `$LIST3R_CACHE`, else the user's cache."""
     name = hashlib.sha256(f"{memory.resolve()}\n{space}".encode("utf-8", "surrogateescape")).hexdigest()[:32]
     return _cache_folder() / "cells" / f"{name}.npz"
 

@@ -64,7 +64,7 @@ class VectorIndex:
 
     @staticmethod
     def of(store: Store, space: str | None = None) -> VectorIndex:
-        """The index of a store's embeddings, of the named space or of the only one.
+        """Return the index of a store's embeddings, of the named space or of the only one.
 
         Raises `SpaceMismatchError` for a space the memory does not hold, `OptionError` when it holds none or several
         and none was named.
@@ -95,7 +95,7 @@ class VectorIndex:
     def search(
         self, store: Store, vector: ArrayLike, k: int, passing: Callable[[Sequence[int]], set[int]] | None = None
     ) -> list[tuple[int, float]]:
-        """The k most alike: (instance id, cosine), best first, ties by id. `vector` has shape (D,).
+        """Return the k most alike: (instance id, cosine), best first, ties by id. `vector` has shape (D,).
 
         `passing` says which of some ids may answer; it is asked about as few as it takes.
         """
@@ -110,7 +110,7 @@ class VectorIndex:
             probed = self.count if width == self.count else 2 * probed
 
     def _ranked(self, store: Store, query: NDArray[np.float32], width: int, probed: int) -> list[tuple[int, float]]:
-        """The best `width` or so of the index and all that has changed, by exact cosine."""
+        """Return the best `width` or so of the index and all that has changed, by exact cosine."""
         score, at = _ask(self.index, query, min(width, self.count), probed)
         found = [(int(n), float(s)) for n, s in zip(at, score, strict=True) if n >= 0 and int(n) not in self._stale]
         if self.count > _EXACT:
@@ -121,7 +121,7 @@ class VectorIndex:
         return sorted(found, key=lambda x: (-x[1], x[0]))
 
     def vector(self, store: Store, instance_id: int) -> NDArray[np.float32]:
-        """The vector of an instance. Raises `OptionError` when it has none in this space."""
+        """Return the vector of an instance. Raises `OptionError` when it has none in this space."""
         ids, vectors = store.embeddings_of(self.space, [instance_id])
         if len(ids) == 0:
             raise OptionError(f"instance {instance_id} has no vector in the space {self.space}")
@@ -143,7 +143,7 @@ class VectorIndex:
 def _first(
     found: Sequence[tuple[int, float]], k: int, passing: Callable[[Sequence[int]], set[int]] | None
 ) -> list[tuple[int, float]]:
-    """The first k that pass."""
+    """Return the first k that pass."""
     if passing is None:
         return list(found[:k])
     kept: list[tuple[int, float]] = []
@@ -186,7 +186,7 @@ def _build(store: Store, space: str, stamp: tuple[int, int, bool]) -> VectorInde
 
 
 def _flat(store: Store, space: str) -> tuple[Any, int]:
-    """All vectors as they are, and how many; no index where there are none."""
+    """Return all vectors as they are, and how many; no index where there are none."""
     import faiss
 
     index: Any = None
@@ -200,7 +200,7 @@ def _flat(store: Store, space: str) -> tuple[Any, int]:
 
 
 def _inverted(store: Store, space: str, count: int) -> tuple[Any, int]:
-    """All vectors in half precision, in cells that are learned on a sample or were kept since they were."""
+    """Return all vectors in half precision, in cells that are learned on a sample or were kept since they were."""
     import faiss
 
     pointer: Any = faiss.swig_ptr
@@ -224,7 +224,7 @@ def _inverted(store: Store, space: str, count: int) -> tuple[Any, int]:
 
 
 def _empty(cells: Cells, dimension: int) -> tuple[Any, Any]:
-    """An inverted file without vectors, and the index of its cells."""
+    """Return an inverted file without vectors, and the index of its cells."""
     import faiss
 
     quantizer = faiss.IndexFlatIP(dimension)

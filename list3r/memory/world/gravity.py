@@ -72,7 +72,7 @@ class Gravity:
 def gravity_from_planes(
     planes: Planes, S_graph_cam: Sim3, unit: float = 1.0, settings: GravitySettings | None = None
 ) -> Gravity:
-    """Up from planes and cameras.
+    """Return up from planes and cameras.
 
     `S_graph_cam` holds the poses of the colour cameras, batched over F frames; `unit` is what a metre is in the
     graph's units (1 for a metric memory). Candidates are the normals of planes seen from above: floors and tables, not
@@ -115,7 +115,7 @@ def gravity_from_planes(
 
 
 def _camera_allows(up: Array, S_graph_cam: Sim3, mean_up: Array, s: GravitySettings) -> Array:
-    """Which directions the cameras' tilt and roll allow. Shape (C, 3) -> (C,)."""
+    """Return which directions the cameras' tilt and roll allow. Shape (C, 3) -> (C,)."""
     level_axis = S_graph_cam.rotation[:, :, 0]
     roll = np.degrees(np.median(np.abs(np.arcsin(np.clip(up @ level_axis.T, -1, 1))), axis=1))
     tilt = np.degrees(np.arccos(np.clip(up @ mean_up, -1, 1)))
@@ -123,7 +123,7 @@ def _camera_allows(up: Array, S_graph_cam: Sim3, mean_up: Array, s: GravitySetti
 
 
 def _votes(candidates: Array, normals: Array, areas: Array, s: GravitySettings) -> Array:
-    """Area that is level with respect to each candidate, plus half of what is upright. Shape (C,)."""
+    """Return the area that is level with respect to each candidate, plus half of what is upright. Shape (C,)."""
     along = np.abs(candidates @ normals.T)
     width = np.radians(s.level_deg)
     level = np.exp(-0.5 * (np.arccos(np.clip(along, 0, 1)) / (width / 2)) ** 2)
@@ -132,7 +132,9 @@ def _votes(candidates: Array, normals: Array, areas: Array, s: GravitySettings) 
 
 
 def _refine(up: Array, normals: Array, areas: Array, s: GravitySettings) -> Array:
-    """The direction that level planes point along and upright planes are perpendicular to, reweighted (Cauchy)."""
+    """Return the direction that level planes point along and upright planes are perpendicular to, reweighted
+    (Cauchy).
+    """
     limit = np.radians(s.level_deg)
     for _ in range(12):
         along = np.clip(np.abs(normals @ up), 0, 1)
@@ -150,7 +152,7 @@ def _refine(up: Array, normals: Array, areas: Array, s: GravitySettings) -> Arra
 def floor_height(
     up: Array, planes: Planes, camera_centers: Array, unit: float = 1.0, settings: GravitySettings | None = None
 ) -> float | None:
-    """Height along `up` of the lowest level surface that faces up and has (nearly) everything above it.
+    """Return the height along `up` of the lowest level surface that faces up and has (nearly) everything above it.
 
     None where no floor was seen. `camera_centers` has shape (F, 3), in the frame of the planes.
     """
@@ -176,8 +178,8 @@ def estimate_gravity(
     components: Mapping[int, int] | None = None,
     settings: GravitySettings | None = None,
 ) -> Gravity:
-    """Up in the frame in which chunks lie by `S_graph_chunk` (the default: as they are placed), from the chunks of the
-    first component (see `ChunkRow.component`), or 64 of them in a long memory.
+    """Return up in the frame in which chunks lie by `S_graph_chunk` (the default: as they are placed), from the chunks
+    of the first component (see `ChunkRow.component`), or 64 of them in a long memory.
 
     Call it inside a transaction; `world_from_graph` then gives what stands the chunks upright. An estimate that still
     agrees with the one before within `settled_deg` gives way to that one, so that the world does not tremble with every
@@ -206,7 +208,7 @@ def estimate_gravity(
 
 
 def _settled(found: Gravity, before: dict[str, Any] | None, unit: float, s: GravitySettings) -> Gravity:
-    """The estimate before where it holds still, else the one found now."""
+    """Return the estimate before where it holds still, else the one found now."""
     if found.status == "unknown" or before is None or (before["floor_height"] is None) != (found.floor_height is None):
         return found
     up = np.array(before["up"])

@@ -67,7 +67,7 @@ class MeasuredAnchor:
 
 
 def parse_anchor(text: str) -> ScaleAnchor:
-    """An anchor from the user's words; a number without a unit is metres. Raises `OptionError`."""
+    """Return an anchor from the user's words; a number without a unit is metres. Raises `OptionError`."""
     what, equals, length = text.replace(" ", "").rpartition("=")
     number = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?)(m|cm|mm|)", length)
     try:
@@ -90,7 +90,7 @@ def parse_anchor(text: str) -> ScaleAnchor:
 
 
 def measure(store: Store, anchor: ScaleAnchor) -> MeasuredAnchor:
-    """How long the anchor is now. Raises `OptionError` and `UnknownIdError` where it cannot be measured."""
+    """Return how long the anchor is now. Raises `OptionError` and `UnknownIdError` where it cannot be measured."""
     chunks = _main_part(store.chunks())
     if not chunks:
         raise OptionError(f"{store.path} holds no chunk yet; there is nothing to measure")
@@ -119,7 +119,7 @@ def settle_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[in
 
 
 def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int, Sim3]) -> WorldScale:
-    """What a unit of the graph is: by the chunks that are metric, else by the last anchor that stands."""
+    """Return what a unit of the graph is: by the chunks that are metric, else by the last anchor that stands."""
     inside = _main_part(chunks)
     metric = [c.chunk_id for c in inside if c.scale_kind == "metric"]
     said = store.get_value("scale_source")
@@ -159,7 +159,7 @@ def rescale(store: Store) -> None:
 
 
 def _main_part(chunks: list[ChunkRow]) -> list[ChunkRow]:
-    """The chunks of the part whose unit is the memory's."""
+    """Return the chunks of the part whose unit is the memory's."""
     first = min((c.component for c in chunks), default=0)
     return [c for c in chunks if c.component == first]
 
