@@ -1,6 +1,6 @@
 """What discovery calls one thing, against the truth of worlds that nothing was tuned on.
 
-PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --methods geometric,learned --json benchmarks/results/discovery.json
+PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --json benchmarks/results/discovery.json
 PYTHONPATH=. python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
 
 Worlds come from `training/worlds` with families, textures and a sensor that training never shows; the house is one that
@@ -22,7 +22,7 @@ import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
 
-from list3r.evaluation.instances import evaluate_instances
+from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.instances.base import Discoverer, Proposals
 from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
@@ -134,7 +134,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
     """Instances by boxes at IoU 0.25 and 0.5, and structure by pixels."""
     frame = _upright(up)
     stride, structural = views.stride, {t.id for t in film.things if t.structure}
-    true, told = _Gathered(), _Gathered()
+    true, told, pairs = _Gathered(), _Gathered(), []
     right = claimed = there = 0
     for proposals in found:
         view = views.view(proposals.position)
@@ -149,8 +149,10 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
             right + (bound & flat).sum(),
         )
         points = view.points @ frame.T
-        true.add(points, np.where(np.isin(ids, list(structural)), -1, ids - 1), view.confirmed)
-        told.add(points, np.where(flat, -1, identity), view.confirmed)
+        mine, theirs = np.where(np.isin(ids, list(structural)), -1, ids - 1), np.where(flat, -1, identity)
+        true.add(points, mine, view.confirmed)
+        told.add(points, theirs, view.confirmed)
+        pairs.append(np.stack([mine[view.confirmed], theirs[view.confirmed]], axis=1))
     wanted, faint = true.boxes(MIN_PX)
     boxes, _ = told.boxes(1)
     out: dict[str, Any] = {"true": len(wanted), "structure": [int(right), int(claimed), int(there)]}
@@ -164,6 +166,24 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
             hit = {t for t, _, _ in errors.matches}
             out |= {"duplicates": errors.duplicates, "merged": errors.merged_pairs}
             out |= {"small": len(small), "small_found": sum(k in hit for k in small)}
+    return out | _by_masks(np.concatenate(pairs), true.large(MIN_PX))
+
+
+def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
+    """Things found and listed by IoU of their pixels over all views, of those that are `large` enough to count."""
+    true, at = np.unique(pairs[:, 0], return_inverse=True)
+    told, to = np.unique(pairs[:, 1], return_inverse=True)
+    shared = np.zeros((len(true), len(told)))
+    np.add.at(shared, (at, to), 1)
+    union = shared.sum(axis=1, keepdims=True) + shared.sum(axis=0, keepdims=True) - shared
+    iou = (shared / union)[true >= 0][:, told >= 0]
+    wanted = np.array([t in large for t in true[true >= 0].tolist()], bool)
+    out = {}
+    for threshold in (0.25, 0.5):
+        matches = match_boxes(iou, threshold)
+        faint = sum(not wanted[t] for t, _ in matches)
+        tag = f"{threshold:g}"
+        out |= {f"mask_found_{tag}": len(matches) - faint, f"mask_listed_{tag}": iou.shape[1] - faint}
     return out
 
 
@@ -182,6 +202,10 @@ class _Gathered:
             self._most[value] = max(self._most.get(value, 0), len(mine))
             sure = mine[confirmed.ravel()[mine]]
             self._points.setdefault(value, []).append(points.reshape(-1, 3)[sure])
+
+    def large(self, least_px: int) -> set[int]:
+        """What covers so many pixels of a view."""
+        return {value for value, most in self._most.items() if most >= least_px}
 
     def boxes(self, least_px: int) -> tuple[list[OrientedBox], list[OrientedBox]]:
         """Boxes of what is large enough in a view, and of the rest."""
@@ -217,6 +241,8 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for tag in ("0.25", "0.5"):
         out[f"recall_{tag}"] = round(total(f"found_{tag}") / max(total("true"), 1), 3)
         out[f"precision_{tag}"] = round(total(f"found_{tag}") / max(total(f"listed_{tag}"), 1), 3)
+        out[f"mask_recall_{tag}"] = round(total(f"mask_found_{tag}") / max(total("true"), 1), 3)
+        out[f"mask_precision_{tag}"] = round(total(f"mask_found_{tag}") / max(total(f"mask_listed_{tag}"), 1), 3)
     out["duplicates_per_thing"] = round(total("duplicates") / max(total("true"), 1), 3)
     out["merged_pairs_per_thing"] = round(total("merged") / max(total("true"), 1), 3)
     out["small_recall_0.25"] = round(total("small_found") / max(total("small"), 1), 3)

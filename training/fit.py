@@ -28,6 +28,8 @@ class FitSettings:
     decay: float = 1e-4
     name_share: float = 0.2
     """Weight of the loss of names."""
+    noise: float = 0.0
+    """Deviation of what is added to features, of their own deviation."""
     seed: int = 0
 
 
@@ -94,7 +96,7 @@ def _step(
     network: PieceNetwork, optimiser: torch.optim.Optimizer, lesson: Lesson, settings: FitSettings
 ) -> dict[str, float]:
     network.train()
-    affinity, structure, names, _ = network(*tensors(lesson))
+    affinity, structure, names, _ = network(*_disturbed(network, lesson, settings.noise))
     same, _, weight = truths(lesson)
     w = torch.from_numpy(weight)
     pair = F.binary_cross_entropy_with_logits(
@@ -115,6 +117,16 @@ def _step(
     torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
     optimiser.step()
     return {"pair": pair.item(), "structure": bound.item(), "name": word.item()}
+
+
+def _disturbed(network: PieceNetwork, lesson: Lesson, noise: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What a network takes, with noise on the features; both ways of a border keep the same."""
+    nodes, left, right, edges, back = tensors(lesson)
+    if noise <= 0:
+        return nodes, left, right, edges, back
+    nodes = nodes + noise * network.node_std * torch.randn_like(nodes)
+    shift = noise * network.edge_std * torch.randn_like(edges)
+    return nodes, left, right, edges + shift, back + shift
 
 
 def _means(rows: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import neighbour_pairs
-from list3r.instances.learned.cut import CutSettings, make_parts
+from list3r.instances.learned.cut import make_parts
 from list3r.instances.learned.graph import PieceGraph, Surroundings
 from list3r.instances.learned.network import judge
 from list3r.instances.learned.pieces import Pieces, cut_pieces
@@ -77,15 +77,26 @@ def first_lesson(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
     return _read(kept)
 
 
-def second_lesson(path: Path, arrays: Mapping[str, NDArray[Any]]) -> Lesson:
-    """Return the graph of the parts that the first network makes of a sample on disk, with its truth."""
-    lesson, labels = first_lesson(path)
-    sample = read_sample(path)
-    cloud = sample.cloud()
-    pieces = Pieces(labels, neighbour_pairs(cloud.keys, 1), lesson.graph)
-    told = judge(arrays, "fine", lesson.graph)
-    parts, graph = make_parts(cloud, sample.views, surroundings_of(sample), pieces, told, CutSettings().sure)
-    return lesson_of(sample, graph, parts, sample.truth_of(cloud))
+def second_lessons(
+    path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path, sures: Sequence[float]
+) -> list[Lesson]:
+    """Return the graphs of the parts that the first network makes of a sample on disk, with their truth.
+
+    One for each threshold, so that the second network sees parts of several sizes; kept in `folder`.
+    """
+    files = [folder / f"{path.stem}-{sure:g}.parts" for sure in sures]
+    if not all(f.exists() for f in files):
+        folder.mkdir(parents=True, exist_ok=True)
+        lesson, labels = first_lesson(path)
+        sample = read_sample(path)
+        cloud = sample.cloud()
+        truth = sample.truth_of(cloud)
+        pieces = Pieces(labels, neighbour_pairs(cloud.keys, 1), lesson.graph)
+        told = judge(arrays, "fine", lesson.graph)
+        for sure, file in zip(sures, files, strict=True):
+            parts, graph = make_parts(cloud, sample.views, surroundings_of(sample), pieces, told, sure)
+            _write(file, lesson_of(sample, graph, parts, truth), np.zeros(0, np.int32))
+    return [_read(f)[0] for f in files]
 
 
 def _write(path: Path, lesson: Lesson, labels: NDArray[np.int32]) -> None:

@@ -13,8 +13,9 @@ def _two(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 class _Layer(nn.Module):
     """One round of messages."""
 
-    def __init__(self, node: int, edge: int) -> None:
+    def __init__(self, node: int, edge: int, dropout: float) -> None:
         super().__init__()
+        self.drop = nn.Dropout(dropout)
         self.here, self.there, self.way = nn.Linear(node, node), nn.Linear(node, node), nn.Linear(edge, node)
         self.update, self.norm = _two(3 * node, node, node), nn.LayerNorm(node)
         self.edge_update, self.edge_norm = nn.Linear(node, edge), nn.LayerNorm(edge)
@@ -24,7 +25,7 @@ class _Layer(nn.Module):
         size = torch.zeros(len(h), 1).index_add_(0, target, torch.ones(len(target), 1)).clamp(min=1)
         mean = torch.zeros_like(h).index_add_(0, target, m) / size
         most = torch.zeros_like(h).scatter_reduce(0, target[:, None].expand_as(m), m, "amax", include_self=True)
-        h = self.norm(h + self.update(torch.cat([h, mean, most], 1)))
+        h = self.norm(h + self.drop(self.update(torch.cat([h, mean, most], 1))))
         return h, self.edge_norm(e + self.edge_update(m))
 
 
@@ -32,7 +33,15 @@ class PieceNetwork(nn.Module):
     """Affinity of neighbours, structure and name of each piece."""
 
     def __init__(
-        self, node_features: int, edge_features: int, names: int, node: int = 32, edge: int = 24, depth: int = 3
+        self,
+        node_features: int,
+        edge_features: int,
+        names: int,
+        *,
+        node: int = 32,
+        edge: int = 24,
+        depth: int = 3,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.register_buffer("node_mean", torch.zeros(node_features))
@@ -41,7 +50,7 @@ class PieceNetwork(nn.Module):
         self.register_buffer("edge_std", torch.ones(edge_features))
         self.register_buffer("depth", torch.tensor(depth))
         self.node, self.edge = _two(node_features, node, node), _two(edge_features, edge, edge)
-        self.layers = nn.ModuleList(_Layer(node, edge) for _ in range(depth))
+        self.layers = nn.ModuleList(_Layer(node, edge, dropout) for _ in range(depth))
         self.pair_head = _two(edge + 2 * node, node, 1)
         self.node_head = nn.Linear(node, 1 + names)
 

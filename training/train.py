@@ -23,13 +23,16 @@ from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
 from list3r.instances.learned.network import judge
 from list3r.instances.learned.weights import write_weights
 from training.fit import FitSettings, fit
-from training.graphs import Lesson, first_lesson, second_lesson
+from training.graphs import Lesson, first_lesson, second_lessons
 from training.model import PieceNetwork
 from training.samples import make_sample
 from training.worlds.catalogue import LABELS
 
 FIRST_SEED, FIRST_HELD_SEED = 1000, 5000
 """Seeds of worlds for training count up from the first, those of left-out worlds for the log from the second."""
+
+OTHER_THRESHOLDS = (0.5, 3.5)
+"""Where agglomeration of fine pieces stops besides, so that the second network sees parts of other sizes too."""
 
 
 def main() -> None:
@@ -54,11 +57,15 @@ def train(paths: Sequence[Path], held: Sequence[Path], out: Path, epochs: int, w
         PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS)), lessons, seen, out / "fine", FitSettings(epochs)
     )
     arrays = named("fine", fine)
-    more, unseen = [second_lesson(p, arrays) for p in paths], [second_lesson(p, arrays) for p in held]
+    usual = CutSettings().sure
+    more = [second_lessons(p, arrays, out / "parts", (usual, *OTHER_THRESHOLDS)) for p in paths]
+    unseen = [second_lessons(p, arrays, out / "parts", (usual,))[0] for p in held]
     shape = (NODE_FEATURES + EXTRA_NODES, EDGE_FEATURES + EXTRA_EDGES)
-    coarse = fit(PieceNetwork(*shape, len(LABELS)), more, unseen, out / "coarse", FitSettings(3 * epochs))
+    every = [lesson for several in more for lesson in several]
+    settings = FitSettings(epochs, noise=0.15, decay=1e-2)
+    coarse = fit(PieceNetwork(*shape, len(LABELS), dropout=0.15), every, unseen, out / "coarse", settings)
     arrays |= named("coarse", coarse)
-    arrays |= fit_confidence(arrays, more)
+    arrays |= fit_confidence(arrays, [several[0] for several in more])
     write_weights(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, unseen)}))  # noqa: T201
 

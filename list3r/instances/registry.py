@@ -15,7 +15,9 @@ from list3r.memory.errors import OptionError
 if TYPE_CHECKING:
     from list3r.instances.neural.appearance import Appearance
 
-DISCOVERERS = ("geometric", "eomt", "mask2former", "sam2", "sam3", "precomputed")
+DISCOVERERS = ("geometric", "learned", "eomt", "mask2former", "sam2", "sam3", "precomputed")
+WITHOUT_DOWNLOAD = ("geometric", "learned")
+"""Discoverers that need no weights from elsewhere; their features are the geometric ones."""
 TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
 FEATURES = ("geometric", "own", "dinov2", "dinov3")
 """`own` are those of a neural discoverer; geometric ones belong to the geometric discoverer."""
@@ -30,10 +32,13 @@ def check_choice(discovery: str, tracking: str, features: str) -> None:
     ):
         if value not in known:
             raise OptionError(f"--{option} {value} is not known; choose one of {', '.join(known)}")
-    if features == "geometric" and discovery != "geometric":
-        raise OptionError(f"--features geometric needs --discovery geometric; with {discovery} use own or dinov2")
-    if features == "own" and discovery == "geometric":
-        raise OptionError("--features own are those of a neural discoverer; with geometric use geometric or dinov2")
+    ours = discovery in WITHOUT_DOWNLOAD
+    if features == "geometric" and not ours:
+        raise OptionError(
+            f"--features geometric needs --discovery geometric or learned; with {discovery} use own or dinov2"
+        )
+    if features == "own" and ours:
+        raise OptionError(f"--features own are those of a neural discoverer; with {discovery} use geometric or dinov2")
 
 
 def make_discoverer(
@@ -47,6 +52,10 @@ def make_discoverer(
     found: Discoverer
     if discovery == "geometric":
         found = GeometricDiscoverer(settings)
+    elif discovery == "learned":
+        from list3r.instances.learned.discovery import LearnedDiscoverer
+
+        found = LearnedDiscoverer(settings)
     elif discovery == "precomputed":
         from list3r.instances.neural.precomputed_masks import PrecomputedMasks
 

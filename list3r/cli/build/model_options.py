@@ -36,7 +36,9 @@ Preset = Annotated[
 ]
 Discovery = Annotated[
     str | None,
-    typer.Option("--discovery", help="geometric, eomt, mask2former, sam2, sam3 or precomputed: what finds things."),
+    typer.Option(
+        "--discovery", help="geometric, learned, eomt, mask2former, sam2, sam3 or precomputed: what finds things."
+    ),
 ]
 Tracking = Annotated[
     str | None,
@@ -234,6 +236,7 @@ def _local_features(words: str) -> tuple[str, str | None]:
 
 def _selection(info: SourceInfo, words: ModelWords) -> ModelSelection:
     """The preset's models, or the classical ones, with what was asked for by name put in their place."""
+    from list3r.instances.registry import WITHOUT_DOWNLOAD
     from list3r.models.device import find_gpu
     from list3r.models.presets import ModelSelection, select
 
@@ -244,7 +247,7 @@ def _selection(info: SourceInfo, words: ModelWords) -> ModelSelection:
     given = {k: getattr(words, k) for k in ("reconstruction", "discovery", "tracking", "features")}
     named = {k: str(v) for k, v in given.items() if v is not None}
     if "discovery" in named and "features" not in named:
-        neural = named["discovery"] != "geometric"
+        neural = named["discovery"] not in WITHOUT_DOWNLOAD
         if neural and chosen.features == "geometric":
             named["features"] = "own"
         elif not neural and chosen.features == "own":

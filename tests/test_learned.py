@@ -1,0 +1,128 @@
+"""The learned discoverer: its pieces, its network in two forms, its weights, and the worlds it is trained on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.instances.geometric.views import chunk_views, forget_views
+from list3r.instances.learned.agglomeration import agglomerate
+from list3r.instances.learned.discovery import LearnedDiscoverer
+from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph
+from list3r.instances.learned.network import judge
+from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
+from list3r.instances.registry import make_discoverer
+from list3r.instances.settings import InstanceSettings
+from list3r.memory.errors import OptionError
+from tests.test_instances_library import SCENE, render, walk
+
+
+def random_graph(seed: int, pieces: int = 30, borders: int = 90) -> PieceGraph:
+    rng = np.random.default_rng(seed)
+    codes = rng.choice(pieces * pieces, 3 * borders, replace=False)
+    a, b = codes // pieces, codes % pieces
+    left, right = a[a < b][:borders], b[a < b][:borders]
+    nodes = rng.normal(size=(pieces, NODE_FEATURES)).astype(np.float32)
+    edges = rng.normal(size=(len(left), EDGE_FEATURES)).astype(np.float32)
+    return PieceGraph(nodes, left, right, edges, rng.uniform(1, 9, len(left)).astype(np.float32))
+
+
+def one_by_one(count: int, graph: PieceGraph, score: np.ndarray, threshold: float) -> np.ndarray:
+    """Average linkage by its definition: join the most alike pair of clusters until none is above the threshold."""
+    own = np.arange(count)
+    while True:
+        a, b = own[graph.left], own[graph.right]
+        pairs = {(min(p), max(p)) for p in zip(a.tolist(), b.tolist(), strict=True) if p[0] != p[1]}
+        best, who = threshold, None
+        for low, high in sorted(pairs):
+            mine = ((a == low) & (b == high)) | ((a == high) & (b == low))
+            mean = float((score * graph.weight)[mine].sum() / graph.weight[mine].sum())
+            if mean > best:
+                best, who = mean, (low, high)
+        if who is None:
+            return own
+        own[own == who[1]] = who[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_agglomeration_is_average_linkage(seed: int) -> None:
+    graph = random_graph(seed)
+    score = np.random.default_rng(seed).normal(0.5, 2.0, len(graph.left)).astype(np.float32)
+    own = agglomerate(30, graph.left, graph.right, score, graph.weight, 0.3)
+    expected = one_by_one(30, graph, np.clip(score.astype(np.float64), -6, 6), 0.3)
+    assert np.array_equal(own[:, None] == own, expected[:, None] == expected)
+
+
+def test_a_border_seen_twice_from_its_other_side_is_itself() -> None:
+    graph = random_graph(3)
+    turned = PieceGraph(graph.nodes, graph.left, graph.right, graph.reversed_edges(), graph.weight)
+    assert np.array_equal(turned.reversed_edges(), graph.edges)
+    assert not np.array_equal(graph.reversed_edges(), graph.edges)
+
+
+def test_the_network_says_the_same_in_numpy_and_torch() -> None:
+    torch = pytest.importorskip("torch")
+    model = pytest.importorskip("training.model")
+    torch.manual_seed(5)
+    network = model.PieceNetwork(NODE_FEATURES, EDGE_FEATURES, 7).eval()
+    graph = random_graph(8)
+    arrays = {f"fine.{k}": v.detach().numpy() for k, v in network.state_dict().items()}
+    told = judge(arrays, "fine", graph)
+    given = (graph.nodes, graph.left, graph.right, graph.edges, graph.reversed_edges())
+    with torch.no_grad():
+        affinity, structure, names, hidden = network(*(torch.from_numpy(a) for a in given))
+    assert np.allclose(told.affinity, affinity.numpy(), atol=1e-4)
+    assert np.allclose(told.structure, structure.numpy(), atol=1e-4)
+    assert np.allclose(told.names, torch.log_softmax(names, 1).numpy(), atol=1e-4)
+    assert np.allclose(told.hidden, hidden.numpy(), atol=1e-4)
+
+
+def test_weights_come_back_and_damage_is_said(tmp_path: Path) -> None:
+    arrays = {"a.weight": np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4), "a.bias": np.ones(3, np.float32)}
+    file = tmp_path / "w.npz"
+    write_weights(file, arrays)
+    back = load_weights(file)
+    assert np.allclose(back["a.weight"], arrays["a.weight"], atol=1e-3) and back["a.weight"].dtype == np.float32
+
+    with np.load(file) as data:
+        kept = {name: data[name] for name in data.files}
+    np.savez(tmp_path / "old.npz", **{**kept, "version": np.int64(0)})
+    np.savez(tmp_path / "hit.npz", **{**kept, "a.bias": np.zeros(3, np.float32)})
+    (tmp_path / "cut.npz").write_bytes(file.read_bytes()[:100])
+    for name, word in (("none", "missing"), ("old", "version 0"), ("hit", "damaged"), ("cut", "cannot be read")):
+        with pytest.raises(OptionError, match=word) as said:
+            load_weights(tmp_path / f"{name}.npz")
+        assert "\n" not in str(said.value) and "--discovery geometric" in str(said.value)
+
+
+def test_shipped_weights_are_small_and_whole() -> None:
+    assert SHIPPED.stat().st_size < 4_000_000
+    weights = load_weights()
+    assert weights["fine.node_mean"].shape == (NODE_FEATURES,) and weights["fine.edge_mean"].shape == (EDGE_FEATURES,)
+
+
+def test_it_is_asked_for_by_name() -> None:
+    found = make_discoverer("learned", "geometric", (), "cpu", InstanceSettings())
+    assert isinstance(found, LearnedDiscoverer)
+
+
+def test_it_finds_what_stands_on_a_table() -> None:
+    frames, reconstruction = walk(SCENE)
+    discoverer = LearnedDiscoverer(InstanceSettings())
+    anchor = chunk_views(frames, reconstruction, discoverer.settings).anchors[0]
+    proposals = discoverer(frames, reconstruction, anchor)
+    forget_views()
+    pose = frames[anchor].T_source_cam
+    assert pose is not None and proposals.identity is not None and proposals.structure is not None
+    blocks = render(SCENE, pose)[1]
+    floor, wall, table, mug, tin = (most_of(proposals.labels[blocks == k]) for k in (0, 1, 2, 5, 6))
+    assert proposals.structure[floor - 1] and proposals.structure[wall - 1]
+    assert len({table, mug, tin, floor}) == 4
+    assert not proposals.structure[[table - 1, mug - 1, tin - 1]].any()
+
+
+def most_of(labels: np.ndarray) -> int:
+    """The candidate that most pixels have."""
+    return int(np.bincount(labels[labels > 0]).argmax())
