@@ -17,7 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 import list3r
-from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
+from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS, WITHOUT_DOWNLOAD
 from list3r.memory.errors import OptionError
 from list3r.models.cache import (
     cache_folder,
@@ -84,7 +84,7 @@ def card(code: Licence = APACHE, *weights: Weights) -> ModelCard:
 
 def test_every_adapter_has_a_card_and_every_card_an_adapter() -> None:
     known = {("geometry", m) for m in MODELS if m not in ("rgbd", "sfm", "precomputed")}
-    known |= {("discovery", d) for d in DISCOVERERS if d not in ("geometric", "precomputed")}
+    known |= {("discovery", d) for d in DISCOVERERS if d not in (*WITHOUT_DOWNLOAD, "precomputed")}
     known |= {("tracking", t) for t in TRACKERS if t != "reprojection"}
     known |= {("features", f) for f in FEATURES if f not in ("geometric", "own")}
     carded = {(c.part, c.name) for c in CARDS}

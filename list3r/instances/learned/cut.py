@@ -114,8 +114,8 @@ def summarise(
     total = np.maximum(np.bincount(own, size, minlength=count), 1.0)
     bound = 1.0 / (1.0 + np.exp(-np.clip(told.structure.astype(np.float64), -20, 20)))
     structure = np.bincount(own, bound * size, minlength=count) / total
-    odds = np.stack([np.bincount(own, told.names[:, k] * size, minlength=count) for k in range(told.names.shape[1])], 1)
-    odds = odds / total[:, None]
+    words = [np.bincount(own, told.names[:, k] * size, minlength=count) / total for k in range(told.names.shape[1])]
+    odds = np.stack(words, axis=1)
     names = np.exp(odds - odds.max(axis=1, keepdims=True))
     names = names / names.sum(axis=1, keepdims=True)
     features = thing_features(own, size, structure, graph, told)
