@@ -1,7 +1,7 @@
 """What a memory survives: kill -9 while it is built, updated and edited (`kills`), readers beside a writer, flipped
-bytes, truncation.
+bytes, truncation, lies with valid checksums (`lies`).
 
-    python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --json benchmarks/results/safety.json
+    python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --lies 200 --json benchmarks/results/safety.json
 
 Every process is real. The whole takes about half an hour on a quiet core; a part is written to the file as it is done,
 and the same command with --resume goes on after the last one.
@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from kills import build_command, kill_builds, kill_commands, kill_edits, kill_updates, kill_writes, update_command
+from lies import tell_lies
 from machine import machine, write_json
 
 from list3r.exporters.scene_json import scene_dict
@@ -283,12 +284,13 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=200, help="in all: builds and updates 30 %% each, edits the rest")
     parser.add_argument("--minutes", type=float, default=5.0, help="how long eight readers and a writer run")
     parser.add_argument("--flips", type=int, default=1000)
+    parser.add_argument("--lies", type=int, default=200, help="memories of valid checksums that hold nonsense")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--resume", action="store_true", help="keep the parts that the file holds already")
     words = parser.parse_args()
     print(machine())
-    asked = {"kills": words.kills, "minutes": words.minutes, "flips": words.flips, "seed": words.seed}
+    asked = {name: getattr(words, name) for name in ("kills", "minutes", "flips", "lies", "seed")}
     result: Result = {"asked": asked}
     if words.resume and words.json is not None and words.json.exists():
         held = json.loads(words.json.read_text(encoding="utf-8"))
@@ -320,6 +322,7 @@ def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Calla
         # A file of its own for each: what a killed writer left beside one belongs to no other.
         yield part, lambda k=kill, n=count: k(_copy(made.updated, k.__name__), n, seed + 2)
     yield "flips", lambda: flip(made.built, folder, words.flips, seed)
+    yield "lies", lambda: tell_lies(made.updated, words.lies, seed, folder)
     yield "repairs", lambda: repair_flips(made.built, folder, words.flips // 10, seed + 1)
     yield "file_mb", lambda: round(made.built.stat().st_size / 1e6, 2)
     yield "verify_s", lambda: _verify_s(made.built)

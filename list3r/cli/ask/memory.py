@@ -156,7 +156,7 @@ def show(
         instance = scene.instance(instance_id)
         relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
         names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
-        aliases = [old for old, _ in scene.store.aliases().items() if scene.store.resolve(old) == instance.id]
+        aliases = scene.store.aliases_of(instance.id)
         track = scene.track(instance.id) if instance.dynamic else None
         parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations(instance.id)]
         units = scene.units

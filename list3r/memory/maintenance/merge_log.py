@@ -16,7 +16,7 @@ def merge_log(store: Store, instance_id: int | None = None) -> list[LogEntry]:
     if instance_id is None:
         return entries
     current = store.resolve(instance_id)
-    names = {f"#{current}", *(f"#{old}" for old in store.aliases() if _becomes(store, old, current))}
+    names = {f"#{current}", *(f"#{old}" for old in store.aliases_of(current))}
     names |= {f"{o.chunk_id}:{o.local_id}" for o in store.observations(current)}
     edits = {e.entry for e in store.edits() if any(f"#{n}" in names for n, _, _ in e.before)}
     return [e for e in entries if e.entry in edits or e.decision.a in names or e.decision.b in names]
@@ -27,12 +27,3 @@ def states(store: Store) -> dict[int, str]:
     edits = store.edits()
     in_force = {e.entry for e in standing(edits)}
     return {e.entry: "stands" if e.entry in in_force else "undone" for e in edits}
-
-
-def _becomes(store: Store, old: int, current: int) -> bool:
-    aliases = store.aliases()
-    seen: set[int] = set()
-    while old in aliases and old not in seen:
-        seen.add(old)
-        old = aliases[old]
-    return old == current

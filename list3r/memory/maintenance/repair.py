@@ -38,6 +38,7 @@ from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
 from list3r.memory.store.store import Store
+from list3r.memory.store.values import bad_values
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events")
 """Tables that consolidation writes; a row lost there is written anew."""
@@ -262,6 +263,7 @@ def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) ->
         sums, _ = stored_sums(damaged, table)
     except FAILURES:
         sums = {}
+    lies = _lies(damaged, table)
     summed = [table.columns.index(c) for c in table.summed]
     kept: dict[Row, Row] = {}
     missing = {part: list(crcs) for part, crcs in sums.items()}
@@ -270,7 +272,7 @@ def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) ->
             continue
         crc = row_crc(tuple(row[k] for k in summed))
         known = missing.get(part)
-        if (known is not None and crc not in known) or not _own_crc_holds(table, row):
+        if (known is not None and crc not in known) or not _own_crc_holds(table, row) or key in lies:
             lost.add(table.name, key)
             continue
         if known is not None:
@@ -280,6 +282,14 @@ def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) ->
     if gone > 0:
         lost.unnamed[table.name] = gone
     return kept
+
+
+def _lies(damaged: sqlite3.Connection, table: SummedTable) -> set[Row]:
+    """Keys of rows that hold what none may hold, whatever their checksums say."""
+    try:
+        return {bad.key for bad in bad_values(damaged, table.name) if bad.key is not None}
+    except FAILURES:
+        return set()
 
 
 def _readable(damaged: sqlite3.Connection, table: SummedTable, parts: list[int]) -> Iterator[tuple[int, Row, Row]]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, bad_rows_of_part, own_crc_wrong, row_crc, summed_tables
+from list3r.memory.store.values import bad_references, bad_values
 from list3r.memory.store.word_index import expected_words, up_to_date
 
 WHOLE_BYTES = 128 * 2**20
@@ -134,6 +135,8 @@ def damage_of(database: sqlite3.Connection, name: str, *, pages: bool = True) ->
     if name in OWN_CRC:
         yield from map(str, own_crc_wrong(database, name, summed_tables()[name].key))
     yield from map(str, bad_rows_of(database, summed_tables()[name]))
+    yield from map(str, bad_values(database, name))
+    yield from bad_references(database, name)
 
 
 def damage_of_part(database: sqlite3.Connection, name: str, part: int) -> Iterator[str]:
@@ -142,6 +145,7 @@ def damage_of_part(database: sqlite3.Connection, name: str, part: int) -> Iterat
     yield from map(str, bad_rows_of_part(database, table, part))
     if name in OWN_CRC:
         yield from map(str, own_crc_wrong(database, name, table.key, table.where(part)))
+    yield from map(str, bad_values(database, name, *table.where(part)))
 
 
 def _large(database: sqlite3.Connection) -> set[str]:

@@ -13,18 +13,6 @@ from list3r.memory.store.tables.edits import EditVerbs
 from list3r.memory.store.tables.events import EventVerbs
 from list3r.memory.store.tables.library import LibraryVerbs
 
-_REFERENCES = (
-    ("observations", "instance", "instances", "id"),
-    ("observations", "chunk_id", "chunks", "chunk_id"),
-    ("relations", "subject", "instances", "id"),
-    ("relations", "object", "instances", "id"),
-    ("embeddings", "instance", "instances", "id"),
-    ("frames", "chunk_id", "chunks", "chunk_id"),
-    ("placements", "chunk_id", "chunks", "chunk_id"),
-    ("chunks", "chunk_id", "placements", "chunk_id"),
-    ("anchors", "instance", "instances", "id"),
-)
-
 
 class Store(EditVerbs, EventVerbs, LibraryVerbs):
     """Verbs of the memory file. `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew."""
@@ -61,9 +49,6 @@ class Store(EditVerbs, EventVerbs, LibraryVerbs):
                 yield from damage_of(self._database, name, pages=False)
             except FAILURES as error:
                 yield f"{name}: {error}"
-        for source, column, other, target in _REFERENCES:
-            query = f"SELECT DISTINCT {column} FROM {source} WHERE {column} NOT IN (SELECT {target} FROM {other})"
-            yield from (f"{source}: {column} {row[0]} is not in {other}" for row in self._asked(query))
 
     def _asked(self, query: str) -> Iterator[tuple[Any, ...]]:
         """Rows of a query; what SQLite says where it fails, as one row."""

@@ -112,6 +112,18 @@ class InstanceVerbs(EmbeddingVerbs):
         """Every retired id and the id it was merged into."""
         return {r[0]: r[1] for r in self._rows("SELECT id, instance FROM aliases ORDER BY id")}
 
+    def aliases_of(self, instance_id: int) -> list[int]:
+        """Retired ids that stand for an instance (no alias) today, ascending."""
+        older: dict[int, list[int]] = {}
+        for old, new in self.aliases().items():
+            older.setdefault(new, []).append(old)
+        found, waiting = set[int](), [instance_id]
+        while waiting:
+            fresh = [n for n in older.get(waiting.pop(), []) if n not in found]
+            found.update(fresh)
+            waiting += fresh
+        return sorted(found)
+
     def ids_in_box(self, lower: ArrayLike, upper: ArrayLike) -> list[int]:
         """Ids whose axis-aligned boxes meet the box, from the R*Tree. World coordinates, shape (3,) each."""
         low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
