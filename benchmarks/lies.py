@@ -12,11 +12,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import json
 import random
 import resource
 import shutil
 import signal
 import sqlite3
+import sys
 import tempfile
 import time
 import traceback
@@ -80,6 +82,7 @@ def tell_lies(base: Path, count: int, seed: int, folder: Path, *, edits: bool = 
             longest = max(longest, seconds)
             if ended not in ("0", "1", "2"):
                 problems.append({"lie": f"{seed}:{n} {what}", "command": command, "ended": ended, "told": told})
+                print(problems[-1], file=sys.stderr, flush=True)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     told_of = {"lies": count, "seed": seed, "commands": sum(outcomes.values()), "exits": dict(sorted(outcomes.items()))}
     return told_of | {"problems": problems, "longest_s": round(longest, 2), "peak_mb": round(peak_mb)}
@@ -253,9 +256,7 @@ def main() -> None:
     words = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         report = tell_lies(words.memory, words.count, words.seed, Path(folder))
-    for problem in report.pop("problems"):
-        print(problem)
-    print(report)
+    print(json.dumps(report, indent=2))
 
 
 if __name__ == "__main__":
