@@ -18,6 +18,8 @@ _MAX_POINTS = 4000
 """More points of one instance are thinned out: that is finer than the surfaces are known."""
 STRAY = 2e-5
 """Points may lie this far outside their thing's box, by its size: the steps in which they are stored."""
+_SLACK = 0.02
+"""Points this far outside of the box, as a share of its longest edge, still count as the instance's surface."""
 _KEPT_POINTS = 4_000_000
 """Points of surfaces that are kept for the next question, over all instances of a store."""
 
@@ -80,16 +82,20 @@ def _surface(store: Store, instance: Instance) -> InstanceSurface:
     """Return the support points inside the box, as deriving the box left strays out; those just outside are moved to
     its side, so that a thing is never nearer than its box.
     """
-    points = store.surface_points(instance.id).astype(np.float64)
-    if len(points):
-        low, high = instance.aabb
-        slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
-        points = points[np.all((points >= low - slack) & (points <= high + slack), axis=1)]
+    points = inside_box(store.surface_points(instance.id).astype(np.float64), instance)
     if len(points) == 0:
         return InstanceSurface(None, instance)
+    low, high = instance.aabb
     stray = STRAY * float(np.max(instance.box.size))
     points = np.clip(points[:: -(-len(points) // _MAX_POINTS)], low - stray, high + stray)
     return InstanceSurface(points, instance)
+
+
+def inside_box(points: NDArray[np.float64], instance: Instance) -> NDArray[np.float64]:
+    """Return the points that lie in the box of an instance, or just outside. Shape (N, 3) -> (M, 3)."""
+    slack = _SLACK * float(np.max(instance.box.size)) + 1e-9
+    low, high = instance.aabb
+    return np.asarray(points[np.all((points >= low - slack) & (points <= high + slack), axis=1)])
 
 
 _FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.float64) * 0.5 - 0.5

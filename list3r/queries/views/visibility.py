@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.views.camera import PosedCamera
+from list3r.queries.views.surfaces import inside_box
 
 _WIDTH = 160
 """Cells across the depth buffer."""
@@ -32,6 +33,8 @@ _MANY = 5_000
 """In memories of more things than this those that would hardly show are not looked at."""
 _LEAST_CELLS = 2.0
 """Their width."""
+_MARGIN = 0.05
+"""Share of the far end of the frustum by which it is searched further."""
 _NOISE = 0.02
 """Depth noise between views over depth."""
 
@@ -108,7 +111,7 @@ def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) 
         return []
     step = max(1.0, camera.image_size[1] / _WIDTH)
     ends = np.abs(bounds - camera.place).max(axis=0)
-    far = float(np.linalg.norm(ends)) if max_depth is None else 1.05 * max_depth
+    far = float(np.linalg.norm(ends)) if max_depth is None else (1.0 + _MARGIN) * max_depth
     many = store.largest_id() > _MANY
     fx, fy, cx, cy = camera.intrinsics
     height, width = camera.image_size
@@ -116,7 +119,7 @@ def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) 
     u, v = np.array([-beside, width + beside]), np.array([-beside, height + beside])
     rays = np.array([[(x - cx) / fx, (y - cy) / fy, 1.0] for x in u for y in v]) * far
     corners = np.vstack([rays @ camera.T_world_cam[:3, :3].T + camera.place, camera.place])
-    slack = 0.05 * far
+    slack = _MARGIN * far
     ids, boxes = store.boxes_in_box(corners.min(axis=0) - slack, corners.max(axis=0) + slack)
     if many:
         apart = np.maximum(0.0, np.maximum(boxes[:, 0] - camera.place, camera.place - boxes[:, 1]))
@@ -140,7 +143,7 @@ def _draw(
     """Return the cells that an instance covers when nothing else is there, and its depth in each; None for none."""
     R, t = camera.T_world_cam[:3, :3], camera.T_world_cam[:3, 3]
     corners = (instance.box.corners() - t) @ R
-    if corners[:, 2].max() <= 0.0 or (max_depth is not None and corners[:, 2].min() > max_depth * 1.05):
+    if corners[:, 2].max() <= 0.0 or (max_depth is not None and corners[:, 2].min() > max_depth * (1.0 + _MARGIN)):
         return None
     world, spacing = _surface(store, instance)
     points = (world - t) @ R
@@ -190,9 +193,7 @@ def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], flo
     """Return the surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie
     apart: of most of them the second neighbour is nearer, so that squares of that width close the surface.
     """
-    points = store.support(instance.id).points.astype(np.float64)
-    slack = 0.02 * float(np.max(instance.box.size)) + 1e-9
-    points = points[np.all((points >= instance.aabb[0] - slack) & (points <= instance.aabb[1] + slack), axis=1)]
+    points = inside_box(store.support(instance.id).points.astype(np.float64), instance)
     if len(points) < _FEW:
         side = np.linspace(-0.5, 0.5, _FEW)
         grid = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
