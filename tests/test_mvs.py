@@ -14,14 +14,14 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
 from list3r.reconstruction.mvs.fill import fill_regions
 from list3r.reconstruction.mvs.fusion import DepthMap, fill_flat
-from list3r.reconstruction.mvs.images import Warp, box_sum, look_up, resized_camera
+from list3r.reconstruction.mvs.images import Warp, box_sum, look_up
 from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
 from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
 COUNT = 20
-SMALL = resized_camera(CAMERA, 160)
+SMALL = CAMERA.shrunk(160)
 
 
 def shrunk(frame: Frame) -> Frame:
@@ -202,7 +202,7 @@ def test_look_up_and_box_sum() -> None:
 
 
 def test_a_resized_camera_sees_the_same() -> None:
-    small = resized_camera(Camera(640, 480, 524.0, 524.0, 319.5, 239.5), 320)
+    small = Camera(640, 480, 524.0, 524.0, 319.5, 239.5).shrunk(320)
     assert (small.width, small.height, small.fx, small.cx, small.cy) == (320, 240, 262.0, 159.5, 119.5)
 
 

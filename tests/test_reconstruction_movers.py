@@ -13,7 +13,7 @@ from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.motion.movers import surfaces
 from list3r.reconstruction.motion.settings import MoverSettings
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.view import make_view, shrink_camera
+from list3r.reconstruction.rgbd.view import make_view
 from tests.rgbd_scenes import CAMERA, frames_along, pose_errors, walk
 
 SPEED_M_PER_S = 0.3
@@ -54,7 +54,7 @@ def test_a_near_mover_does_not_drag_the_camera(first: int) -> None:
 def test_surfaces_are_parted_by_steps_of_depth() -> None:
     frame, noise = carried(frames_along(walk(1))[0], place(0)), SensorNoise()
     assert frame.depth is not None
-    view = make_view(frame.color, frame.depth, shrink_camera(CAMERA, 160), noise)
+    view = make_view(frame.color, frame.depth, CAMERA.shrunk(160), noise)
     boards = [m for m in surfaces(view, MoverSettings(), noise) if m[view.depth.shape[0] // 2, 80]]
     assert len(boards) == 1
     assert abs(float(boards[0].mean()) - 0.2) < 0.05

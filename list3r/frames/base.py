@@ -28,8 +28,21 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def pinhole(self) -> Camera:
-        """The same camera without lens distortion."""
+        """Return the same camera without lens distortion."""
         return replace(self, distortion=())
+
+    def resized(self, height: int, width: int) -> Camera:
+        """Return the camera of its pictures at another size."""
+        if (height, width) == (self.height, self.width):
+            return self
+        x, y = width / self.width, height / self.height
+        cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return Camera(width, height, self.fx * x, self.fy * y, cx, cy, self.distortion)
+
+    def shrunk(self, width: int) -> Camera:
+        """Return the pinhole camera of its pictures at most `width` px wide, of the same shape."""
+        width = min(width, self.width)
+        return self.pinhole().resized(max(1, round(self.height * width / self.width)), width)
 
 
 @dataclass(frozen=True)

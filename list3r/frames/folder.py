@@ -19,7 +19,7 @@ from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_de
 from list3r.frames.exif import exif_focal
 from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
-from list3r.frames.registration.rig import Rig, build_rig, merge_optics, resized
+from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
 from list3r.frames.stored import stored_size
 from list3r.memory.errors import FrameError, SourceError
@@ -249,11 +249,11 @@ class FolderSource:
         return None if focal is None else centred_camera(focal, self._rig)
 
 
-def centred_camera(focal: float, rig: Rig) -> Camera | None:
+def centred_camera(focal: float, rig: Rig) -> Camera:
     """A camera with its centre in the middle, for a focal length in px of the pictures as stored."""
     height, width = rig.stored_size
     stored = Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
-    return resized(stored, rig.color_size)
+    return stored.resized(*rig.color_size)
 
 
 def reduced_note(rig: Rig) -> str:

@@ -12,7 +12,6 @@ from threadpoolctl import threadpool_limits
 
 from list3r.frames.base import Camera, SourceInfo
 from list3r.frames.options import SourceOptions
-from list3r.frames.registration.rig import resized
 from list3r.frames.source import open_source
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
@@ -89,8 +88,7 @@ def _stored_size(source: str | Path, options: SourceOptions) -> tuple[int, int]:
 
 def _as_stored(camera: Camera, size: tuple[int, int]) -> dict[str, list[float]]:
     """Intrinsics and distortion for pictures of that (height, width)."""
-    full = resized(camera, size)
-    assert full is not None
+    full = camera.resized(*size)
     return {"intrinsics": [full.fx, full.fy, full.cx, full.cy], "distortion": list(camera.distortion)}
 
 

@@ -15,7 +15,7 @@ from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.features.learned import LearnedDetector, as_bytes
 from list3r.reconstruction.features.local import Features, detect, points_at
 from list3r.reconstruction.features.vlad import describe_frame
-from list3r.reconstruction.rgbd.view import shrink_camera, shrink_depth
+from list3r.reconstruction.rgbd.view import shrink_depth
 from list3r.reconstruction.settings import KeyframeSettings, SampleSettings
 
 
@@ -124,7 +124,7 @@ def _make_keyframe(
 ) -> Keyframe:
     camera, depth = reconstruction.camera, reconstruction.depth[position]
     features = detect(frame.color, depth, camera, settings.features)
-    small = shrink_camera(camera, settings.depth_width)
+    small = camera.shrunk(settings.depth_width)
     kept = features
     if detector is not None:
         found = detector(frame.color, settings.learned_count)

@@ -92,15 +92,6 @@ WORKING_SIDES = (960, 1280)
 """Longest side of the frames handed out unless said otherwise, px: without depth, with depth."""
 
 
-def resized(camera: Camera | None, size: tuple[int, int]) -> Camera | None:
-    """The camera of its pictures at another (height, width); pixel (0, 0) is the centre of the upper left pixel."""
-    if camera is None or (camera.height, camera.width) == size:
-        return camera
-    x, y = size[1] / camera.width, size[0] / camera.height
-    cx, cy = (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5
-    return Camera(size[1], size[0], camera.fx * x, camera.fy * y, cx, cy, camera.distortion)
-
-
 def build_rig(
     optics: Optics,
     stored_size: tuple[int, int],
@@ -117,7 +108,8 @@ def build_rig(
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
     stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
-    lens = resized(_of_size(stated, stored_size, "the colour pictures"), color_size)
+    whole = _of_size(stated, stored_size, "the colour pictures")
+    lens = None if whole is None else whole.resized(*color_size)
     camera = lens.pinhole() if lens else None
     undistortion = Undistortion(lens) if lens and lens.distortion else None
     registration = None
@@ -159,7 +151,7 @@ def _of_size(camera: Camera | None, size: tuple[int, int], what: str) -> Camera 
             f"{what} are {_size(size)}, but the source states its camera for {stated}{turned}; give --intrinsics "
             "fx,fy,cx,cy for the pictures as they are"
         )
-    return resized(camera, size)
+    return camera.resized(*size)
 
 
 _MOST_SHEAR = 0.02

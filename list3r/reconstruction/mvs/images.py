@@ -26,16 +26,9 @@ class Pictures:
     """Pinhole camera of that size."""
 
 
-def resized_camera(camera: Camera, width: int) -> Camera:
-    """The camera of the same picture at another width; (0, 0) stays the centre of the upper left pixel."""
-    height = max(1, round(camera.height * width / camera.width))
-    x, y = width / camera.width, height / camera.height
-    return Camera(width, height, camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
-
-
 def make_pictures(frames: Sequence[Frame], camera: Camera, width: int, device: str) -> Pictures:
     """All frames in grey at `width` px."""
-    small = resized_camera(camera, width)
+    small = camera.shrunk(width)
     out = np.empty((len(frames), small.height, small.width), np.float32)
     for number, frame in enumerate(frames):
         gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)

@@ -114,7 +114,7 @@ class FeedforwardReconstructor:
             self._budget = MemoryBudget(self._network.card.memory_with(self.weights), free, height * width)
         if self._model is None:
             self._model = self._network.load(locate(self.weights), self._device)
-        K = _scaled(camera, height, width) if self._options.camera_known else None
+        K = camera.resized(height, width).matrix() if self._options.camera_known else None
 
         def run(start: int, stop: int) -> WindowOutput:
             return self._pass(shrink([f.color for f in frames[start:stop]], height, width), K)
@@ -181,10 +181,3 @@ def inverted(T_cam_world: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 def sigmoid_of_expp1(confidence: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     """In [0, 1], from the confidence 1 + exp(x) of networks after DUSt3R: the sigmoid of x, which is 1 - 1 / c."""
     return np.asarray(1.0 - 1.0 / np.maximum(confidence, 1.0), np.float32)
-
-
-def _scaled(camera: Camera, height: int, width: int) -> NDArray[np.float64]:
-    """Intrinsics of a camera's frames at another size; pixel centres are whole numbers. Shape (3, 3)."""
-    sx, sy = width / camera.width, height / camera.height
-    cx, cy = (camera.cx + 0.5) * sx - 0.5, (camera.cy + 0.5) * sy - 0.5
-    return np.array([[camera.fx * sx, 0.0, cx], [0.0, camera.fy * sy, cy], [0.0, 0.0, 1.0]])

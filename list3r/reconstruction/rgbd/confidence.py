@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
-from list3r.reconstruction.rgbd.view import Floats, shrink_camera, shrink_depth, surface
+from list3r.reconstruction.rgbd.view import Floats, shrink_depth, surface
 
 
 def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> NDArray[np.float16]:
@@ -23,7 +23,7 @@ def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings
 
 def _facing(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> Floats:
     """Factor of the grazing angle, measured on a small image. Shape (H, W)."""
-    small = shrink_camera(camera, settings.working_width)
+    small = camera.shrunk(settings.working_width)
     points, normals, valid = surface(shrink_depth(depth, small, settings.noise), small)
     distance = np.sqrt(np.einsum("...i,...i->...", points, points))
     cosine = -np.einsum("...i,...i->...", points, normals) / np.maximum(distance, 1e-6)

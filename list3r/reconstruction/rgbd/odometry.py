@@ -23,7 +23,7 @@ from list3r.reconstruction.poses import angle_deg, shows_more
 from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
-from list3r.reconstruction.rgbd.view import WorkingFrame, make_view, shrink_camera
+from list3r.reconstruction.rgbd.view import WorkingFrame, make_view
 
 Pose = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class CameraTracker:
     ) -> None:
         """`known` are masks of any size, by position, of what is known to move: the camera is followed without it."""
         self.frames, self.camera, self.settings = frames, camera, settings
-        self.small = shrink_camera(camera, settings.working_width)
+        self.small = camera.shrunk(settings.working_width)
         self.segments: list[TrackedSegment] = []
         self._features: dict[int, Features] = {}
         self._views: dict[int, WorkingFrame] = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -34,24 +34,6 @@ class WorkingFrame:
     """Where depth and normal are both known. Shape (h, w)."""
     gray: Floats
     """Brightness, 0 to 255. Shape (h, w)."""
-
-
-def shrink_camera(camera: Camera, width: int) -> Camera:
-    """The camera of an image shrunk by area averaging to `width` (unchanged where it is narrower already)."""
-    if width >= camera.width:
-        return camera.pinhole()
-    height = max(1, round(camera.height * width / camera.width))
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * x,
-        fy=camera.fy * y,
-        cx=(camera.cx + 0.5) * x - 0.5,
-        cy=(camera.cy + 0.5) * y - 0.5,
-        distortion=(),
-    )
 
 
 @lru_cache(maxsize=8)
