@@ -26,6 +26,7 @@ from list3r.cli.models import commands as model_commands
 from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
 from list3r.cli.serve import mcp as mcp_commands
+from list3r.cli.serve import view as view_commands
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
 from list3r.memory.errors import List3rError, naming_extras
 
@@ -52,6 +53,7 @@ for module in (
     detect_commands,
     model_commands,
     mcp_commands,
+    view_commands,
 ):
     module.register(app)
 

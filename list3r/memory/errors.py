@@ -70,6 +70,7 @@ EXTRA_OF_PACKAGE = {
     "rosbags": "ros",
     "open3d": "open3d",
     "mcp": "mcp",
+    "viser": "view",
     "transformers": "models",
     "huggingface_hub": "models",
     "safetensors": "models",

@@ -32,10 +32,12 @@ _PACKAGES = (
     ("huggingface_hub", "fetching weights"),
     ("safetensors", "reading weights"),
     ("ncnn", "labels by a box detector"),
+    ("viser", "the viewer (view)"),
     ("mcp", "agents (mcp)"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
 _OPTIONAL = {
+    "viser",
     "mcp",
     "torch",
     "pycolmap",

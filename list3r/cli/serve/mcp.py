@@ -32,12 +32,8 @@ def mcp(
     Example: list3r mcp house.l3r --http
     """
     from list3r.api import open as open_scene
-    from list3r.memory.errors import OptionError
+    from list3r.server.app import HttpSettings, serve_http, serve_stdio
 
-    try:
-        from list3r.server.app import HttpSettings, serve_http, serve_stdio
-    except ModuleNotFoundError as error:
-        raise OptionError(f"`list3r mcp` needs the package {error.name}; pip install 'list3r[mcp]'") from error
     with open_scene(memory, writable=write) as scene:
         if not http:
             serve_stdio(scene)

@@ -1,0 +1,41 @@
+"""view: a memory in the browser."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from list3r.cli.common import MemoryArgument, note
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("view")(view)
+
+
+def view(
+    memory: MemoryArgument,
+    port: Annotated[int, typer.Option("--port", help="Port on this machine; the next free one if taken.")] = 8741,
+    write: Annotated[bool, typer.Option("--write", help="Also edits; keeps other writers out.")] = False,
+    browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
+) -> None:
+    """Show a memory in the browser: points, boxes, names, the camera's path; click, search, measure, go back in time.
+
+    Example: list3r view house.l3r
+    """
+    from list3r.api import open as open_scene
+    from list3r.memory.errors import OptionError
+
+    if not 0 < port <= 65535:
+        raise OptionError(f"--port {port} must lie between 1 and 65535")
+    from list3r.viewer.app import Viewer, ViewerSettings, serve
+
+    with open_scene(memory, writable=write) as scene:
+        viewer = Viewer(scene, ViewerSettings(port))
+        note(f"{viewer.address}  (Ctrl-C ends it)")
+        if browser:
+            import webbrowser
+
+            webbrowser.open(viewer.address)
+        serve(viewer)

@@ -1,0 +1,260 @@
+"""The viewer of a memory in a browser."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from list3r.api import SceneMemory
+from list3r.api import open as open_scene
+from list3r.memory.errors import List3rError
+from list3r.viewer.layers import Layers, LayerSettings, unit_of
+from list3r.viewer.link import ViewState
+from list3r.viewer.panel import Panel
+from list3r.viewer.serving import HOST, quiet, start_server
+from list3r.viewer.told import described
+from list3r.viewer.world import ShownWorld, pick, read_path, read_world
+
+_PICTURE_PX = 200
+"""Small crops are enlarged to about this width."""
+_MOVED_SHARE = 0.1
+"""The camera must move by this share of its distance to what it looks at before detail is drawn anew."""
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """How a memory is shown."""
+
+    port: int = 8741
+    """The next free one where it is taken."""
+    layers: LayerSettings = field(default_factory=LayerSettings)
+
+
+class Viewer:
+    """One memory in the browsers of this machine; all pages show the same."""
+
+    def __init__(self, memory: SceneMemory, settings: ViewerSettings | None = None) -> None:
+        self.memory, self.settings = memory, settings or ViewerSettings()
+        self._lock = threading.RLock()
+        self._asked: list[ViewState] = []
+        self._measuring: list[tuple[int, NDArray[np.float64]]] | None = None
+        self._detail_at: NDArray[np.float64] | None = None
+        self.state = ViewState()
+        self.path = read_path(memory)
+        self.world = self._read()
+        self.server = start_server(self.settings.port, f"list3r {memory.path.name}", self._page_opened)
+        self._layers = Layers(self.server, self.settings.layers)
+        self.server.scene.set_up_direction("+z")
+        self._usual_view()
+        self.panel = Panel(self.server, self)
+        self.server.scene.on_click()(self._clicked)
+        self.server.on_client_connect(self._connected)
+        self.draw()
+
+    @property
+    def address(self) -> str:
+        """Where the viewer is."""
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """End the server."""
+        with quiet():
+            self.server.stop()
+
+    # ------------------------------------------------------------------ what is shown
+
+    def _read(self) -> ShownWorld:
+        session = self.state.session
+        sessions = [s.session_id for s in self.memory.sessions()]
+        if session is None or not sessions or session >= sessions[-1]:
+            return read_world(self.memory, self.memory.changes())
+        with open_scene(self.memory.path, at=session) as before:
+            told = [c for c in self.memory.changes() if c.event.session_id == session]
+            return read_world(before, told)
+
+    def show(self, **changed: Any) -> None:
+        """Change what is shown: fields of `ViewState`."""
+        with self._lock:
+            before, self.state = self.state, replace(self.state, **changed)
+            if before.session != self.state.session:
+                self.world = self._read()
+            if self.state.selected not in self.world.instances:
+                self.state = replace(self.state, selected=None)
+            if before != self.state:
+                self.draw()
+                self.panel.follow(self.state)
+
+    def reload(self) -> None:
+        """Read the memory anew, after an edit."""
+        with self._lock:
+            self.world = self._read()
+            if self.state.selected not in self.world.instances:
+                self.state = replace(self.state, selected=None)
+            self.draw()
+
+    def draw(self) -> None:
+        """Draw everything and say what is selected."""
+        with self._lock, self.server.atomic():
+            s, world, unit = self.state, self.world, unit_of(self.world)
+            self._layers.points(world, s.colors, s.selected, structure=s.structure, visible=s.points)
+            self._layers.boxes(world, s.colors, s.selected, structure=s.structure, visible=s.boxes)
+            self._layers.labels(world, s.selected, visible=s.labels)
+            self._layers.path(self.path, s.session, visible=s.path, unit=unit)
+            self._layers.changes(world, visible=s.colors == "changes")
+            self._layers.clear("relations")
+            self._detail_at = None
+            if s.selected is not None:
+                self._tell(s.selected)
+            else:
+                self.panel.tell("Click a thing, or search for one.", None)
+        self.server.gui.configure_theme(dark_mode=self.state.dark, show_share_button=False, show_logo=False)
+
+    def _tell(self, instance_id: int) -> None:
+        relations = list(self.memory.relations(subject=instance_id))
+        self._layers.relations(self.world, instance_id, relations)
+        try:
+            picture = _enlarged(self.memory.picture(instance_id).crop())
+        except List3rError:
+            picture = None
+        self.panel.tell(described(self.memory, self.world, instance_id, relations), picture)
+
+    # ------------------------------------------------------------------ what a user does
+
+    def find(self, text: str) -> list[int]:
+        """Search, select the best answer and look at it; the ids that answer. The panel says what was not found."""
+        found = self.memory.find(text, 10)
+        ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
+        self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join(found.notes))
+        if ids:
+            self.select(ids[0], look=True)
+        return ids
+
+    def select(self, instance_id: int | None, *, look: bool = False) -> None:
+        """Select an instance, and turn all cameras to it where `look`."""
+        self.show(selected=instance_id)
+        if look and instance_id in self.world.instances and instance_id is not None:
+            i = self.world.instances[instance_id]
+            reach = max(float(np.linalg.norm(i.box.size)), 0.1)
+            for client in self.server.get_clients().values():
+                away = client.camera.position - client.camera.look_at
+                away = away / max(float(np.linalg.norm(away)), 1e-9)
+                client.camera.look_at = i.center
+                client.camera.position = i.center + 3.0 * reach * away
+
+    def measure(self) -> None:
+        """Measure between the next two clicks."""
+        with self._lock:
+            self._measuring = []
+            self._layers.measured([], "")
+            self.panel.say("Click two places.")
+
+    def at_time(self, k: int) -> None:
+        """Show the camera of the k-th posed frame, with its picture where the memory keeps one."""
+        with self._lock:
+            near = [p for p in self.panel.pictures if p.session_id == self.path.session[k]]
+            picture = min(near, key=lambda p: abs(p.frame_index - self.path.frame[k]), default=None)
+            rgb = None if picture is None else self.memory.pixels(picture)[::2, ::2]
+            camera = self.memory.camera(frame=int(self.path.frame[k]), session=int(self.path.session[k]))
+            height, width = camera.image_size
+            self._layers.camera(self.path, k, rgb, (camera.intrinsics[1], width, height), unit_of(self.world))
+
+    def edit(self, change: Callable[[], Any]) -> None:
+        """Run one edit and show what it did, or why it was refused."""
+        try:
+            report = change()
+        except List3rError as error:
+            self.panel.say(f"Refused: {error}")
+            return
+        self.reload()
+        self.panel.say(report.text)
+        if report.ids and report.ids[0] in self.world.instances:
+            self.select(report.ids[0])
+
+    def link(self, client: viser.ClientHandle | None) -> str:
+        """Return the address that restores the view of a page."""
+        told = [f"view={self.state.encode()}"]
+        if client is not None:
+            for name, place in (("Position", client.camera.position), ("LookAt", client.camera.look_at)):
+                told.append(f"initialCamera{name}={','.join(f'{v:.3f}' for v in place)}")
+        return f"{self.address}/?{'&'.join(told)}"
+
+    # ------------------------------------------------------------------ events
+
+    def _page_opened(self, code: str) -> None:
+        self._asked.append(ViewState.decode(code))
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        if self._asked:
+            self.show(**vars(self._asked.pop()))
+        client.camera.on_update(self._camera_moved)
+
+    def _camera_moved(self, camera: viser.CameraHandle) -> None:
+        with self._lock:
+            place = np.asarray(camera.position, np.float64)
+            reach = float(np.linalg.norm(place - np.asarray(camera.look_at)))
+            far = self._detail_at is None or np.linalg.norm(place - self._detail_at) > _MOVED_SHARE * reach
+            if far and self.state.points:
+                self._detail_at = place
+                self._layers.detail(self.world, self.state.colors, self.state.selected, place)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64)
+        with self._lock:
+            met = pick(self.world, self._layers.shown, origin, direction / np.linalg.norm(direction))
+        if self._measuring is None:
+            self.select(None if met is None else met[0])
+        elif met is not None:
+            self._measuring.append(met)
+            self._measured(self._measuring)
+
+    def _measured(self, picked: list[tuple[int, NDArray[np.float64]]]) -> None:
+        if len(picked) < 2:
+            self._layers.measured([picked[0][1]], "from here")
+            return
+        (a, start), (b, end) = picked
+        units, away = self.memory.units, float(np.linalg.norm(end - start))
+        text = f"{away:.3f} {units}"
+        self._layers.measured([start, end], text)
+        self._measuring = None
+        if a != b:
+            try:
+                gap = self.memory.measure(a, b).gap
+                text += f" between the places, {gap:.3f} {units} between the surfaces of {a} and {b}"
+            except List3rError as error:
+                text += f"; {error}"
+        self.panel.say(text)
+
+    def _usual_view(self) -> None:
+        corners = np.array([i.aabb for i in self.world.instances.values()]).reshape(-1, 3)
+        low, high = (corners.min(axis=0), corners.max(axis=0)) if len(corners) else (-np.ones(3), np.ones(3))
+        middle, reach = (low + high) / 2, float(np.linalg.norm(high - low))
+        self.server.initial_camera.look_at = middle
+        self.server.initial_camera.position = middle + reach * np.array([-0.2, -0.4, 0.5])
+        self.server.initial_camera.up = (0.0, 0.0, 1.0)
+
+
+def _enlarged(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture at least as wide as the panel, for small crops."""
+    from PIL import Image
+
+    zoom = max(1, round(_PICTURE_PX / rgb.shape[1]))
+    image = Image.fromarray(np.ascontiguousarray(rgb))
+    return np.asarray(image.resize((image.width * zoom, image.height * zoom), Image.Resampling.BICUBIC))
+
+
+def serve(viewer: Viewer) -> None:
+    """Keep a viewer running until it is interrupted."""
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.stop()

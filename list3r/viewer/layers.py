@@ -1,0 +1,225 @@
+"""What stands in the 3D scene: points, boxes, labels, path, and lines of the selected instance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
+from list3r.memory.records import Instance, Relation
+from list3r.viewer.world import CHANGE_COLORS, CameraPath, Cloud, ShownWorld, close_by, color_of, colors, overview
+
+_EDGES = np.array([(a, a ^ bit) for a in range(8) for bit in (1, 2, 4) if a < a ^ bit])
+"""Pairs of corners of `OrientedBox.corners` that an edge joins."""
+_INK = (255, 200, 0)
+_MEASURED = (230, 40, 90)
+
+
+@dataclass(frozen=True)
+class LayerSettings:
+    """How much is drawn."""
+
+    overview_points: int = 1_500_000
+    """Points that are always there."""
+    detail_points: int = 1_500_000
+    """Points that come besides near the camera."""
+    most_labels: int = 60
+    """The things seen most have labels."""
+    frustums: int = 40
+
+
+class Layers:
+    """The scene of one server; every layer is drawn anew when what it shows changes."""
+
+    def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
+        self._scene, self._settings = server.scene, settings
+        self._nodes: dict[str, list[Any]] = {}
+        self.shown = Cloud(
+            np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64), np.zeros(0, np.int64)
+        )
+        """The points that can be picked."""
+
+    def clear(self, layer: str) -> None:
+        """Take a layer away."""
+        for node in self._nodes.pop(layer, []):
+            node.remove()
+
+    def points(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
+        """Draw the overview of the points."""
+        cloud = world.cloud
+        solid = {n for n, i in world.instances.items() if structure or i.structure is None}
+        allowed = np.isin(cloud.owner, list(solid))
+        cloud = cloud.part(allowed)
+        self.shown = (
+            cloud.part(overview(cloud, self._settings.overview_points))
+            if visible
+            else cloud.part(np.zeros(len(cloud.points), bool))
+        )
+        self._draw_cloud("points", world, self.shown, mode, selected)
+        self.clear("detail")
+
+    def detail(self, world: ShownWorld, mode: str, selected: int | None, place: NDArray[np.float64]) -> None:
+        """Draw the points that the overview leaves out of the instances near a place; structure is not among them."""
+        hidden = ~overview(world.cloud, self._settings.overview_points)
+        solid = [n for n, i in world.instances.items() if i.structure is None]
+        hidden &= np.isin(world.cloud.owner, solid)
+        if hidden.any():
+            chosen = close_by(world, hidden, place, self._settings.detail_points)
+            self._draw_cloud("detail", world, world.cloud.part(chosen), mode, selected)
+
+    def _draw_cloud(self, layer: str, world: ShownWorld, cloud: Cloud, mode: str, selected: int | None) -> None:
+        self.clear(layer)
+        if not len(cloud.points):
+            return
+        middle = cloud.points.mean(axis=0)
+        node = self._scene.add_point_cloud(
+            f"/{layer}",
+            cloud.points - middle,
+            colors(world, cloud, mode, selected),
+            point_size=0.012 * unit_of(world),
+            point_shape="circle",
+            position=middle.astype(np.float64),
+        )
+        self._nodes[layer] = [node]
+
+    def boxes(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
+        """Draw the oriented boxes; only that of the selected instance unless all are visible."""
+        self.clear("boxes")
+        things = [
+            i for i in world.instances.values() if i.id == selected or (visible and (structure or i.structure is None))
+        ]
+        if things:
+            ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in things]
+            node = _box_lines(self._scene, "/boxes", [i.box for i in things], ink, 1.5)
+            self._nodes["boxes"] = [node]
+
+    def labels(self, world: ShownWorld, selected: int | None, *, visible: bool) -> None:
+        """Draw the names of the things seen most, and of the selected one."""
+        self.clear("labels")
+        things = sorted((i for i in world.instances.values() if i.structure is None), key=lambda i: -i.observations)
+        chosen = things[: self._settings.most_labels] if visible else []
+        if selected in world.instances and all(i.id != selected for i in chosen):
+            chosen = [*chosen, world.instances[selected]] if selected is not None else chosen
+        self._nodes["labels"] = [
+            self._scene.add_label(
+                f"/labels/{i.id}", f"{i.id} {world.name(i.id)}", position=_top(i), anchor="bottom-center",
+                font_screen_scale=1.2 if i.id == selected else 0.6,
+            )
+            for i in chosen
+        ]  # fmt: skip
+
+    def path(self, path: CameraPath, session: int | None, *, visible: bool, unit: float) -> None:
+        """Draw the camera's path, through gaps broken, with frustums."""
+        self.clear("path")
+        keep = np.ones(len(path.session), bool) if session is None else path.session <= session
+        place, rotation, number = path.position[keep], path.rotation[keep], path.session[keep]
+        if not visible or len(place) < 2:
+            return
+        lines = np.stack([place[:-1], place[1:]], axis=1)
+        joined = (number[:-1] == number[1:]) & (np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) < 1.0 * unit)
+        nodes: list[Any] = [
+            self._scene.add_line_segments(
+                "/path/line", lines[joined].astype(np.float32), (60, 120, 220), thickness=2.0, thickness_units="screen"
+            )
+        ]
+        for k in range(0, len(place), max(1, len(place) // self._settings.frustums)):
+            nodes.append(
+                self._scene.add_camera_frustum(
+                    f"/path/{k}", fov=0.8, aspect=4 / 3, scale=0.08 * unit, color=(60, 120, 220),
+                    wxyz=quat_wxyz_from_rotation(rotation[k]), position=place[k],
+                )
+            )  # fmt: skip
+        self._nodes["path"] = nodes
+
+    def camera(
+        self, path: CameraPath, k: int, rgb: NDArray[np.uint8] | None, intrinsics: tuple[float, ...], unit: float
+    ) -> None:
+        """Draw the camera of one frame, with its picture where that is stored. `intrinsics`: fy, width, height."""
+        self.clear("camera")
+        fy, width, height = intrinsics
+        self._nodes["camera"] = [
+            self._scene.add_camera_frustum(
+                "/camera", fov=2 * float(np.arctan2(height / 2, fy)), aspect=width / height, scale=0.25 * unit,
+                color=_INK, image=rgb, wxyz=quat_wxyz_from_rotation(path.rotation[k]), position=path.position[k],
+            )
+        ]  # fmt: skip
+
+    def relations(self, world: ShownWorld, selected: int, relations: Sequence[Relation]) -> None:
+        """Draw lines from the selected instance to those it is related to, with what relates them."""
+        self.clear("relations")
+        start = world.instances[selected].center
+        words: dict[int, list[str]] = {}
+        for r in relations:
+            if r.subject == selected and r.object in world.instances:
+                words.setdefault(r.object, []).append(r.predicate.replace("_", " "))
+        if not words:
+            return
+        ends = np.array([[start, world.instances[n].center] for n in words], np.float32)
+        nodes: list[Any] = [
+            self._scene.add_line_segments("/relations/lines", ends, _INK, thickness=2.0, thickness_units="screen")
+        ]
+        for n, told in words.items():
+            middle = 0.35 * start + 0.65 * world.instances[n].center
+            text = f"{', '.join(told)} {n}"
+            nodes.append(self._scene.add_label(f"/relations/{n}", text, position=middle, font_screen_scale=0.7))
+        self._nodes["relations"] = nodes
+
+    def changes(self, world: ShownWorld, *, visible: bool) -> None:
+        """Draw where things were before: arrows of what moved, boxes of what is gone."""
+        self.clear("changes")
+        if not visible:
+            return
+        nodes: list[Any] = []
+        moved = [c for c in world.changes.values() if c.event.kind == "moved" and c.event.from_box and c.event.to_box]
+        ways = [(c.event.from_box.center, c.event.to_box.center) for c in moved if c.event.from_box and c.event.to_box]
+        if ways:
+            unit = unit_of(world)
+            nodes.append(
+                self._scene.add_arrows(
+                    "/changes/moved", np.array(ways, np.float32), CHANGE_COLORS["moved"], shaft_radius=0.01 * unit,
+                    head_radius=0.03 * unit, head_length=0.06 * unit,
+                )
+            )  # fmt: skip
+        before = [(c.event.from_box, CHANGE_COLORS[c.event.kind]) for c in world.changes.values() if c.event.from_box]
+        if before:
+            boxes, ink = [b for b, _ in before if b is not None], [color for _, color in before]
+            nodes.append(_box_lines(self._scene, "/changes/before", boxes, ink, 1.5))
+        self._nodes["changes"] = nodes
+
+    def measured(self, ends: Sequence[NDArray[np.float64]], text: str) -> None:
+        """Draw a measured line between two places, or a mark at the first of them."""
+        self.clear("measured")
+        if len(ends) == 2:
+            line = np.array([ends], np.float32)
+            self._nodes["measured"] = [
+                self._scene.add_line_segments("/measured/line", line, _MEASURED, thickness=3, thickness_units="screen"),
+                self._scene.add_label("/measured/text", text, position=(ends[0] + ends[1]) / 2),
+            ]
+        elif ends:
+            self._nodes["measured"] = [self._scene.add_label("/measured/text", text, position=ends[0])]
+
+
+def unit_of(world: ShownWorld) -> float:
+    """Return what a metre is about in world units: 1 where things lie apart as in a home, else a fifth of how far."""
+    centers = np.array([i.center for i in world.instances.values()]).reshape(-1, 3)
+    extent = float(np.ptp(centers, axis=0).max()) if len(centers) > 1 else 5.0
+    return 1.0 if 1.0 < extent < 100.0 else max(extent, 1e-9) / 5.0
+
+
+def _top(instance: Instance) -> NDArray[np.float64]:
+    return np.array([*instance.center[:2], instance.aabb[1, 2]])
+
+
+def _box_lines(
+    scene: Any, name: str, boxes: Sequence[OrientedBox], ink: Iterable[tuple[int, int, int]], width: float
+) -> Any:
+    lines = np.concatenate([b.corners()[_EDGES] for b in boxes]).astype(np.float32)
+    shades = np.repeat(np.array(list(ink), np.uint8), len(_EDGES), axis=0)
+    return scene.add_line_segments(
+        name, lines, np.repeat(shades[:, None], 2, axis=1), thickness=width, thickness_units="screen"
+    )

@@ -1,0 +1,53 @@
+"""A view as a short code for a link."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from dataclasses import asdict, dataclass, fields
+
+from list3r.viewer.world import COLOR_MODES
+
+_LONGEST = 2000
+
+
+@dataclass(frozen=True)
+class ViewState:
+    """What a link restores, beside the camera."""
+
+    selected: int | None = None
+    colors: str = COLOR_MODES[0]
+    session: int | None = None
+    points: bool = True
+    boxes: bool = True
+    labels: bool = True
+    structure: bool = True
+    path: bool = False
+    dark: bool = False
+
+    def encode(self) -> str:
+        """Return the code."""
+        usual = ViewState()
+        told = {k: v for k, v in asdict(self).items() if v != getattr(usual, k)}
+        return base64.urlsafe_b64encode(json.dumps(told, separators=(",", ":")).encode()).decode().rstrip("=")
+
+    @staticmethod
+    def decode(code: str) -> ViewState:
+        """Return the view of a code; what a code says that makes no sense is as usual."""
+        try:
+            padded = code[:_LONGEST] + "=" * (-len(code[:_LONGEST]) % 4)
+            told = json.loads(base64.urlsafe_b64decode(padded))
+        except (ValueError, binascii.Error):
+            return ViewState()
+        if not isinstance(told, dict):
+            return ViewState()
+        return ViewState(
+            **{f.name: told[f.name] for f in fields(ViewState) if f.name in told and _sound(f.name, told[f.name])}
+        )
+
+
+def _sound(name: str, value: object) -> bool:
+    if name in ("selected", "session"):
+        return isinstance(value, int) and not isinstance(value, bool)
+    return value in COLOR_MODES if name == "colors" else isinstance(value, bool)

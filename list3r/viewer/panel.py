@@ -1,0 +1,196 @@
+"""The panel beside the scene: search, what is selected, layers, sessions and time, measuring, edits, keys."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from list3r.memory.errors import List3rError
+from list3r.viewer.link import ViewState
+from list3r.viewer.world import COLOR_MODES
+
+if TYPE_CHECKING:
+    from list3r.viewer.app import Viewer
+
+_LAYERS = ("points", "boxes", "labels", "structure", "path")
+_KEYS: dict[str, Literal["P", "B", "L", "S", "C", "D", "M", "X", "U"]] = {
+    "points": "P", "boxes": "B", "labels": "L", "structure": "S", "path": "C", "dark": "D", "measure": "M",
+    "deselect": "X", "undo": "U",
+}  # fmt: skip
+_AUTHOR = "viewer"
+_NOTHING = "-"
+_BLANK = np.full((8, 8, 3), 245, np.uint8)
+
+
+class Panel:
+    """Controls of one viewer."""
+
+    def __init__(self, server: viser.ViserServer, viewer: Viewer) -> None:
+        self._gui, self._viewer = server.gui, viewer
+        self._following = False
+        self._answers: dict[str, int] = {}
+        self.pictures = viewer.memory.pictures()
+        self._gui.set_panel_label(viewer.memory.path.name)
+        self._search()
+        self._picture = self._gui.add_image(_BLANK, visible=False)
+        self._text = self._gui.add_markdown("")
+        self._said = self._gui.add_markdown("", visible=False)
+        self._layers()
+        self._times()
+        if viewer.memory.writable:
+            self._edits()
+        self._view()
+
+    # ------------------------------------------------------------------ what is told
+
+    def tell(self, text: str, picture: NDArray[np.uint8] | None) -> None:
+        """Say what is selected."""
+        self._text.content = text
+        self._picture.visible = picture is not None
+        if picture is not None:
+            self._picture.image = picture
+
+    def say(self, text: str) -> None:
+        """Say what was done, or why not."""
+        self._said.content, self._said.visible = text, bool(text)
+
+    def found(self, ids: list[int], names: list[str], notes: str) -> None:
+        """Offer the answers of a search."""
+        self._answers = dict(zip(names, ids, strict=True))
+        self._choice.options = names or [_NOTHING]
+        self._choice.visible = len(names) > 1
+        self.say(notes if ids else f"Nothing found. {notes}")
+
+    def follow(self, state: ViewState) -> None:
+        """Set the controls to what is shown."""
+        self._following = True
+        try:
+            for name, box in self._boxes.items():
+                box.value = getattr(state, name)
+            self._colors.value = state.colors
+            if self._session is not None and state.session is not None:
+                self._session.value = state.session
+        finally:
+            self._following = False
+
+    # ------------------------------------------------------------------ controls
+
+    def _search(self) -> None:
+        text = self._gui.add_text("Find", "", hint="white mug on table; the biggest chair; 12")
+        button = self._gui.add_button("Search")
+        self._choice: Any = self._gui.add_dropdown("Answers", [_NOTHING], visible=False)
+
+        @button.on_click
+        def _(_: object) -> None:
+            try:
+                self._viewer.find(text.value)
+            except List3rError as error:
+                self.say(str(error))
+
+        def choose(_: object) -> None:
+            chosen = self._answers.get(self._choice.value)
+            if chosen is not None and chosen != self._viewer.state.selected:
+                self._viewer.select(chosen, look=True)
+
+        self._choice.on_update(choose)
+
+    def _layers(self) -> None:
+        self._boxes: dict[str, Any] = {}
+        usual = self._viewer.state
+        with self._gui.add_folder("Show"):
+            self._colors: Any = self._gui.add_dropdown("Colours", COLOR_MODES, initial_value=usual.colors)
+            for name in (*_LAYERS, "dark"):
+                self._boxes[name] = self._gui.add_checkbox(name.capitalize(), getattr(usual, name))
+
+        self._colors.on_update(lambda _: self._show(colors=self._colors.value))
+
+        for name, box in self._boxes.items():
+            self._toggle(name, box)
+
+    def _toggle(self, name: str, box: Any) -> None:
+        box.on_update(lambda _: self._show(**{name: bool(box.value)}))
+        command = self._gui.add_command(f"Show or hide: {name}", hotkey=_KEYS[name])
+
+        @command.on_trigger
+        def _(_: object) -> None:
+            self._viewer.show(**{name: not getattr(self._viewer.state, name)})
+
+    def _show(self, **changed: Any) -> None:
+        if not self._following:
+            self._viewer.show(**changed)
+
+    def _times(self) -> None:
+        sessions = [s.session_id for s in self._viewer.memory.sessions()]
+        self._session: Any = None
+        with self._gui.add_folder("Time"):
+            if len(sessions) > 1:
+                self._session = self._gui.add_slider("After session", sessions[0], sessions[-1], 1, sessions[-1])
+                self._session.on_update(lambda _: self._show(session=int(self._session.value)))
+
+            count = len(self._viewer.path.frame)
+            if count > 1:
+                time = self._gui.add_slider("Frame", 0, count - 1, 1, 0)
+
+                @time.on_update
+                def _(_: object) -> None:
+                    self._viewer.at_time(int(time.value))
+
+    def _edits(self) -> None:
+        memory, viewer = self._viewer.memory, self._viewer
+        with self._gui.add_folder("Edit"):
+            text = self._gui.add_text("Name", "")
+            name = self._gui.add_button("Name it")
+            other = self._gui.add_number("Other id", 0, min=0, step=1)
+            merge = self._gui.add_button("Merge with the other")
+            split = self._gui.add_button("Split")
+            delete = self._gui.add_button("Delete", color="red")
+            undo = self._gui.add_button("Undo the last edit")
+
+        @name.on_click
+        def _(_: object) -> None:
+            self._edit(lambda n: memory.label(n, text.value or None, author=_AUTHOR))
+
+        @merge.on_click
+        def _(_: object) -> None:
+            self._edit(lambda n: memory.merge(n, int(other.value), author=_AUTHOR))
+
+        @split.on_click
+        def _(_: object) -> None:
+            self._edit(lambda n: memory.split(n, author=_AUTHOR))
+
+        @delete.on_click
+        def _(_: object) -> None:
+            self._edit(lambda n: memory.delete(n, author=_AUTHOR))
+
+        def take_back(_: object) -> None:
+            viewer.edit(lambda: memory.undo(author=_AUTHOR))
+
+        undo.on_click(take_back)
+        self._gui.add_command("Undo the last edit", hotkey=_KEYS["undo"]).on_trigger(take_back)
+
+    def _edit(self, change: Any) -> None:
+        selected = self._viewer.state.selected
+        if selected is None:
+            self.say("Select a thing first.")
+        else:
+            self._viewer.edit(lambda: change(selected))
+
+    def _view(self) -> None:
+        with self._gui.add_folder("View"):
+            measure = self._gui.add_button("Measure between two clicks")
+            link = self._gui.add_button("Link to this view")
+            address: Any = self._gui.add_text("Link", "", visible=False)
+        measure.on_click(lambda _: self._viewer.measure())
+        self._gui.add_command("Measure between two clicks", hotkey=_KEYS["measure"]).on_trigger(
+            lambda _: self._viewer.measure()
+        )
+        self._gui.add_command("Select nothing", hotkey=_KEYS["deselect"]).on_trigger(
+            lambda _: self._viewer.select(None)
+        )
+
+        @link.on_click
+        def _(event: viser.GuiEvent[Any]) -> None:
+            address.value, address.visible = self._viewer.link(event.client), True

@@ -1,0 +1,281 @@
+"""The viewer: what it shows and picks, links, who may connect, and the page itself in a headless browser."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import list3r
+from list3r.cli.app import run
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.store.store import Store
+from tests.conftest import small_picture, write_small_room
+from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
+
+pytest.importorskip("viser")
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from list3r.viewer.app import Viewer, ViewerSettings
+from list3r.viewer.layers import LayerSettings
+from list3r.viewer.link import ViewState
+from list3r.viewer.world import COLOR_MODES, Cloud, close_by, color_of, colors, overview, pick, read_path, read_world
+from tests.browser import PROGRAM, Browser
+
+FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
+
+
+def write_room(path: Path) -> Path:
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store, small_picture())
+    return path
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_room(tmp_path_factory.mktemp("viewer") / "room.l3r")
+
+
+@pytest.fixture(scope="module")
+def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table on which the red box is moved and the blue one taken away between two sessions."""
+    path = tmp_path_factory.mktemp("viewer") / "two.l3r"
+    moved = replace(ROOM["red"], center=(-0.2, 0.25, 0.81))
+    later: dict[str, Box] = {k: v for k, v in ROOM.items() if k != "blue"} | {"red": moved}
+    with Store.create(path) as store:
+        for seen, start in ((ROOM, 0.4), (later, 1.0)):
+            with store.transaction():
+                add_session(store, seen, cameras((0.0, 0.0, 0.8), start))
+                place_together(store)
+                consolidate(store)
+    return path
+
+
+# ---------------------------------------------------------------------------------------------- what is shown
+
+
+def cloud_of(counts: list[int]) -> Cloud:
+    owner = np.repeat(np.arange(len(counts)), counts)
+    rank = np.concatenate([np.arange(n) for n in counts]) if counts else np.zeros(0, int)
+    return Cloud(np.zeros((len(owner), 3), np.float32), np.zeros((len(owner), 3), np.uint8), owner, rank)
+
+
+@given(st.lists(st.integers(1, 200), min_size=1, max_size=12), st.integers(1, 500))
+def test_the_overview_keeps_its_bound_and_small_things(counts: list[int], most: int) -> None:
+    kept = overview(cloud_of(counts), most)
+    of_each = [int(kept[np.repeat(np.arange(len(counts)), counts) == n].sum()) for n in range(len(counts))]
+    assert kept.sum() <= max(most, 0) + len(counts)
+    if sum(counts) <= most:
+        assert kept.all()
+    shares = [k / n for k, n in zip(of_each, counts, strict=True)]
+    order = np.argsort(counts)
+    assert all(shares[a] >= shares[b] - 1 / counts[a] - 1 / counts[b] for a, b in itertools.pairwise(order))
+
+
+def test_what_is_near_comes_in_full(room: Path) -> None:
+    with list3r.open(room) as memory:
+        world = read_world(memory, [])
+    hidden = ~overview(world.cloud, 600)
+    chosen = close_by(world, hidden, np.array([2.0, 1.0, 0.5]), 500)
+    assert set(world.cloud.owner[chosen].tolist()) >= {CHAIR} and chosen.sum() <= 500
+    assert not (chosen & ~hidden).any()
+
+
+def test_a_ray_meets_what_is_first(room: Path) -> None:
+    with list3r.open(room) as memory:
+        world = read_world(memory, [])
+    above_mug = np.array([1.8, 0.1, 3.0])
+    met = pick(world, world.cloud, above_mug, np.array([0.0, 0.0, -1.0]))
+    assert met is not None and met[0] == MUG and met[1][2] == pytest.approx(0.82, abs=0.02)
+    bare = pick(world, world.cloud.part(np.zeros(len(world.cloud.owner), bool)), above_mug, np.array([0.0, 0.0, -1.0]))
+    assert bare is not None and bare[0] == MUG and bare[1][2] == pytest.approx(0.82)
+    assert pick(world, world.cloud, above_mug, np.array([0.0, 0.0, 1.0])) is None
+
+
+def test_colours_are_those_of_the_mode(two_sessions: Path) -> None:
+    with list3r.open(two_sessions) as memory:
+        told = memory.changes()
+        world = read_world(memory, told)
+        assert {c.event.kind for c in told} == {"moved", "removed"}
+    moved = next(c.instance.id for c in told if c.event.kind == "moved")
+    assert color_of(world, moved, "changes") != color_of(world, moved, "instance")
+    own = colors(world, world.cloud, "own colour", None)
+    assert (own == world.cloud.rgb).all()
+    chosen = colors(world, world.cloud, "own colour", moved)
+    assert ((chosen != own).any(axis=1) <= (world.cloud.owner == moved)).all() and (chosen != own).any()
+
+
+def test_the_path_is_that_of_the_camera(room: Path) -> None:
+    with list3r.open(room) as memory:
+        path = read_path(memory)
+    assert len(path.frame) == 20 and np.allclose(np.diff(path.position[:, 1]), 0.01)
+
+
+# ---------------------------------------------------------------------------------------------- links
+
+views = st.builds(
+    ViewState, selected=st.none() | st.integers(0, 10**9),
+    colors=st.sampled_from(COLOR_MODES), session=st.none() | st.integers(1, 99), labels=st.booleans(),
+    dark=st.booleans(), path=st.booleans(),
+)  # fmt: skip
+
+
+@given(views)
+def test_a_code_gives_back_its_view(view: ViewState) -> None:
+    assert ViewState.decode(view.encode()) == view
+
+
+@given(st.text(max_size=80))
+def test_any_code_gives_some_view(code: str) -> None:
+    assert isinstance(ViewState.decode(code), ViewState)
+
+
+def test_what_makes_no_sense_in_a_code_is_as_usual() -> None:
+    import base64
+
+    code = base64.urlsafe_b64encode(b'{"colors": "loud", "selected": "x", "dark": true, "what": [1, 2]}').decode()
+    assert ViewState.decode(code) == ViewState(dark=True)
+
+
+# ---------------------------------------------------------------------------------------------- the server
+
+
+@pytest.fixture
+def viewer(room: Path) -> Iterator[Viewer]:
+    with list3r.open(room) as memory:
+        shown = Viewer(memory, ViewerSettings(0))
+        yield shown
+        shown.stop()
+
+
+def test_pages_of_other_sites_are_not_answered(viewer: Viewer) -> None:
+    address = viewer.address.replace("http", "ws")
+    for origin in ("https://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null"):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(address, origin=origin)
+        assert refused.value.response.status_code == 403
+    with pytest.raises(InvalidStatus):
+        connect(address)
+
+
+def test_search_select_and_measure_without_a_page(viewer: Viewer) -> None:
+    assert viewer.find("mug on table") == [MUG, TWIN] and viewer.state.selected == MUG
+    assert viewer.find("elephant") == [] and viewer.state.selected == MUG
+    viewer.show(selected=12345)
+    assert viewer.state.selected is None
+    assert ViewState.decode(viewer.link(None).split("view=")[1]) == viewer.state
+
+
+def test_the_program_says_what_is_wrong(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["view", str(room), "--port", "0"]) == 2
+    assert run(["view", str(room.with_name("absent.l3r"))]) == 2
+    assert "absent.l3r" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------------------------------- the page
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if PROGRAM is None:
+        pytest.skip("there is no Chromium")
+    opened = Browser(tmp_path_factory.mktemp("browser"))
+    yield opened
+    opened.close()
+
+
+def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path: Path) -> None:
+    path = write_room(tmp_path / "room.l3r")
+    with list3r.open(path, writable=True) as memory:
+        viewer = Viewer(memory, ViewerSettings(0, LayerSettings(overview_points=1000)))
+        try:
+            browser.open(viewer.address)
+            browser.says("Click a thing, or search for one.")
+            browser.fill("Find", "mug")
+            browser.wait(lambda: browser.run("[...document.querySelectorAll('input')].some(i => i.value === 'mug')"))
+            browser.press("Search")
+            browser.says("3 mug")
+            browser.says("on 2 table")
+            browser.wait(lambda: browser.run("[...document.querySelectorAll('img')].some(i => i.naturalWidth > 200)"))
+            browser.fill("Name", "blue <b>cup</b>")
+            browser.press("Name it")
+            browser.says("3 blue <b>cup</b>")
+            assert memory.instance(MUG).label == "blue <b>cup</b>"
+            browser.key("d")
+            browser.wait(lambda: viewer.state.dark)
+            browser.wait(lambda: float(browser.picture()[700:780, 20:200].mean()) < 90)
+            browser.press("Link to this view")
+            found = "([...document.querySelectorAll('input')].find(i => i.value.includes('?view=')) || {}).value"
+            browser.wait(lambda: browser.run(found))
+            link = str(browser.run(found))
+            (client,) = viewer.server.get_clients().values()
+            place = np.array(client.camera.position)
+            viewer.show(dark=False, selected=None)
+            browser.open("about:blank")
+            browser.wait(lambda: not viewer.server.get_clients())
+            browser.open(link)
+            browser.says("3 blue <b>cup</b>")
+            assert viewer.state.dark and viewer.state.selected == MUG
+            (client,) = viewer.server.get_clients().values()
+            browser.wait(lambda: np.allclose(client.camera.position, place, atol=0.02))
+            assert browser.errors == []
+        finally:
+            viewer.stop()
+    with list3r.open(path) as memory:
+        assert memory.instance(MUG).label == "blue <b>cup</b>"
+
+
+def test_a_click_on_a_thing_selects_it(browser: Browser, room: Path) -> None:
+    with list3r.open(room) as memory:
+        viewer = Viewer(memory, ViewerSettings(0))
+        try:
+            browser.open(viewer.address)
+            browser.says("Click a thing, or search for one.")
+            browser.wait(viewer.server.get_clients)
+            time.sleep(2.0)  # the page sets its first camera after it has connected
+            viewer.select(CHAIR, look=True)
+            browser.says("5 chair")
+            viewer.select(None)
+            browser.says("Click a thing, or search for one.")
+            browser.wait(lambda: _selects(browser, viewer))
+            assert viewer.state.selected == CHAIR
+        finally:
+            viewer.stop()
+
+
+def _selects(browser: Browser, viewer: Viewer) -> bool:
+    browser.click(640, browser.run("window.innerHeight") / 2)
+    browser.run("new Promise(r => setTimeout(r, 500))")
+    return viewer.state.selected is not None
+
+
+def test_the_slider_goes_back_in_time(browser: Browser, two_sessions: Path) -> None:
+    with list3r.open(two_sessions) as memory:
+        viewer = Viewer(memory, ViewerSettings(0))
+        try:
+            blue = next(c.instance.id for c in memory.changes() if c.event.kind == "removed")
+            assert blue not in viewer.world.instances
+            browser.open(viewer.address)
+            browser.says("After session")
+            before = viewer.world
+            browser.run(
+                "(() => { const s = document.querySelector('[role=slider]'); s.focus(); s.dispatchEvent("
+                "new KeyboardEvent('keydown', {key: 'ArrowLeft', code: 'ArrowLeft', bubbles: true})); })()"
+            )
+            browser.wait(lambda: viewer.state.session == 1)
+            browser.wait(lambda: viewer.world is not before)
+            assert blue in viewer.world.instances
+            viewer.show(colors="changes", session=2)
+            viewer.at_time(3)
+            browser.wait(lambda: browser.picture().std() > 10)
+            assert browser.errors == []
+        finally:
+            viewer.stop()
