@@ -16,7 +16,9 @@ from list3r.exporters.palette import instance_color
 from list3r.exporters.plan.frame import PlanFrame, choose_rotation
 from list3r.exporters.plan.labels import TagTarget, place_tags
 from list3r.exporters.plan.layout import PlanSettings, choose_layout
-from list3r.exporters.plan.picture import _plain, _round_length, plan_image, write_plan
+from list3r.exporters.plan.margins import round_length
+from list3r.exporters.plan.picture import plan_image, write_plan
+from list3r.exporters.plan.sheet import plain_text
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from tests.test_exporters import write_split_memory
@@ -88,12 +90,12 @@ def test_a_tag_on_a_large_thing_is_on_it() -> None:
     assert place == (500.0, 500.0)
 
 
-def test_round_lengths() -> None:
-    assert [_round_length(v) for v in (0.9, 1.0, 4.9, 7.0, 23.0)] == pytest.approx([0.5, 1.0, 2.0, 5.0, 20.0])
+def testround_lengths() -> None:
+    assert [round_length(v) for v in (0.9, 1.0, 4.9, 7.0, 23.0)] == pytest.approx([0.5, 1.0, 2.0, 5.0, 20.0])
 
 
 def test_letters_that_the_font_lacks_are_replaced() -> None:
-    assert _plain("écran 2 × 3 cm · …") == "ecran 2 ? 3 cm · …"
+    assert plain_text("écran 2 × 3 cm · …") == "ecran 2 ? 3 cm · …"
 
 
 def test_a_wide_scene_has_its_legend_below() -> None:

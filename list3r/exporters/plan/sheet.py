@@ -1,0 +1,112 @@
+"""The page of a plan view while it is drawn: lines, marks, texts and tags."""
+
+from __future__ import annotations
+
+import unicodedata
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial import ConvexHull, QhullError
+
+from list3r.exporters.palette import Color, instance_color
+from list3r.exporters.plan.frame import PlanFrame
+from list3r.exporters.plan.layout import Layout, PlanSettings
+from list3r.memory.records import Instance
+
+INK: Color = (38, 42, 52)
+GREY: Color = (120, 124, 134)
+OVERSAMPLING = 2
+"""Drawn so many times larger and averaged down: Pillow does not smooth its lines."""
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
+
+class Sheet:
+    """The page while it is drawn, at `OVERSAMPLING` times its size."""
+
+    def __init__(self, frame: PlanFrame, layout: Layout, settings: PlanSettings) -> None:
+        self.frame, self.layout, self.settings = frame, layout, settings
+        k = OVERSAMPLING
+        self.left, self.top = settings.margin_px * k, settings.header_px * k
+        self.map_size = frame.size_px
+        self.image = Image.new("RGB", (settings.width_px * k, layout.height_px * k), (255, 255, 255))
+        self.draw = ImageDraw.Draw(self.image, "RGBA")
+        self.tag_font, self.text_font = font_of(13), font_of(14)
+
+    def finish(self) -> Image.Image:
+        """Return the page at its size."""
+        return self.image.reduce(OVERSAMPLING)
+
+    def px(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where world points are on the page, px. Shape (N, 3) -> (N, 2)."""
+        return np.asarray(self.frame.to_px(points_world) + np.array([self.left, self.top]))
+
+    def footprint(self, instance: Instance) -> list[tuple[float, float]]:
+        """Return the outline of an instance on the page, px."""
+        corners = self.px(instance.box.corners())
+        try:
+            corners = corners[ConvexHull(corners).vertices]
+        except (QhullError, ValueError):
+            corners = np.array([corners.min(axis=0), corners.max(axis=0) + 1.0])
+        return [(float(x), float(y)) for x, y in corners]
+
+    def stroke(self, a: NDArray[np.float64], b: NDArray[np.float64], color: Color, width: float) -> None:
+        """Draw a line between two places of the page."""
+        ends = [(float(a[0]), float(a[1])), (float(b[0]), float(b[1]))]
+        self.draw.line(ends, fill=(*color, 210), width=round(width * OVERSAMPLING))
+
+    def mark(self, xy: NDArray[np.float64], color: Color, word: str, *, round_mark: bool) -> None:
+        """Draw a mark with a word beside it."""
+        x, y = (float(v) for v in xy)
+        r = 6 * OVERSAMPLING
+        shape = self.draw.ellipse if round_mark else self.draw.rectangle
+        shape((x - r, y - r, x + r, y + r), fill=color, outline=(255, 255, 255), width=2 * OVERSAMPLING)
+        self.text((x + r * 1.6, y), word, self.text_font, color, anchor="lm", halo=True)
+
+    def text(
+        self,
+        xy: tuple[float, float],
+        text: str,
+        font: Font,
+        color: Color,
+        anchor: str = "la",
+        *,
+        halo: bool = False,
+    ) -> None:
+        """Write a text in the letters of the font."""
+        stroke = 2 * OVERSAMPLING if halo else 0
+        self.draw.text(
+            xy, plain_text(text), fill=color, font=font, anchor=anchor, stroke_width=stroke, stroke_fill=(255, 255, 255)
+        )
+
+    def chip_width(self, instance_id: int) -> float:
+        """Return the width of the tag of an id, px."""
+        return float(self.draw.textlength(str(instance_id), font=self.tag_font)) + 9.0 * OVERSAMPLING
+
+    def chip(self, xy: tuple[float, float], size: tuple[float, float], instance_id: int) -> None:
+        """Draw the tag of an id, its middle at `xy`."""
+        (x, y), (w, h) = xy, (size[0] / 2, size[1] / 2)
+        color = instance_color(instance_id)
+        edge = OVERSAMPLING
+        self.draw.rounded_rectangle(
+            (x - w, y - h, x + w, y + h), radius=h * 0.5, fill=color, outline=(255, 255, 255), width=edge
+        )
+        self.text((x, y), str(instance_id), self.tag_font, _contrast(color), anchor="mm")
+
+
+def font_of(size_px: int) -> Font:
+    return ImageFont.load_default(size_px * OVERSAMPLING)
+
+
+def plain_text(text: str) -> str:
+    """Return the text in the letters that Pillow's own font has."""
+    kept = "".join(c for c in text if c in "·…" or c.isascii())
+    if kept == text:
+        return text
+    return "".join(
+        c if c in "·…" else unicodedata.normalize("NFKD", c).encode("ascii", "ignore").decode() or "?" for c in text
+    )
+
+
+def _contrast(color: Color) -> Color:
+    return (255, 255, 255) if 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] < 165 else INK
