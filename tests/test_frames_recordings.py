@@ -238,7 +238,7 @@ def test_depth_and_poses_are_not_lost_without_a_word(tmp_path: Path) -> None:
 
 def test_arkit_poses_are_flipped_once(tmp_path: Path) -> None:
     T = shots()[2].T_world_cam
-    from list3r.frames.axes import pose_of_arkit
+    from list3r.frames.recordings.axes import pose_of_arkit
 
     assert np.allclose(pose_of_arkit(arkit(T)), T)
     assert not np.allclose(pose_of_arkit(T), T)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_PIXELS, read_file, too_many_pixels
-from list3r.frames.stored import CodedArray, Stored
+from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.memory.errors import FrameError
 
 

@@ -19,9 +19,9 @@ from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_de
 from list3r.frames.exif import exif_focal
 from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
+from list3r.frames.recordings.stored import stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
-from list3r.frames.stored import stored_size
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
-from list3r.frames.stored import CodedArray, Stored
+from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.memory.errors import OptionError, SourceError
 
 MAX_LENGTH_M = 1e6

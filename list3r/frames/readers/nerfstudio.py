@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from list3r.frames.axes import OPENGL_TO_OPENCV
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, natural_key, pose_matrix, read_json
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
+from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
 from list3r.memory.errors import OptionError, SourceError
 
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "")

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.axes import pose_of_arkit
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, pose_matrix, read_json
 from list3r.frames.options import SourceOptions, check_intrinsics
+from list3r.frames.recordings.axes import pose_of_arkit
 from list3r.memory.errors import OptionError, SourceError
 
 LEAST_CONFIDENCE = 127

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.axes import pose_of_arkit, pose_of_quaternion
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_json
 from list3r.frames.options import SourceOptions, check_intrinsics
-from list3r.frames.stored import CodedArray, Stored, ZipMember
+from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
+from list3r.frames.recordings.stored import CodedArray, Stored, ZipMember
 from list3r.memory.errors import OptionError, SourceError
 
 LEAST_CONFIDENCE = 2

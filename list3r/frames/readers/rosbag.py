@@ -20,9 +20,9 @@ from list3r.frames.folder import fingerprint
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
+from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
+from list3r.frames.recordings.ros_transforms import TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
-from list3r.frames.ros_images import camera_of, is_depth, read_color, read_depth
-from list3r.frames.ros_transforms import TransformTree
 from list3r.frames.selection import select
 from list3r.memory.errors import FrameError, OptionError, SourceError
 

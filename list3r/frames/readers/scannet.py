@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, natural_key, pose_matrix, read_numbers
 from list3r.frames.options import Intrinsics, SourceOptions
-from list3r.frames.stored import CodedArray, FileSlice
+from list3r.frames.recordings.stored import CodedArray, FileSlice
 from list3r.memory.errors import SourceError
 
 _VERSION = 4

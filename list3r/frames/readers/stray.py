@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.axes import Z_UP_FROM_Y_UP, pose_of_quaternion
 from list3r.frames.base import BadFrame, Frame, SourceInfo
 from list3r.frames.decode import read_raw_depth
 from list3r.frames.layout import Optics, read_numbers, read_text
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.readers.video import VideoSource
+from list3r.frames.recordings.axes import Z_UP_FROM_Y_UP, pose_of_quaternion
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
 from list3r.memory.errors import FrameError, OptionError, SourceError
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.axes import pose_of_quaternion
 from list3r.frames.readers.tum import poses_at
+from list3r.frames.recordings.axes import pose_of_quaternion
 
 Array = NDArray[np.float64]
 WORLDS = ("map", "world", "odom", "vicon", "mocap")
