@@ -18,7 +18,7 @@ import pytest
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.chunking.borrowing import BorrowSettings, borrow
 from list3r.frames.chunking.chunks import ChunkSpan
-from list3r.frames.picture import small_gray
+from list3r.frames.decoding.picture import small_gray
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama

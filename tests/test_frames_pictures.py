@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from list3r.frames.base import Frame, guessed_camera
-from list3r.frames.exif import exif_focal
+from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.inspection import describe, lines
 from list3r.frames.selection import select, sharpness, working_size
 from list3r.frames.source import SourceOptions, open_source

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera
-from list3r.frames.decode import clean_depth
+from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.registration.reprojection import DepthReprojection, Undistortion
 from list3r.reconstruction.base import backproject
 from tests.frames_scenes import moved, paint

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from list3r.cli.app import run
-from list3r.frames.decode import read_color, read_raw_depth
+from list3r.frames.decoding.decode import read_color, read_raw_depth
 from list3r.frames.files import too_many_pixels
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import FrameError, OptionError

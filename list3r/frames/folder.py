@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
-from list3r.frames.decode import clean_depth, read_color, read_gray, read_raw_depth, used_bits
-from list3r.frames.exif import exif_focal
+from list3r.frames.decoding.decode import clean_depth, read_color, read_gray, read_raw_depth, used_bits
+from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.stored import stored_size

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.edges import MeasuredEdge
 from list3r.frames.base import Camera, Frame
-from list3r.frames.decode import decode_picture
+from list3r.frames.decoding.decode import decode_picture
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.decode import decode_picture
+from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.files import read_file
 from list3r.memory.errors import FrameError, OptionError, SourceError
 from list3r.memory.store.store import Store

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.decode import decode_picture
+from list3r.frames.decoding.decode import decode_picture
 from list3r.memory.errors import OptionError
 from list3r.models.images import HALF, InputShape, network_input
 from list3r.models.pretrained import load_pretrained, pick_device, space_name

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.frames.decode import decode_picture
+from list3r.frames.decoding.decode import decode_picture
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, Keyframe
 

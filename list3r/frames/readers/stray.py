@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.decode import read_raw_depth
+from list3r.frames.decoding.decode import read_raw_depth
 from list3r.frames.layout import Optics, read_numbers, read_text
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.readers.video import VideoSource

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
-from list3r.frames.exif import believable, film_focal
+from list3r.frames.decoding.exif import believable, film_focal
+from list3r.frames.decoding.picture import Upright, small_gray
+from list3r.frames.decoding.stamps import list_stamps, open_container, packets, picture_stream
 from list3r.frames.folder import centred_camera, fingerprint, reduced_note
 from list3r.frames.layout import Optics
 from list3r.frames.options import SourceOptions
-from list3r.frames.picture import Upright, small_gray
 from list3r.frames.registration.rig import Rig, build_rig
 from list3r.frames.selection import select, sharpness
-from list3r.frames.stamps import list_stamps, open_container, packets, picture_stream
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
 _MEASURED_PX, _THUMBNAIL_PX, _LOOKED_AT_PX = 320, 160, 640

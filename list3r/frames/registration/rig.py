@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.frames.decode import clean_depth
+from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.registration.reprojection import DepthReprojection, Undistortion

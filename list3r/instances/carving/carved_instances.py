@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.frames.decode import decode_picture
+from list3r.frames.decoding.decode import decode_picture
 from list3r.instances.carving.carved_surfaces import (
     Bools,
     CarvedSurfaces,
