@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,20 +10,14 @@ from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
+from list3r.queries.find_related import PhraseMatch, PhraseSearch, related
 from list3r.queries.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.grammar import SIZES, SUPERLATIVES, Clause, Phrase, parse
+from list3r.queries.grammar import SIZES, SUPERLATIVES, Phrase, parse
 from list3r.queries.match import Match, Matches, checked_count, checked_instance
-from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of, viewer_from
-from list3r.queries.views.camera import camera_of_frame
-from list3r.queries.views.gather import Gathered, gather
-from list3r.queries.views.surfaces import distance_between
-from list3r.queries.views.viewpoint import VIEWPOINT, between
+from list3r.queries.relations import Place, viewer_from
+from list3r.queries.views.gather import gather
 from list3r.queries.words import STRUCTURE, not_borne
 
-_BY_STRUCTURE_M = 0.4
-"""Largest distance from a wall at which something is near it, metres: the memory stores `near` for things only."""
-_MOST_OBJECTS = 40
-"""Instances that others may be left of, or between: at most so many are considered."""
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
 _ALIKE = 0.1
@@ -47,32 +40,6 @@ class Found(Matches):
         return len(self) > 1 and self[0].score - self[1].score < _EQUAL
 
 
-_Pair = tuple[int, str, float, str]
-"""Subject, predicate, confidence, and where it is seen from, in words."""
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    instance: Instance
-    score: float
-    reasons: tuple[str, ...] = ()
-
-
-@dataclass
-class _Search:
-    """State of one question."""
-
-    store: Store
-    things: dict[int, Instance]
-    vocabulary: dict[int, dict[str, float]]
-    encoder: WordEncoder | None
-    viewpoint: Place | None
-    gathered: Gathered | None
-    """What of a large memory is in `things`; None where it is everything."""
-    notes: list[str] = field(default_factory=list)
-    unknown: list[str] = field(default_factory=list)
-
-
 def find(
     store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> Found:
@@ -93,7 +60,7 @@ def find(
     gathered = gather(store, phrase)
     loaded = store.instances() if gathered is None else store.instances_of(sorted(gathered.ids))
     things = {i.id: i for i in loaded if i.state != "removed"}
-    search = _Search(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
+    search = PhraseSearch(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
     search.notes += [] if gathered is None else gathered.notes
     found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
     matches = [
@@ -109,11 +76,11 @@ def find(
 # ---------------------------------------------------------------------------------------------- phrases
 
 
-def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
+def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
     """Return what a phrase may mean: words, then relations, then size among what is left."""
     if phrase.instance_id is not None:
         i = checked_instance(search.store, phrase.instance_id)
-        found = [_Candidate(i, 1.0, (f"#{i.id}",))]
+        found = [PhraseMatch(i, 1.0, (f"#{i.id}",))]
         if not _bears(search, i.id, phrase.words):
             search.notes.append(f"#{i.id} is not named {' '.join(phrase.words)}")
             found = []
@@ -128,7 +95,8 @@ def _meaning(search: _Search, phrase: Phrase) -> list[_Candidate]:
             if clause.other:
                 _meaning(search, clause.other)
             continue
-        found = _related(search, found, clause, phrase.text)
+        ends = _meaning(search, clause.object), _meaning(search, clause.other) if clause.other else []
+        found = related(search, found, clause, ends, phrase.text)
     if phrase.superlative is not None and found:
         found = _extreme(found, phrase.superlative)
     return found
@@ -139,7 +107,7 @@ def _vocabulary(i: Instance) -> dict[str, float]:
     return vocabulary(i.label, i.structure, i.description, i.color_name)
 
 
-def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
+def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
     unknown = _unknown(search, phrase.words)
     if unknown:
         by_vector = _by_vector(search, phrase)
@@ -158,13 +126,13 @@ def _named(search: _Search, phrase: Phrase) -> list[_Candidate]:
         if (i.structure is None or structure) and _bears(search, n, phrase.words):
             score = float(np.mean([search.vocabulary[n][w] for w in phrase.words])) if phrase.words else 1.0
             reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
-            out.append(_Candidate(i, score, reasons))
+            out.append(PhraseMatch(i, score, reasons))
     if not out and len(phrase.words) > 1:
         search.notes.append("no instance matches all of the words " + ", ".join(repr(w) for w in phrase.words))
     return out
 
 
-def _unknown(search: _Search, words: Sequence[str]) -> list[str]:
+def _unknown(search: PhraseSearch, words: Sequence[str]) -> list[str]:
     """Return words that nothing bears."""
     if search.gathered is not None:
         known = search.store.known_words(words)
@@ -172,11 +140,11 @@ def _unknown(search: _Search, words: Sequence[str]) -> list[str]:
     return [w for w in words if not any(w in v for v in search.vocabulary.values())]
 
 
-def _bears(search: _Search, n: int, words: Sequence[str]) -> bool:
+def _bears(search: PhraseSearch, n: int, words: Sequence[str]) -> bool:
     return all(w in search.vocabulary[n] for w in words)
 
 
-def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
+def _by_vector(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch] | None:
     """Return instances by the likeness of their vectors to the phrase; None where no vectors of the encoder's space are
     there."""
     if search.encoder is None:
@@ -192,13 +160,13 @@ def _by_vector(search: _Search, phrase: Phrase) -> list[_Candidate] | None:
     if search.gathered is not None:
         _look_at_too(search, list(cosine))
     return [
-        _Candidate(search.things[n], c, (like(text, c, search.encoder.space),))
+        PhraseMatch(search.things[n], c, (like(text, c, search.encoder.space),))
         for n, c in cosine.items()
         if n in search.things and search.things[n].structure is None
     ]
 
 
-def _look_at_too(search: _Search, ids: Sequence[int]) -> None:
+def _look_at_too(search: PhraseSearch, ids: Sequence[int]) -> None:
     fresh = search.store.instances_of([n for n in ids if n not in search.things])
     for i in (i for i in fresh if i.state != "removed"):
         search.things[i.id], search.vocabulary[i.id] = i, _vocabulary(i)
@@ -207,7 +175,7 @@ def _look_at_too(search: _Search, ids: Sequence[int]) -> None:
 # ---------------------------------------------------------------------------------------------- sizes
 
 
-def _sized(search: _Search, found: list[_Candidate], phrase: Phrase) -> list[_Candidate]:
+def _sized(search: PhraseSearch, found: list[PhraseMatch], phrase: Phrase) -> list[PhraseMatch]:
     """Return those of a size, relative to the others that fit the words, or to all things where those are fewer than
     four."""
     size = phrase.size
@@ -227,11 +195,11 @@ def _sized(search: _Search, found: list[_Candidate], phrase: Phrase) -> list[_Ca
         if said > 0.0 or low <= rank <= high:
             score = max(said, 0.5 + 0.5 * fit)
             why = f"{size}: longest edge {_edge(c.instance):.2f}, {1.0 - rank:.0%} of the others are larger"
-            out.append(_Candidate(c.instance, c.score * score, (*c.reasons, why)))
+            out.append(PhraseMatch(c.instance, c.score * score, (*c.reasons, why)))
     return out
 
 
-def _extreme(found: list[_Candidate], superlative: str) -> list[_Candidate]:
+def _extreme(found: list[PhraseMatch], superlative: str) -> list[PhraseMatch]:
     """Return the largest or smallest, and what is practically as large."""
     kind = SUPERLATIVES[superlative]
     sizes = [_edge(c.instance) if abs(kind) == 1 else float(np.ptp(c.instance.aabb[:, 2])) for c in found]
@@ -241,146 +209,9 @@ def _extreme(found: list[_Candidate], superlative: str) -> list[_Candidate]:
         share = min(size, best) / max(size, best, 1e-12)
         if share >= 1.0 - _ALIKE:
             what = "longest edge" if abs(kind) == 1 else "height"
-            out.append(_Candidate(c.instance, c.score * share, (*c.reasons, f"{superlative}: {what} {size:.2f}")))
+            out.append(PhraseMatch(c.instance, c.score * share, (*c.reasons, f"{superlative}: {what} {size:.2f}")))
     return out
 
 
 def _edge(i: Instance) -> float:
     return float(np.max(i.box.size))
-
-
-# ---------------------------------------------------------------------------------------------- relations
-
-
-def _related(search: _Search, found: list[_Candidate], clause: Clause, text: str) -> list[_Candidate]:
-    """Return those that stand in the relation to something that the clause's phrase means."""
-    objects = _few(search, _meaning(search, clause.object), clause)
-    others = _few(search, _meaning(search, clause.other), clause) if clause.other else []
-    if clause.other:
-        out = _between(search, found, objects, others)
-    else:
-        out = _standing(search, found, objects, clause.predicates)
-    if not out and objects and (others or not clause.other):
-        ends = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
-        search.notes.append(f"of {len(found)} instances that match {text!r} none is known to be {clause.said} {ends!r}")
-    return out
-
-
-def _few(search: _Search, objects: list[_Candidate], clause: Clause) -> list[_Candidate]:
-    """Return no more than can be searched from each of them, the best first."""
-    stored = not ({"between", *VIEWPOINT} & set(clause.predicates))
-    if stored or len(objects) <= _MOST_OBJECTS:
-        return objects
-    search.notes.append(
-        f"{len(objects)} instances match the phrase after {clause.said!r}; the best {_MOST_OBJECTS} were considered"
-    )
-    return sorted(objects, key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))[:_MOST_OBJECTS]
-
-
-def _standing(
-    search: _Search, found: list[_Candidate], objects: list[_Candidate], predicates: Sequence[str]
-) -> list[_Candidate]:
-    subjects = {c.instance.id: c for c in found}
-    best: dict[int, _Candidate] = {}
-    together = _pairs_of_many(search, subjects, objects, predicates) if len(objects) > _MOST_OBJECTS else None
-    for object in objects:
-        pairs = _pairs(search, subjects, object, predicates) if together is None else together[object.instance.id]
-        for subject, predicate, confidence, whence in pairs:
-            c = subjects[subject]
-            score = c.score * confidence * (0.5 + 0.5 * object.score)
-            if subject not in best or score > best[subject].score:
-                o = object.instance
-                why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{whence})"
-                inner = tuple(r for r in object.reasons if not r.startswith(("named", "#")))
-                best[subject] = _Candidate(c.instance, score, (*c.reasons, why, *inner))
-    return [best[n] for n in sorted(best)]
-
-
-def _pairs_of_many(
-    search: _Search, subjects: dict[int, _Candidate], objects: list[_Candidate], predicates: Sequence[str]
-) -> dict[int, list[_Pair]] | None:
-    """`_pairs` of many objects, in few questions to the store; None for relations that are not stored."""
-    if set(predicates) & set(VIEWPOINT):
-        return None
-    out: dict[int, list[_Pair]] = {c.instance.id: [] for c in objects}
-    from_objects = len(objects) <= len(subjects)
-    rows = search.store.related(out if from_objects else subjects, predicates, as_object=from_objects)
-    order = {p: n for n, p in enumerate(predicates)}
-    for s, p, o, sure in sorted(rows, key=lambda r: (r[2], order[r[1]], -r[3], r[0])):
-        if s in subjects and o in out and s != o:
-            out[o].append((s, p, sure, ""))
-    for predicate in predicates:
-        held = relations(search.store, None, predicate, objects[0].instance.id)
-        if held.state == "unknown" and predicate in VERTICAL:
-            search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
-    for c in objects if "near" in predicates else []:
-        if c.instance.structure is not None:
-            near = _near_structure(search, subjects, c.instance)
-            out[c.instance.id] += [p for p in near if p[0] != c.instance.id]
-    return out
-
-
-def _pairs(
-    search: _Search, subjects: dict[int, _Candidate], object: _Candidate, predicates: Sequence[str]
-) -> list[_Pair]:
-    """Return (subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
-    o = object.instance
-    out: list[tuple[int, str, float, str]] = []
-    for predicate in predicates:
-        place = _viewpoint(search, o) if predicate in VIEWPOINT else None
-        if predicate in VIEWPOINT and place is None:
-            search.notes.append(f"{predicate.replace('_', ' ')} depends on the viewpoint; name one")
-            continue
-        held = relations(search.store, None, predicate, o.id, viewpoint=place)
-        if held.state == "unknown" and (predicate in VIEWPOINT or predicate in VERTICAL):
-            search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
-        whence = f", {held.reason.split(';')[0]}" if place is not None else ""
-        out += [(r.subject, r.predicate, r.confidence, whence) for r in held if r.subject in subjects]
-    if "near" in predicates and (o.structure is not None):
-        out += _near_structure(search, subjects, o)
-    return [p for p in out if p[0] != o.id]
-
-
-def _near_structure(search: _Search, subjects: dict[int, _Candidate], o: Instance) -> list[tuple[int, str, float, str]]:
-    """Return things near a wall, by the distance of surfaces: the memory keeps `near` of things only."""
-    limit = _BY_STRUCTURE_M * unit_of(search.store)
-    near = set(search.store.ids_in_box(o.aabb[0] - limit, o.aabb[1] + limit))
-    out = []
-    for n, c in subjects.items():
-        if n in near and n != o.id and c.instance.component == o.component:
-            gap = distance_between(search.store, c.instance, o)
-            if gap <= limit:
-                out.append((n, "near", 1.0 - 0.5 * gap / limit, f", {gap:.2f} away"))
-    return out
-
-
-def _viewpoint(search: _Search, o: Instance) -> Place | None:
-    """Return from where left and right are told: as asked, else the picture in which the other thing is seen best."""
-    if search.viewpoint is not None:
-        return search.viewpoint
-    if o.best_view is None:
-        return None
-    try:
-        return camera_of_frame(search.store, o.best_view.frame_index, o.best_view.session_id)
-    except OptionError:
-        return None
-
-
-def _between(
-    search: _Search, found: list[_Candidate], ones: list[_Candidate], others: list[_Candidate]
-) -> list[_Candidate]:
-    """Return those that stand between one of the ones and one of the others, each with its best pair."""
-    noise = noise_of(search.store)
-    best: dict[int, _Candidate] = {}
-    pairs = ((a, b) for a in ones for b in others if a.instance.id != b.instance.id)
-    for a, b in pairs:
-        ends = a.instance.id, b.instance.id
-        box = np.stack([a.instance.aabb, b.instance.aabb])
-        near = set(search.store.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0))) - set(ends)
-        for c in (c for c in found if c.instance.id in near):
-            r = between(c.instance, a.instance, b.instance, noise)
-            score = 0.0 if r is None else c.score * r.confidence * (0.5 + 0.25 * (a.score + b.score))
-            if r is not None and (c.instance.id not in best or score > best[c.instance.id].score):
-                why = f"between #{ends[0]} and #{ends[1]} ({r.confidence:.2f})"
-                best[c.instance.id] = _Candidate(c.instance, score, (*c.reasons, why))
-    return [best[n] for n in sorted(best)]

@@ -1,0 +1,193 @@
+"""Judge the relations of a phrase: which instances stand to others as it says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+from list3r.queries.free_words import WordEncoder
+from list3r.queries.grammar import Clause
+from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
+from list3r.queries.views.camera import camera_of_frame
+from list3r.queries.views.gather import Gathered
+from list3r.queries.views.surfaces import distance_between
+from list3r.queries.views.viewpoint import VIEWPOINT, between
+
+_BY_STRUCTURE_M = 0.4
+"""Largest distance from a wall at which something is near it, metres: the memory stores `near` for things only."""
+_MOST_OBJECTS = 40
+"""Instances that others may be left of, or between: at most so many are considered."""
+_Pair = tuple[int, str, float, str]
+"""Subject, predicate, confidence, and where it is seen from, in words."""
+
+
+@dataclass(frozen=True)
+class PhraseMatch:
+    instance: Instance
+    score: float
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass
+class PhraseSearch:
+    """State of one question."""
+
+    store: Store
+    things: dict[int, Instance]
+    vocabulary: dict[int, dict[str, float]]
+    encoder: WordEncoder | None
+    viewpoint: Place | None
+    gathered: Gathered | None
+    """What of a large memory is in `things`; None where it is everything."""
+    notes: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+
+
+def related(
+    search: PhraseSearch,
+    found: list[PhraseMatch],
+    clause: Clause,
+    ends: tuple[list[PhraseMatch], ...],
+    text: str,
+) -> list[PhraseMatch]:
+    """Return those of `found` that stand in a clause's relation to its ends: the objects and, of `between`, the others.
+
+    `text` is the phrase that `found` match, for notes.
+    """
+    objects, others = (_few(search, end, clause) for end in ends)
+    if clause.other:
+        out = _between(search, found, objects, others)
+    else:
+        out = _standing(search, found, objects, clause.predicates)
+    if not out and objects and (others or not clause.other):
+        what = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
+        search.notes.append(f"of {len(found)} instances that match {text!r} none is known to be {clause.said} {what!r}")
+    return out
+
+
+def _few(search: PhraseSearch, objects: list[PhraseMatch], clause: Clause) -> list[PhraseMatch]:
+    """Return no more than can be searched from each of them, the best first."""
+    stored = not ({"between", *VIEWPOINT} & set(clause.predicates))
+    if stored or len(objects) <= _MOST_OBJECTS:
+        return objects
+    search.notes.append(
+        f"{len(objects)} instances match the phrase after {clause.said!r}; the best {_MOST_OBJECTS} were considered"
+    )
+    return sorted(objects, key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))[:_MOST_OBJECTS]
+
+
+def _standing(
+    search: PhraseSearch, found: list[PhraseMatch], objects: list[PhraseMatch], predicates: Sequence[str]
+) -> list[PhraseMatch]:
+    subjects = {c.instance.id: c for c in found}
+    best: dict[int, PhraseMatch] = {}
+    together = _pairs_of_many(search, subjects, objects, predicates) if len(objects) > _MOST_OBJECTS else None
+    for object in objects:
+        pairs = _pairs(search, subjects, object, predicates) if together is None else together[object.instance.id]
+        for subject, predicate, confidence, whence in pairs:
+            c = subjects[subject]
+            score = c.score * confidence * (0.5 + 0.5 * object.score)
+            if subject not in best or score > best[subject].score:
+                o = object.instance
+                why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{whence})"
+                inner = tuple(r for r in object.reasons if not r.startswith(("named", "#")))
+                best[subject] = PhraseMatch(c.instance, score, (*c.reasons, why, *inner))
+    return [best[n] for n in sorted(best)]
+
+
+def _pairs_of_many(
+    search: PhraseSearch,
+    subjects: dict[int, PhraseMatch],
+    objects: list[PhraseMatch],
+    predicates: Sequence[str],
+) -> dict[int, list[_Pair]] | None:
+    """Return `_pairs` of many objects, in few questions to the store; None for relations that are not stored."""
+    if set(predicates) & set(VIEWPOINT):
+        return None
+    out: dict[int, list[_Pair]] = {c.instance.id: [] for c in objects}
+    from_objects = len(objects) <= len(subjects)
+    rows = search.store.related(out if from_objects else subjects, predicates, as_object=from_objects)
+    order = {p: n for n, p in enumerate(predicates)}
+    for s, p, o, sure in sorted(rows, key=lambda r: (r[2], order[r[1]], -r[3], r[0])):
+        if s in subjects and o in out and s != o:
+            out[o].append((s, p, sure, ""))
+    for predicate in predicates:
+        held = relations(search.store, None, predicate, objects[0].instance.id)
+        if held.state == "unknown" and predicate in VERTICAL:
+            search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
+    for c in objects if "near" in predicates else []:
+        if c.instance.structure is not None:
+            near = _near_structure(search, subjects, c.instance)
+            out[c.instance.id] += [p for p in near if p[0] != c.instance.id]
+    return out
+
+
+def _pairs(
+    search: PhraseSearch, subjects: dict[int, PhraseMatch], object: PhraseMatch, predicates: Sequence[str]
+) -> list[_Pair]:
+    """Return (subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
+    o = object.instance
+    out: list[tuple[int, str, float, str]] = []
+    for predicate in predicates:
+        place = _viewpoint(search, o) if predicate in VIEWPOINT else None
+        if predicate in VIEWPOINT and place is None:
+            search.notes.append(f"{predicate.replace('_', ' ')} depends on the viewpoint; name one")
+            continue
+        held = relations(search.store, None, predicate, o.id, viewpoint=place)
+        if held.state == "unknown" and (predicate in VIEWPOINT or predicate in VERTICAL):
+            search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
+        whence = f", {held.reason.split(';')[0]}" if place is not None else ""
+        out += [(r.subject, r.predicate, r.confidence, whence) for r in held if r.subject in subjects]
+    if "near" in predicates and (o.structure is not None):
+        out += _near_structure(search, subjects, o)
+    return [p for p in out if p[0] != o.id]
+
+
+def _near_structure(search: PhraseSearch, subjects: dict[int, PhraseMatch], o: Instance) -> list[_Pair]:
+    """Return things near a wall, by the distance of surfaces: the memory keeps `near` of things only."""
+    limit = _BY_STRUCTURE_M * unit_of(search.store)
+    near = set(search.store.ids_in_box(o.aabb[0] - limit, o.aabb[1] + limit))
+    out = []
+    for n, c in subjects.items():
+        if n in near and n != o.id and c.instance.component == o.component:
+            gap = distance_between(search.store, c.instance, o)
+            if gap <= limit:
+                out.append((n, "near", 1.0 - 0.5 * gap / limit, f", {gap:.2f} away"))
+    return out
+
+
+def _viewpoint(search: PhraseSearch, o: Instance) -> Place | None:
+    """Return from where left and right are told: as asked, else the picture in which the other thing is seen best."""
+    if search.viewpoint is not None:
+        return search.viewpoint
+    if o.best_view is None:
+        return None
+    try:
+        return camera_of_frame(search.store, o.best_view.frame_index, o.best_view.session_id)
+    except OptionError:
+        return None
+
+
+def _between(
+    search: PhraseSearch, found: list[PhraseMatch], ones: list[PhraseMatch], others: list[PhraseMatch]
+) -> list[PhraseMatch]:
+    """Return those that stand between one of the ones and one of the others, each with its best pair."""
+    noise = noise_of(search.store)
+    best: dict[int, PhraseMatch] = {}
+    pairs = ((a, b) for a in ones for b in others if a.instance.id != b.instance.id)
+    for a, b in pairs:
+        ends = a.instance.id, b.instance.id
+        box = np.stack([a.instance.aabb, b.instance.aabb])
+        near = set(search.store.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0))) - set(ends)
+        for c in (c for c in found if c.instance.id in near):
+            r = between(c.instance, a.instance, b.instance, noise)
+            score = 0.0 if r is None else c.score * r.confidence * (0.5 + 0.25 * (a.score + b.score))
+            if r is not None and (c.instance.id not in best or score > best[c.instance.id].score):
+                why = f"between #{ends[0]} and #{ends[1]} ({r.confidence:.2f})"
+                best[c.instance.id] = PhraseMatch(c.instance, score, (*c.reasons, why))
+    return [best[n] for n in sorted(best)]
