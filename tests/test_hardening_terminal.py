@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from list3r.cli.app import run
-from list3r.cli.terminal import shown
+from list3r.memory.description.printable import shown
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, MergeDecision
 from list3r.memory.store.store import Store
@@ -60,6 +60,14 @@ def test_no_text_of_a_memory_reaches_the_terminal_raw(
     for text in (told.out, told.err):
         assert all(line.isprintable() for line in text.split("\n")), repr(text)
         assert not any(line.strip().startswith("9  forged") for line in text.split("\n"))
+
+
+@pytest.mark.parametrize(("to", "ending"), [("plan", ".png"), ("usd", ".usda"), ("json", ".json"), ("csv", ".csv")])
+def test_no_text_of_a_memory_breaks_an_export(to: str, ending: str, tmp_path: Path) -> None:
+    path, out = evil_memory(tmp_path / "evil.l3r"), tmp_path / f"out{ending}"
+    assert run(["export", str(path), "--to", to, "--out", str(out)]) == 0
+    if to in ("usd", "json"):
+        assert b"\x1b" not in out.read_bytes()
 
 
 def test_printable_text_is_shown_as_it_is() -> None:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from list3r.cli.terminal import say, shown, tell, write
+from list3r.cli.terminal import say, tell, write
+from list3r.memory.description.printable import shown
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory

@@ -10,6 +10,7 @@ import contextlib
 import os
 import sys
 
+from list3r.memory.description.printable import shown
 from list3r.memory.errors import List3rError
 
 _FULL = "standard output cannot be written"
@@ -17,14 +18,6 @@ _FULL = "standard output cannot be written"
 
 class OutputError(List3rError):
     """Standard output that takes no more; what was asked for is done."""
-
-
-def shown(text: object) -> str:
-    """Return a text as one line of printable characters; all others are escaped as in `\\x1b`."""
-    line = str(text)
-    if line.isprintable():
-        return line
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in line)
 
 
 def say(*lines: object) -> None:

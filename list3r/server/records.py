@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance, Relation
 from list3r.queries.changes import Changed
 from list3r.queries.match import Match
@@ -18,7 +19,7 @@ MOST = 100
 
 def name_of(instance: Instance) -> str:
     """Return what an instance is called: its label, its kind of structure, or its description up to the comma."""
-    return instance.label or instance.structure or instance.description.split(",")[0] or "thing"
+    return shown(instance.label or instance.structure or instance.description.split(",")[0] or "thing")
 
 
 def numbers(values: ArrayLike) -> list[float | None]:

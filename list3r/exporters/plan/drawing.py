@@ -12,6 +12,7 @@ from list3r.exporters.plan.frame import is_wall
 from list3r.exporters.plan.labels import TagTarget, place_tags
 from list3r.exporters.plan.map import pale_picture
 from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet, plain_text
+from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance, Support
 
 _START: Color = (22, 140, 100)
@@ -139,7 +140,7 @@ def _leader(sheet: Sheet, anchor: TagTarget, place: tuple[float, float]) -> None
 
 
 def _short_name(instance: Instance) -> str:
-    return plain_text(instance.label or instance.description.split(",")[0])
+    return plain_text(shown(instance.label or instance.description.split(",")[0]))
 
 
 def _area(outline: list[tuple[float, float]]) -> float:

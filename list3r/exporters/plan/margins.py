@@ -6,6 +6,7 @@ import numpy as np
 from PIL import ImageDraw
 
 from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Font, Sheet, font_of, plain_text
+from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance
 
 
@@ -79,7 +80,7 @@ def _legend_column(sheet: Sheet, rows: list[Instance], unit: str, x: float, y: f
         middle = y + 28 * k + (row + 0.5) * sheet.settings.row_px * k
         sheet.chip((x + 18 * k, middle), (max(30.0 * k, sheet.chip_width(instance.id)), 18.0 * k), instance.id)
         room = right - reserved - x - 46 * k
-        words = _shorten(sheet.draw, instance.label or instance.description, sheet.text_font, room)
+        words = _shorten(sheet.draw, shown(instance.label or instance.description), sheet.text_font, room)
         sheet.text((x + 46 * k, middle), words, sheet.text_font, INK, anchor="lm")
         sheet.text((right, middle), size, sheet.text_font, GREY, anchor="rm")
 

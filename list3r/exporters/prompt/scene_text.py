@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from list3r.exporters.prompt.budget import Budget
+from list3r.memory.description.printable import shown
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance, Relation
 
@@ -107,7 +108,7 @@ def ranked_instances(memory: SceneMemory, things: Sequence[Instance], question: 
 
 def name_of(instance: Instance) -> str:
     """Return what an instance is called: its label, its kind of structure, or its description up to the comma."""
-    return instance.label or instance.structure or instance.description.split(",")[0].strip() or "thing"
+    return shown(instance.label or instance.structure or instance.description.split(",")[0].strip() or "thing")
 
 
 def length_unit(things: Iterable[Instance], units: str) -> tuple[float, int]:
