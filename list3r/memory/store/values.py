@@ -96,7 +96,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         **{name: _number(1e-3, 1e7) for name in ("fx", "fy")},
         **{name: _number(-1e7, 1e7) for name in ("cx", "cy")},
         **{name: _integer(1, 2**17) for name in ("height", "width")},
-        "scale_kind": _one_of("metric", "relative"),
+        "scale_kind": _text(60),
         "feature_space": _text(),
         "cannot_link": _bytes(8, "pairs of whole numbers"),
         "overlap": _ARCHIVE,
@@ -402,13 +402,15 @@ def _is_similarity(value: Any) -> bool:
 
 
 _VALUES: Mapping[str, Callable[[Any], object]] = {
-    "scale_kind": lambda v: v in ("metric", "relative"),
     "gravity": lambda v: v in ("known", "estimated", "unknown"),
     "T_world_graph": _is_similarity,
     "gravity_estimate": lambda v: len(v["up"]) == 3 and all(map(_finite, [*v["up"], v["floor_height"] or 0.0])),
     "last_id": lambda v: type(v) is int and 0 <= v < _ID,
     "metres_per_graph_unit": lambda v: _finite(v) and 0 < v < 1e12,
-    **{name: lambda v: isinstance(v, str) and len(v) <= _MOST_TEXT for name in ("scale_source", "created_by", "poses")},
+    **{
+        name: lambda v: isinstance(v, str) and len(v) <= _MOST_TEXT
+        for name in ("scale_kind", "scale_source", "created_by", "poses")
+    },
     **{name: lambda v: isinstance(v, dict) for name in ("library", "tale", "text_models", "label classes")},
     "feature_space": lambda v: isinstance(v, str),
 }
