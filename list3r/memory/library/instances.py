@@ -142,7 +142,7 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
         (store.node_checksum(k), m.chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in m.group})
     )
     cuts = b"".join(np.packbits(x.dropped[slice(*x.span)]).tobytes() for x in shown_by)
-    key = (instance_id, m.component, m.upright, tuple(m.group), tuple(m.shown_by), poses, cuts, m.mover)
+    key = (instance_id, m.component, m.upright, tuple(m.group), tuple(m.shown_by), poses, cuts, m.mover, settings)
     kept = cache.get(key)
     if kept is not None:
         return kept

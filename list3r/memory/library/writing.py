@@ -208,7 +208,7 @@ class Writer:
             ring = {n for b in there for n in self._near(b.aabb, reach)} - scene
             scene |= ring
         measured = self._store.derived.of(PairMeasures)
-        measured.begin()
+        measured.begin(unit, s)
         found = []
         there = [b for b in self._stored(scene) if self._states[b.id] != "removed" and self._derived[b.id].resting]
         for component in sorted({b.component for b in there}):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.planes import Planes, chunk_planes
-from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes
+from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.derived import LruCache
@@ -56,8 +56,8 @@ def _bytes_of(summary: ChunkSummary) -> int:
     return sum(p.nbytes + 100 for p in parts if isinstance(p, np.ndarray))
 
 
-class SummaryCache(LruCache[tuple[int, int], ChunkSummary]):
-    """Summaries by chunk id and checksum of what the chunk measured."""
+class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None], ChunkSummary]):
+    """Summaries by chunk id, checksum of what the chunk measured, and settings."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, _bytes_of)
@@ -79,7 +79,7 @@ class Summaries(Mapping[int, ChunkSummary]):
     def __getitem__(self, chunk_id: int) -> ChunkSummary:
         if chunk_id not in self._checked:
             self._checked[chunk_id] = self._store.node_checksum(chunk_id)
-        key = chunk_id, self._checked[chunk_id]
+        key = chunk_id, self._checked[chunk_id], self._settings
         found = self._known.get(key)
         return found or self._known.put(key, _summary(self._store, self._store.chunk(chunk_id), self._settings))
 
@@ -130,15 +130,9 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     nodes = store.local_nodes([chunk.chunk_id])
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
-    shapes = chunk_shapes(
-        nodes,
-        chunk.image_size,
-        unit,
-        settings,
-        chunk_id=chunk.chunk_id,
-        session_id=chunk.session_id,
-        samples=None if chunk.scale_kind == "metric" else store.frame_samples(chunk.chunk_id),
-    )
+    shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
+    if chunk.scale_kind != "metric":
+        shapes = with_samples(shapes, store.frame_samples(chunk.chunk_id))
     lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
     motions = {n: store.motion_track(chunk.chunk_id, n) for n in moves}

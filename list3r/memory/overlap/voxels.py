@@ -9,7 +9,7 @@ what is small or densely sampled, coarser (by powers of two) where the support p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -138,11 +138,10 @@ def chunk_shapes(
     *,
     chunk_id: int,
     session_id: int = 1,
-    samples: FrameSamples | None = None,
 ) -> ChunkShapes:
     """Enter the local instances of one chunk in their grids.
 
-    `image_size` is (height, width); `unit` is what a metre is in chunk units; `samples` are given for computed depth.
+    `image_size` is (height, width); `unit` is what a metre is in chunk units.
     """
     s = settings or ShapeSettings()
     nodes = sorted(nodes, key=lambda n: n.local_id)
@@ -165,7 +164,6 @@ def chunk_shapes(
         points.append(p[chosen])
         rgb.append(node.support.rgb[chosen])
         owner.append(np.full(len(chosen), n))
-    sampled, sample_owner = _sampled(samples or FrameSamples.empty(), [n.local_id for n in nodes])
     return ChunkShapes(
         chunk_id=chunk_id,
         session_id=session_id,
@@ -194,8 +192,6 @@ def chunk_shapes(
         boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
         areas_px=tuple(n.areas_px for n in nodes),
         visible_fraction=tuple(n.visible_fraction for n in nodes),
-        samples=sampled,
-        sample_owner=sample_owner,
     )
 
 
@@ -204,14 +200,14 @@ SAMPLED_FRAMES = 3
 PIXEL_BITS = 24
 
 
-def _sampled(samples: FrameSamples, local_id: Sequence[int]) -> tuple[Ints, NDArray[np.int32]]:
-    """Return keys of the samples of every third frame, ascending, and the instance of each."""
+def with_samples(shapes: ChunkShapes, samples: FrameSamples) -> ChunkShapes:
+    """Return the shapes of a chunk of computed depth with the samples of every third frame."""
     kept = np.flatnonzero((samples.frame % SAMPLED_FRAMES == 0) & (samples.confidence > 0))
     keys = samples.frame[kept] << PIXEL_BITS | samples.pixel[kept].astype(np.int64)
-    place = {n: k for k, n in enumerate(local_id)}
+    place = {n: k for k, n in enumerate(shapes.local_id.tolist())}
     owner = np.array([place.get(n, -1) for n in samples.instance[kept].tolist()], np.int32)
     order = np.argsort(keys, kind="stable")
-    return np.asarray(keys[order], np.int64), owner[order]
+    return replace(shapes, samples=np.asarray(keys[order], np.int64), sample_owner=owner[order])
 
 
 def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, grown: GrownCells | None = None) -> Array:

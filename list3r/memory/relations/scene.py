@@ -25,10 +25,14 @@ class PairMeasures:
     def __init__(self) -> None:
         self._before: dict[tuple[object, ...], object] = {}
         self._used: dict[tuple[object, ...], object] = {}
+        self._basis: object = None
 
-    def begin(self) -> None:
-        """Begin a run: what the last one did not ask for is forgotten."""
-        self._before, self._used = self._used, {}
+    def begin(self, unit: float, settings: RelationSettings) -> None:
+        """Begin a run: what the last one did not ask for is forgotten, and all of it where its unit or settings were
+        others.
+        """
+        self._before = self._used if self._basis == (unit, settings) else {}
+        self._used, self._basis = {}, (unit, settings)
 
     def get(self, what: str, a: InstanceGeometry, b: InstanceGeometry, compute: Callable[[], T]) -> T:
         """Return the measure `what` of a and b, computed if it is new."""
