@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.chunking.cuts import CutSettings, jumps, spaced, suspected
+from list3r.frames.chunking.cuts import ShotCutSettings, jumps, spaced, suspected
 
 LIKENESS = 0.75
 """Cosine from which frame descriptors are alike whatever is usual."""
@@ -13,7 +13,7 @@ LIKENESS = 0.75
 
 def cuts_by_descriptor(descriptors: NDArray[np.float32]) -> tuple[int, ...]:
     """Positions before which the video jumps, ascending, by unit-length descriptors of all frames. Shape (F, D)."""
-    chosen = CutSettings()
+    chosen = ShotCutSettings()
     if len(descriptors) < 2:
         return ()
     likeness = np.r_[1.0, np.einsum("fd,fd->f", descriptors[1:], descriptors[:-1])]

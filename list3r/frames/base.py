@@ -24,7 +24,7 @@ class Camera:
     """OpenCV's (k1, k2, p1, p2, k3), empty for none. Frames handed out by a source are already undistorted."""
 
     def matrix(self) -> NDArray[np.float64]:
-        """The intrinsic matrix, px. Shape (3, 3)."""
+        """Return the intrinsic matrix, px. Shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def pinhole(self) -> Camera:
@@ -133,5 +133,5 @@ class FrameSource(Protocol):
         ...
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
+        """Return where a frame (Frame.index) is among those handed out."""
         ...

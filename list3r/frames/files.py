@@ -55,7 +55,7 @@ def _claimed_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """The largest frame that any header before the first scan claims (ITU-T T.81, B.2.2)."""
+    """Return the largest frame that any header before the first scan claims (ITU-T T.81, B.2.2)."""
     at, found = 2, None
     while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         marker = data[at + 1]

@@ -78,7 +78,7 @@ class FolderSource:
                 yield BadFrame(number, str(error))
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
+        """Return where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
@@ -106,7 +106,7 @@ class FolderSource:
             return None
 
     def _number(self, position: int) -> int:
-        """The frame number handed out at a position."""
+        """Return the frame number handed out at a position."""
         first, stop = int(self._chosen.starts[position]), int(self._chosen.stops[position])
         if stop - first > 1 and position not in self._sharpest:
             scores = [self._sharpness(k) for k in range(first, stop)]
@@ -133,7 +133,7 @@ class FolderSource:
         return Frame(number, self._time_s(number, file), color, depth, self._pose(file))
 
     def _color(self, file: FrameFile) -> NDArray[np.uint8]:
-        """The picture as stored, upright where that is asked for. Shape (H, W, 3)."""
+        """Return the picture as stored, upright where that is asked for. Shape (H, W, 3)."""
         return read_color(file.color, self._bits, upright=self._layout.upright_tags)
 
     def _sure(self, raw: NDArray[Any], file: FrameFile) -> NDArray[Any]:
@@ -150,7 +150,7 @@ class FolderSource:
         return file.time_s if self._clock and file.time_s is not None else number / self._fps
 
     def _pose(self, file: FrameFile) -> NDArray[np.float64] | None:
-        """The colour camera's pose, None where the file has none or an invalid one."""
+        """Return the colour camera's pose, None where the file has none or an invalid one."""
         T_source_given = file.T_source_camera
         if file.pose is not None:
             try:
@@ -182,7 +182,7 @@ class FolderSource:
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
 
     def _doubts(self) -> tuple[str, ...]:
-        """What looks wrong with depth, poses and times."""
+        """Return what looks wrong with depth, poses and times."""
         return (*self._depth_doubts(), *self._pose_doubts(), *self._time_doubts())
 
     def _depth_doubts(self) -> tuple[str, ...]:
@@ -243,14 +243,14 @@ class FolderSource:
         )
 
     def _camera_guess(self) -> Camera | None:
-        """What the first picture's EXIF says of a camera that is unknown."""
+        """Return what the first picture's EXIF says of a camera that is unknown."""
         picture = self._first_picture
         focal = exif_focal(picture) if self._rig.camera is None and isinstance(picture, Path) else None
         return None if focal is None else centred_camera(focal, self._rig)
 
 
 def centred_camera(focal: float, rig: Rig) -> Camera:
-    """A camera with its centre in the middle, for a focal length in px of the pictures as stored."""
+    """Return a camera with its centre in the middle, for a focal length in px of the pictures as stored."""
     height, width = rig.stored_size
     stored = Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
     return stored.resized(*rig.color_size)
@@ -270,7 +270,7 @@ def fingerprint(kind: str, listing: list[tuple[str, int]], options: SourceOption
 
 
 def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
-    """The files in order, but those whose picture has not the size that most have behind the others."""
+    """Return the files in order, but those whose picture has not the size that most have behind the others."""
     sizes = []
     for file in files:
         try:

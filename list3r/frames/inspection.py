@@ -11,7 +11,7 @@ __all__ = ["describe", "draw_registration", "lines"]
 
 
 def describe(info: SourceInfo) -> dict[str, Any]:
-    """What was recognised, ready for JSON."""
+    """Return what was recognised, ready for JSON."""
     return {
         "kind": info.kind,
         "path": info.path,
@@ -73,7 +73,7 @@ def _camera(camera: Camera | None) -> dict[str, float] | None:
 
 
 def _seen_text(report: dict[str, Any]) -> str:
-    """The camera, or what is known of it where it is not."""
+    """Return the camera, or what is known of it where it is not."""
     if report["camera"] is not None or report["size"] is None:
         return _camera_text(report["camera"])
     width, height = report["size"]

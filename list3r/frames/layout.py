@@ -100,7 +100,7 @@ def read_numbers(path: Path) -> list[list[float]]:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file. Raises `SourceError`."""
+    """Return the text of a file. Raises `SourceError`."""
     try:
         return read_file(path, MAX_TEXT_BYTES).decode("utf-8", "replace")
     except OSError as error:
@@ -141,7 +141,7 @@ def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
 
 
 def inside(root: Path, name: str, stated_in: Path) -> Path:
-    """The path of a name within a folder. Raises `SourceError` for one that leads out of it."""
+    """Return the path of a name within a folder. Raises `SourceError` for one that leads out of it."""
     path = root / name
     if not path.resolve().is_relative_to(root.resolve()):
         raise SourceError(f"{stated_in} names {name}, which lies outside of {root}; copy it there or mend the name")

@@ -84,7 +84,7 @@ class SourceOptions:
     depth. Intrinsics are given for pictures as stored."""
 
     def topics_by_role(self) -> dict[str, str]:
-        """The topics that were chosen, by role."""
+        """Return the topics that were chosen, by role."""
         return dict(self.topics or ())
 
     def __post_init__(self) -> None:
@@ -149,7 +149,7 @@ def check_distortion(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def check_rigid(matrix: NDArray[np.float64], name: str = "transform") -> NDArray[np.float64]:
-    """A rigid 4x4 matrix with its rotation made exact. Raises `OptionError` for anything else."""
+    """Return a rigid 4x4 matrix with its rotation made exact. Raises `OptionError` for anything else."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise OptionError(f"{name}: a 4x4 rigid matrix with last row 0,0,0,1 is needed")
     u, scales, vt = np.linalg.svd(matrix[:3, :3])
@@ -183,7 +183,7 @@ def parse_distortion(text: str) -> tuple[float, ...]:
 
 
 def parse_transform(text: str, name: str = "depth to color", quaternion: Literal["xyzw", "wxyz"] = "xyzw") -> Rows:
-    """A rigid transform from text, or from a text file that is named.
+    """Return a rigid transform from text, or from a text file that is named.
 
     16 numbers are a 4x4 matrix row by row, 12 its upper three rows, 7 are `tx,ty,tz` in metres and a quaternion in
     the order that `quaternion` says, 3 a translation. Raises `OptionError`.
@@ -229,7 +229,7 @@ def parse_range(text: str) -> tuple[int | None, int | None]:
 
 
 def _file_text(text: str) -> str | None:
-    """The contents of the file that `text` names, None if it names none."""
+    """Return the contents of the file that `text` names, None if it names none."""
     if any(sign in text for sign in ",;\n") or not text.strip():
         return None
     try:
@@ -240,7 +240,7 @@ def _file_text(text: str) -> str | None:
 
 
 def _names_a_file(text: str) -> bool:
-    """Whether text that is no number can only be meant as a file: it has letters and no comma."""
+    """Return whether text that is no number can only be meant as a file: it has letters and no comma."""
     try:
         float(text)
     except ValueError:

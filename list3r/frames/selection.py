@@ -31,14 +31,14 @@ class FrameSelection:
         return len(self.starts)
 
     def position(self, number: int) -> int:
-        """Where a frame number is, or would be, among the frames handed out."""
+        """Return where a frame number is, or would be, among the frames handed out."""
         return max(0, int(np.searchsorted(self.starts, number, side="right")) - 1)
 
 
 def select(
     times_s: NDArray[np.float64], options: SourceOptions, root: Path, *, clock: bool, video: bool
 ) -> FrameSelection:
-    """The frames that the options leave of a source.
+    """Return the frames that the options leave of a source.
 
     `times_s` (F,) are the frames' times, ascending, from the source's `clock` or made up from a frame rate. With a
     clock, `fps` thins the frames out to so many a second. Of a thinned video the sharpest frames are taken unless the
@@ -69,7 +69,7 @@ def select(
 
 
 def _range_text(options: SourceOptions) -> str:
-    """The options that say from where to where, in the user's words."""
+    """Return the options that say from where to where, in the user's words."""
     said = []
     if options.start is not None or options.stop is not None:
         said.append(f"frames {'' if options.start is None else options.start}:{options.stop or ''}")
@@ -79,7 +79,7 @@ def _range_text(options: SourceOptions) -> str:
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:
-    """How sharp a grey picture is beside others of the same place: the variance of its Laplacian at 320 px.
+    """Return how sharp a grey picture is beside others of the same place: the variance of its Laplacian at 320 px.
 
     Pech-Pacheco et al., Diatom autofocusing in brightfield microscopy, ICPR 2000. Shape (H, W).
     """

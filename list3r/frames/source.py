@@ -58,7 +58,7 @@ _WANTED = (
 
 
 def open_source(path: str | Path, options: SourceOptions | None = None) -> FrameSource:
-    """The frames at `path`, which can be opened again in another process with the same arguments.
+    """Return the frames at `path`, which can be opened again in another process with the same arguments.
 
     Raises `SourceError` for what is not a source, `OptionError` for options that do not fit it.
     """
@@ -79,7 +79,7 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
 
 
 def require_camera(info: SourceInfo) -> Camera:
-    """The source's camera. Raises `SourceError` when its intrinsics are unknown."""
+    """Return the source's camera. Raises `SourceError` when its intrinsics are unknown."""
     if info.camera is None:
         raise SourceError(f"{info.path}: the camera's intrinsics are unknown; give --intrinsics fx,fy,cx,cy in px")
     return info.camera
@@ -138,7 +138,7 @@ def _check_nothing_ignored(root: Path, kind: str, options: SourceOptions) -> Non
 
 
 def _pictures_to_convert(root: Path) -> str | None:
-    """A picture in the folder of a kind that cannot be read, None where there is none."""
+    """Return a picture in the folder of a kind that cannot be read, None where there is none."""
     return next((p.name for p in sorted(root.iterdir()) if p.suffix.lower() in _OTHER_PICTURES), None)
 
 

@@ -50,7 +50,7 @@ class Cached:
 
 
 def cache_folder() -> Path:
-    """Where the hub keeps what was fetched, by the environment variables that its own package obeys."""
+    """Return where the hub keeps what was fetched, by the environment variables that its own package obeys."""
     if "HF_HUB_CACHE" in os.environ:
         return Path(os.environ["HF_HUB_CACHE"]).expanduser()
     base = os.environ.get("XDG_CACHE_HOME", "~/.cache")
@@ -58,7 +58,7 @@ def cache_folder() -> Path:
 
 
 def find_cached(repository: str, revision: str = UNPINNED) -> Cached | None:
-    """What the cache holds of a repository at a revision; None where nothing, or no weights, are there."""
+    """Return what the cache holds of a repository at a revision; None where nothing, or no weights, are there."""
     base = cache_folder() / f"models--{repository.replace('/', '--')}"
     commit = revision
     if not _COMMIT.fullmatch(revision):
@@ -80,7 +80,7 @@ def split_name(name: str) -> tuple[str, str] | None:
 
 
 def resolve(asked: str | None, weights: Weights | None, option: str) -> str:
-    """The weights that a run will use, fetched where they are not in the cache: a path, or `owner/name@commit`.
+    """Return the weights that a run will use, fetched where they are not in the cache: a path, or `owner/name@commit`.
 
     `asked` is what the user gave (a path, a repository, a repository at a revision), `weights` what the card names.
     Raises `OptionError` when there is nothing to use, or it can be had neither from the disk nor from the hub.
@@ -99,7 +99,7 @@ def resolve(asked: str | None, weights: Weights | None, option: str) -> str:
 
 
 def locate(name: str) -> Path:
-    """The file or folder of weights that `resolve` named. Raises `OptionError` when it is no longer there."""
+    """Return the file or folder of weights that `resolve` named. Raises `OptionError` when it is no longer there."""
     if Path(name).exists():
         return Path(name)
     parts = split_name(name)
@@ -191,7 +191,7 @@ def _unknown() -> Any:
 
 
 def _is_known(endpoint: str) -> bool:
-    """Whether the name of the hub's host can be looked up here; a proxy looks it up itself."""
+    """Return whether the name of the hub's host can be looked up here; a proxy looks it up itself."""
     if getproxies():
         return True
     try:
@@ -202,5 +202,5 @@ def _is_known(endpoint: str) -> bool:
 
 
 def _is_transport(error: Exception) -> bool:
-    """Whether an error comes from the network's side, by the packages that speak to it."""
+    """Return whether an error comes from the network's side, by the packages that speak to it."""
     return type(error).__module__.split(".")[0] in ("httpx", "httpcore", "requests", "urllib3", "huggingface_hub")

@@ -254,7 +254,7 @@ CARDS: tuple[ModelCard, ...] = (
 
 
 def find_card(name: str, part: str) -> ModelCard | None:
-    """The card of a model, None for one that needs no weights (rgbd, sfm, geometric, ...)."""
+    """Return the card of a model, None for one that needs no weights (rgbd, sfm, geometric, ...)."""
     return next((c for c in CARDS if c.name == name and c.part == part), None)
 
 
@@ -267,5 +267,5 @@ def cards_named(name: str) -> list[ModelCard]:
 
 
 def find_weights(card: ModelCard, repository: str) -> Weights | None:
-    """What is known of a repository of weights, None for one that the card does not name."""
+    """Return what is known of a repository of weights, None for one that the card does not name."""
     return next((w for w in card.weights if w.repository.lower() == repository.lower()), None)

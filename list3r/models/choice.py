@@ -37,7 +37,7 @@ def parse_weights(words: list[str] | None) -> dict[str, str]:
 
 
 def check_allowed(selection: ModelSelection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
-    """The weights to use, by option, those asked for and those that the licence profile leaves of the cards'.
+    """Return the weights to use, by option, those asked for and those that the licence profile leaves of the cards'.
 
     Nothing is loaded or fetched. Raises `OptionError` for what the profile forbids and for packages that are missing.
     """

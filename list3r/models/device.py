@@ -24,7 +24,7 @@ class Gpu:
 
 
 def find_gpu(device: str = "auto") -> Gpu | None:
-    """The GPU that a device name means, None where there is none or the name is `cpu`."""
+    """Return the GPU that a device name means, None where there is none or the name is `cpu`."""
     import torch
 
     if device == "cpu" or not torch.cuda.is_available():

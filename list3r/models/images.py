@@ -40,7 +40,7 @@ class InputShape:
 
 
 def sam_input(model: str, size: int) -> InputShape:
-    """What the networks of the SAM family take: a square, normalised otherwise since SAM 3."""
+    """Return what the networks of the SAM family take: a square, normalised otherwise since SAM 3."""
     mean, std = (HALF, HALF) if model == "sam3" else (IMAGENET_MEAN, IMAGENET_STD)
     return InputShape(size, size, mean=mean, std=std)
 
@@ -55,7 +55,7 @@ def normalised(
 def network_input(
     color: NDArray[np.uint8], shape: InputShape, device: torch.device, dtype: torch.dtype
 ) -> torch.Tensor:
-    """A picture (H, W, 3) as a batch of one, normalised. Shape (1, 3, height, width)."""
+    """Return a picture (H, W, 3) as a batch of one, normalised. Shape (1, 3, height, width)."""
     import torch
     from torch.nn import functional
 

@@ -50,7 +50,7 @@ def _wrong(licence: Licence, profile: str) -> str | None:
 
 
 def choose_weights(card: ModelCard, asked: str | None, profile: str, option: str) -> Weights | None:
-    """The weights to use: those asked for by repository, else the first of the card that the profile allows.
+    """Return the weights to use: those asked for by repository, else the first of the card that the profile allows.
 
     None where the user brings weights of his own. A repository that the card does not name has terms of its own.
     Raises `OptionError`, naming the model, its licence and what is allowed instead, when the profile forbids it.
@@ -70,7 +70,7 @@ def choose_weights(card: ModelCard, asked: str | None, profile: str, option: str
 
 
 def terms(card: ModelCard, weights: Weights | None) -> str:
-    """What a user should know before using a model commercially; empty where there is nothing to say."""
+    """Return what a user should know before using a model commercially; empty where there is nothing to say."""
     if weights is None:
         return ""
     said = [

@@ -40,7 +40,7 @@ class ModelSelection:
 
 
 def select(preset: str, *, has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelection:
-    """The models of a preset for a source. Raises `OptionError` for a preset that is not known."""
+    """Return the models of a preset for a source. Raises `OptionError` for a preset that is not known."""
     if preset == "cpu":
         return ModelSelection(why="preset cpu: no weights")
     if preset == "light":
@@ -54,7 +54,7 @@ def select(preset: str, *, has_depth: bool, profile: str, gpu: Gpu | None) -> Mo
 
 
 def _by_machine(has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelection:
-    """The best models that are installed, fetched, and allowed; without a GPU none that has weights."""
+    """Return the best models that are installed, fetched, and allowed; without a GPU none that has weights."""
     if gpu is None:
         return ModelSelection(why="preset auto: no GPU, so nothing that has weights")
     chosen = ModelSelection()
@@ -96,5 +96,5 @@ def obstacle(name: str, part: str, profile: str) -> str | None:
 
 
 def missing_package(card: ModelCard) -> str | None:
-    """The first module of a card that cannot be imported, looked for without importing it."""
+    """Return the first module of a card that cannot be imported, looked for without importing it."""
     return next((p for p in card.packages if find_spec(p) is None), None)

@@ -39,7 +39,7 @@ def pick_device(name: str) -> torch.device:
 def load_named(
     kinds: Mapping[str, str], option: str, name: str, folder: Path, device: str, *, exact: bool = False
 ) -> tuple[Any, torch.device]:
-    """The network that a model's name stands for, by its class, and the device that it lies on.
+    """Return the network that a model's name stands for, by its class, and the device that it lies on.
 
     `exact` keeps it in float32 everywhere, for networks that half precision breaks.
     Raises `OptionError` as `pick_device` and `load_pretrained` do, and for a name that is none of the kinds.
@@ -59,7 +59,7 @@ def network_dtype(device: torch.device) -> torch.dtype:
 
 
 def load_pretrained(class_name: str, folder: Path, device: torch.device, *, exact: bool = False) -> Any:
-    """The network of a folder with `config.json` and weights, in evaluation mode, of `network_dtype` or float32.
+    """Return the network of a folder with `config.json` and weights, in evaluation mode, of `network_dtype` or float32.
 
     Raises `OptionError` when the package is missing, the folder is not such a folder, or the weights are of another
     network (a missing or an unexpected layer, another shape).

@@ -45,7 +45,7 @@ def upstream_class(card: ModelCard, module: str, name: str) -> Any:
 
 
 def load_upstream(cls: Any, path: Path, device: torch.device) -> Any:
-    """A network of the class with the weights at `path`, in evaluation mode on the device.
+    """Return a network of the class with the weights at `path`, in evaluation mode on the device.
 
     A folder is read by the class's own `from_pretrained` (with its `config.json` where it has one); a single file is
     a state dict for the class's defaults, read without unpickling code. Raises `OptionError` in one line when the
@@ -115,7 +115,7 @@ def _check_complete(model: Any, names: set[str], path: Path) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says, or its kind where it says nothing."""
+    """Return the first line of what an error says, or its kind where it says nothing."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     text = " ".join(lines[:2]) if lines and lines[0].endswith(":") else (lines[0] if lines else type(error).__name__)
     return text[:240]

@@ -16,7 +16,7 @@ from list3r.association.revisits.search import RevisitSettings
 from list3r.association.revisits.session_ties import TieSettings
 from list3r.frames.chunking.borrowing import BorrowSettings
 from list3r.frames.chunking.chunks import ChunkSettings
-from list3r.frames.chunking.cuts import CutSettings
+from list3r.frames.chunking.cuts import ShotCutSettings
 from list3r.frames.chunking.pace import PaceSettings
 from list3r.instances.carving.carved_surfaces import ChangedPlaceSettings
 from list3r.instances.settings import InstanceSettings
@@ -86,7 +86,7 @@ class BuildSettings:
     instances: InstanceSettings = field(default_factory=InstanceSettings)
     keep_pictures: bool = True
     """Keep a JPEG of each keyframe in the memory."""
-    cuts: CutSettings = field(default_factory=CutSettings)
+    cuts: ShotCutSettings = field(default_factory=ShotCutSettings)
     """Where the video jumps."""
     pace: PaceSettings = field(default_factory=PaceSettings)
     borrowing: BorrowSettings = field(default_factory=BorrowSettings)

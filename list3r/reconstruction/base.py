@@ -51,7 +51,7 @@ class DepthNoise:
     """Deviation, as a share of depth, at which confidence is one half; 0 where confidence does not tell."""
 
     def scaled(self, scale: float) -> DepthNoise:
-        """The same where a unit is `scale` units of before."""
+        """Return the same where a unit is `scale` units of before."""
         return DepthNoise(self.base * scale, self.quadratic / scale, self.half_share)
 
     def sigma(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:

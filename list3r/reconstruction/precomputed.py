@@ -26,7 +26,7 @@ from list3r.reconstruction.registry import ModelOptions
 
 
 def make(options: ModelOptions) -> PrecomputedReconstructor:
-    """The reader of the folder that the options name as weights. Raises `OptionError` where there is none."""
+    """Return the reader of the folder that the options name as weights. Raises `OptionError` where there is none."""
     if options.weights is None:
         raise OptionError("--reconstruction precomputed needs a folder: --weights DIR (see docs/precomputed.md)")
     return PrecomputedReconstructor(Path(options.weights).expanduser(), options.poses, options.settings.networks)
@@ -69,7 +69,7 @@ class PrecomputedReconstructor:
         self._settings = settings or NetworkSettings()
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """What is known of the frames; those that no file holds are not posed.
+        """Return what is known of the frames; those that no file holds are not posed.
 
         Raises `TrackingError` when fewer than two are held, `OptionError` for files that are damaged or do not fit.
         """
@@ -137,7 +137,7 @@ def _roughest(noises: Sequence[DepthNoise]) -> DepthNoise | None:
 
 
 def _unknown(count: int, size: tuple[int, ...]) -> WindowOutput:
-    """An answer that says nothing yet."""
+    """Return an answer that says nothing yet."""
     return WindowOutput(
         np.full((count, 4, 4), np.nan),
         np.zeros((count, *size), np.float32),

@@ -46,7 +46,7 @@ class Manifest:
     """Frames that neighbouring files share."""
 
     def as_json(self) -> dict[str, object]:
-        """The contents of `precomputed.json`."""
+        """Return the contents of `precomputed.json`."""
         chunks = {} if self.length is None else {"chunk_length": self.length, "chunk_overlap": self.overlap}
         return {"format": FORMAT, "version": VERSION, "scale": self.scale, "model": self.model, **chunks}
 
@@ -74,7 +74,7 @@ class Piece:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder. Raises `OptionError` for a folder that has none, or one that makes no sense."""
+    """Return the manifest of a folder. Raises `OptionError` for a folder that has none, or one that makes no sense."""
     path = folder / MANIFEST
     if not path.is_file():
         raise OptionError(f"{folder} has no {MANIFEST}; see docs/precomputed.md, or write it with `list3r precompute`")
@@ -120,7 +120,7 @@ def write_piece(path: Path, piece: Piece) -> None:
 
 
 def read_frames(path: Path) -> NDArray[np.int64]:
-    """The frame numbers of a file, without its large arrays. Raises `OptionError`."""
+    """Return the frame numbers of a file, without its large arrays. Raises `OptionError`."""
     return _checked_frames(_arrays(path, ("frames",))["frames"], path)
 
 
@@ -167,7 +167,7 @@ def _checked_frames(frames: NDArray[Any], path: Path) -> NDArray[np.int64]:
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """The named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
+    """Return the named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
     try:
         check_ordinary(path.stat(), path, MAX_BYTES)
         with zipfile.ZipFile(path) as archive:

@@ -66,7 +66,7 @@ MODELS: dict[str, ModelEntry] = {
 
 
 def make_reconstructor(name: str, options: ModelOptions) -> Reconstructor:
-    """The model of that name. Raises `OptionError` for a name that is not known or a package that is missing."""
+    """Return the model of that name. Raises `OptionError` for a name that is not known or a package that is missing."""
     model = import_module(f"list3r.reconstruction.{entry(name).module}").make(options)
     return model  # type: ignore[no-any-return]
 
@@ -77,7 +77,7 @@ def usual_model(has_depth: bool) -> str:
 
 
 def entry(name: str) -> ModelEntry:
-    """The entry of a name. Raises `OptionError` for one that is not known."""
+    """Return the entry of a name. Raises `OptionError` for one that is not known."""
     if name not in MODELS:
         raise OptionError(f"--reconstruction {name} is not known; choose one of {', '.join(MODELS)}, auto")
     return MODELS[name]

@@ -59,13 +59,13 @@ class WalkSettings:
             raise OptionError(f"start {self.start}: it must not be negative")
 
     def camera(self) -> Camera:
-        """The pinhole camera of the pictures."""
+        """Return the pinhole camera of the pictures."""
         width, height = self.size
         focal = 525.0 * width / 640 if self.focal is None else self.focal
         return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     def world(self) -> SimulatedWorld:
-        """The world that is filmed."""
+        """Return the world that is filmed."""
         return make_world(self.seed)
 
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -78,11 +78,11 @@ class WalkSettings:
         return time_s[self.start :], poses[self.start :]
 
     def movers(self) -> tuple[MovingThing, ...]:
-        """What moves while it is filmed, with its pose in each of the frames to be written."""
+        """Return what moves while it is filmed, with its pose in each of the frames to be written."""
         return ()
 
     def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
-        """The content of `truth.json`; `seen` has the counts of each thing's id, as `world_truth` takes them."""
+        """Return the content of `truth.json`; `seen` has the counts of each thing's id, as `world_truth` takes them."""
         return world_truth(self.world(), seen)
 
 

@@ -74,7 +74,7 @@ def borrow(
     frames: Sequence[Frame],
     settings: BorrowSettings | None = None,
 ) -> Borrowed:
-    """The frames of positions `span` = [start, stop) with those around it, from within `shot`, that show it from
+    """Return the frames of positions `span` = [start, stop) with those around it, from within `shot`, that show it from
     elsewhere."""
     s = settings or BorrowSettings()
     sieve = _Sieve(s)
@@ -111,7 +111,7 @@ def frames_around(
 
 
 def _thinned(source: FrameSource, start: int, stop: int, step: int) -> list[Frame]:
-    """The frames at positions start, start + step, ... before `stop` that can be decoded."""
+    """Return the frames at positions start, start + step, ... before `stop` that can be decoded."""
     thinned = getattr(source, "read_every", None)
     if start >= stop:
         return []

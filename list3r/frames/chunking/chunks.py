@@ -41,7 +41,7 @@ class ChunkSpan:
 
 
 def plan_chunks(frame_count: int, settings: ChunkSettings, cuts: Sequence[int] = ()) -> list[ChunkSpan]:
-    """The spans that cover `frame_count` frames; the last one may be shorter, never only overlap.
+    """Return the spans that cover `frame_count` frames; the last one may be shorter, never only overlap.
 
     `cuts` are positions before which the video jumps (`frames.cuts`): no span holds frames of both sides, and spans on
     either side of a cut do not overlap. A shot shorter than a chunk is one chunk.
@@ -61,7 +61,7 @@ def shot_of(span: ChunkSpan, cuts: Sequence[int], frame_count: int) -> tuple[int
 
 
 def _plan_shot(start: int, stop: int, settings: ChunkSettings, first: int) -> list[ChunkSpan]:
-    """The spans of frames [start, stop) without a jump, numbered from `first`."""
+    """Return the spans of frames [start, stop) without a jump, numbered from `first`."""
     step = settings.length - settings.overlap
     count = max(1, -(-(stop - start - settings.overlap) // step))
     begins = [start + k * step for k in range(count)]

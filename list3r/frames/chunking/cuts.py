@@ -23,7 +23,7 @@ Gray = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class CutSettings:
+class ShotCutSettings:
     """When a jump is believed."""
 
     window: int = 12
@@ -71,7 +71,7 @@ Progress = Callable[[int, int], None]
 
 
 def find_cuts(
-    source: FrameSource, settings: CutSettings | None = None, progress: Progress | None = None
+    source: FrameSource, settings: ShotCutSettings | None = None, progress: Progress | None = None
 ) -> tuple[int, ...]:
     """Positions of `source` before which the video jumps, ascending.
 
@@ -79,7 +79,7 @@ def find_cuts(
     around a suspect again; what it keeps does not grow with the video but by some bytes a frame. The same source gives
     the same cuts. A bad frame is passed over: the next is compared with the last good one.
     """
-    chosen = settings or CutSettings()
+    chosen = settings or ShotCutSettings()
     count = source.info.frame_count
     likeness = np.ones(count)  # of every frame to the one before it
     around: dict[int, Gray] = {}
@@ -117,7 +117,7 @@ def find_cuts(
 Alike = Callable[[int, int], bool]
 
 
-def suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: CutSettings) -> bool:
+def suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: ShotCutSettings) -> bool:
     """Whether a frame is far less like the one before than is usual around it; 1 is alike, of F frames the first is."""
     if likeness[k] >= enough:
         return False
@@ -125,14 +125,14 @@ def suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: Cu
     return bool(1.0 - likeness[k] > settings.factor * float(np.median(around)))
 
 
-def jumps(cut: int, count: int, alike: Alike, settings: CutSettings) -> bool:
+def jumps(cut: int, count: int, alike: Alike, settings: ShotCutSettings) -> bool:
     """True when nothing just before the cut is like anything just after it, looking past spoilt frames on one side."""
     after = ((cut - 1, cut + k) for k in range(settings.look_past + 1) if cut + k < count)
     before = ((cut - k, cut) for k in range(2, settings.look_past + 2) if cut - k >= 0)
     return not any(alike(a, b) for a, b in (*after, *before))
 
 
-def spaced(cuts: Sequence[int], alike: Alike, settings: CutSettings) -> tuple[int, ...]:
+def spaced(cuts: Sequence[int], alike: Alike, settings: ShotCutSettings) -> tuple[int, ...]:
     """Cuts with no shot between them that is too short to be one: the frames of a flash belong to neither side."""
     out: list[int] = []
     for cut in cuts:
@@ -200,7 +200,7 @@ _KEPT = 64
 class _Looks:
     """Local features of the few frames round suspects."""
 
-    def __init__(self, source: FrameSource, settings: CutSettings) -> None:
+    def __init__(self, source: FrameSource, settings: ShotCutSettings) -> None:
         self._source, self._settings = source, settings
         self._sift = cv2.SIFT.create(nfeatures=settings.features, contrastThreshold=0.015)
         self._count = source.info.frame_count
@@ -209,7 +209,7 @@ class _Looks:
         self._agreeing: dict[tuple[int, int], int] = {}
 
     def same_place(self, a: int, b: int) -> bool:
-        """True unless both frames have something to say and agree on nothing."""
+        """Return True unless both frames have something to say and agree on nothing."""
         if min(len(self._features(k)[0]) for k in (a, b)) < self._settings.least_features:
             return True
         usual = min(self.agreeing(a - 1, a) if a > 0 else 0, self.agreeing(b, b + 1) if b + 1 < self._count else 0)

@@ -17,7 +17,7 @@ from list3r.memory.errors import FrameError
 
 
 def read_color(path: Stored, bits: int = 16, *, upright: bool = True) -> NDArray[np.uint8]:
-    """An RGB image, turned as its EXIF tag says if `upright`. Shape (H, W, 3). Raises `FrameError`.
+    """Return an RGB image, turned as its EXIF tag says if `upright`. Shape (H, W, 3). Raises `FrameError`.
 
     Of a picture with 16 bits a channel the lower `bits` are in use, see `used_bits`.
     """
@@ -31,7 +31,7 @@ def read_color(path: Stored, bits: int = 16, *, upright: bool = True) -> NDArray
 
 
 def used_bits(paths: Sequence[Stored]) -> int:
-    """How many of their 16 bits pictures of one camera use: 10, 12, 14 or 16; 16 for pictures of 8 bits.
+    """Return how many of their 16 bits pictures of one camera use: 10, 12, 14 or 16; 16 for pictures of 8 bits.
 
     Cameras of 10 to 14 bits write them into 16, and are nearly black where all 16 are looked at.
     """
@@ -48,7 +48,7 @@ def used_bits(paths: Sequence[Stored]) -> int:
 
 
 def read_gray(path: Stored, reduction: int) -> NDArray[np.uint8]:
-    """A grey image, each side reduced by 1, 2, 4 or 8: a JPEG takes less to decode then. Raises `FrameError`."""
+    """Return a grey image, each side reduced by 1, 2, 4 or 8: a JPEG takes less to decode then. Raises `FrameError`."""
     flags = {
         1: cv2.IMREAD_GRAYSCALE,
         2: cv2.IMREAD_REDUCED_GRAYSCALE_2,

@@ -47,7 +47,7 @@ def film_focal(focal_35mm: float, width: int, height: int) -> float:
 
 
 def believable(focal: float | None, width: int, height: int) -> float | None:
-    """The focal length, px, if any lens of a camera has it."""
+    """Return the focal length, px, if any lens of a camera has it."""
     if focal is None or not math.isfinite(focal):
         return None
     low, high = _PLAUSIBLE
@@ -70,7 +70,7 @@ def _from_sensor(tags: dict[int, Any], width: int, height: int) -> float | None:
 
 
 def _cropped(tags: dict[int, Any], width: int, height: int) -> bool:
-    """Whether the picture has another shape than the one that was taken."""
+    """Return whether the picture has another shape than the one that was taken."""
     taken = sorted(_number(tags.get(tag)) or 0 for tag in (_WIDTH, _HEIGHT))
     if not taken[0]:
         return False
@@ -78,7 +78,7 @@ def _cropped(tags: dict[int, Any], width: int, height: int) -> bool:
 
 
 def _number(value: Any) -> float | None:
-    """A positive finite number, None for everything else that EXIF can hold."""
+    """Return a positive finite number, None for everything else that EXIF can hold."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -67,7 +67,7 @@ class Upright:
         return np.ascontiguousarray(np.rot90(rgb, self.turns))
 
     def notes(self) -> tuple[str, ...]:
-        """What is done, for people."""
+        """Return what is done, for people."""
         out = []
         if self.turns:
             out.append(f"frames are turned by {90 * self.turns} degrees counter-clockwise, as the file says")
@@ -91,7 +91,7 @@ _WHITE_NITS = 203.0
 
 
 def _pq_to_srgb() -> NDArray[np.uint8]:
-    """The usual code (IEC 61966-2-1) of each value of ST 2084, both of 8 bits. Shape (256,)."""
+    """Return the usual code (IEC 61966-2-1) of each value of ST 2084, both of 8 bits. Shape (256,)."""
     v = np.linspace(0.0, 1.0, 256) ** (1.0 / 78.84375)
     nits = 10000.0 * (np.maximum(v - 0.8359375, 0.0) / (18.8515625 - 18.6875 * v)) ** (1.0 / 0.1593017578125)
     light = np.minimum(nits / _WHITE_NITS, 1.0)
@@ -105,7 +105,7 @@ _LUMA = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "n
 
 
 def small_gray(image: av.VideoFrame, side: int) -> NDArray[np.uint8]:
-    """A stored picture in grey, its longer side at most `side` px. Shape (H, W).
+    """Return a stored picture in grey, its longer side at most `side` px. Shape (H, W).
 
     Nearly all video holds the grey picture as it is; to take that costs a tenth of having it made.
     """

@@ -92,7 +92,7 @@ class Stamps:
 
 
 def list_stamps(path: Path) -> Stamps:
-    """The clock of a video file. Raises `SourceError` for what is none."""
+    """Return the clock of a video file. Raises `SourceError` for what is none."""
     try:
         found, hidden_s = _listed(path, {})
         return _listed(path, _WHOLE)[0] if 0 < hidden_s <= _PRIMING_S else found
@@ -128,7 +128,7 @@ def open_container(path: Path, words: dict[str, str]) -> Any:
 
 
 def picture_stream(container: Any) -> Any | None:
-    """The video stream to read, the largest; None where there is none; the cover of a piece of music is none."""
+    """Return the video stream to read, the largest; None where there is none; the cover of a piece of music is none."""
     return next(iter(_picture_streams(container)), None)
 
 
@@ -196,7 +196,7 @@ def _ascend(stamps: Sequence[int | None]) -> bool:
 
 
 def _joined(rows: _Rows) -> tuple[_Rows, bool]:
-    """The rows with one clock where that of decoding steps back, as in files that were put together."""
+    """Return the rows with one clock where that of decoding steps back, as in files that were put together."""
     steps = [b - a for (_, a, _), (_, b, _) in pairwise(rows) if a is not None and b is not None]
     if len(steps) + 1 < len(rows) or all(step >= 0 for step in steps):
         return rows, False
@@ -209,7 +209,7 @@ def _joined(rows: _Rows) -> tuple[_Rows, bool]:
 
 
 def _other_streams(container: Any) -> tuple[str, ...]:
-    """What is said of a file with more than one video in it."""
+    """Return what is said of a file with more than one video in it."""
     streams = _picture_streams(container)
     if len(streams) < 2:
         return ()
@@ -219,7 +219,7 @@ def _other_streams(container: Any) -> tuple[str, ...]:
 
 
 def _breaks_off(rows: _Rows, container: Any, stream: Any, unit: Fraction) -> tuple[str, ...]:
-    """What is said of a file that is shorter than it states."""
+    """Return what is said of a file that is shorter than it states."""
     if stream.frames and len(rows) < stream.frames:
         return (f"the file breaks off: {len(rows)} of its {stream.frames} frames are there",)
     stated = float(container.duration or 0) / float(av.time_base)

@@ -29,7 +29,7 @@ _MOST_PIXELS = 2**27
 
 
 def is_depth(message: Any) -> bool:
-    """Whether an Image or CompressedImage holds depth."""
+    """Return whether an Image or CompressedImage holds depth."""
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
     return "compressedDepth" in message.format
@@ -64,7 +64,7 @@ def read_depth(message: Any) -> NDArray[Any]:
 
 
 def _rows(message: Any, kind: np.dtype[Any], channels: int) -> NDArray[Any]:
-    """The pixels of an Image, without what pads its rows. Shape (H, W) or (H, W, channels)."""
+    """Return the pixels of an Image, without what pads its rows. Shape (H, W) or (H, W, channels)."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     used = width * channels * kind.itemsize
     data = np.asarray(message.data, np.uint8)

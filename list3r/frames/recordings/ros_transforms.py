@@ -103,7 +103,7 @@ class TransformTree:
         return poses_at(times_s, table[:, 0], table[:, 1:])
 
     def _up(self, frame: str) -> list[str]:
-        """A frame and its parents up to the root; a circle ends where it closes."""
+        """Return a frame and its parents up to the root; a circle ends where it closes."""
         chain = [frame]
         while chain[-1] in self.parents and len(chain) < _LONGEST_CHAIN and self.parents[chain[-1]] not in chain:
             chain.append(self.parents[chain[-1]])

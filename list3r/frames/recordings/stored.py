@@ -45,7 +45,7 @@ class ZipMember:
             return -1
 
     def is_file(self) -> bool:
-        """Whether the archive has the member."""
+        """Return whether the archive has the member."""
         return self.size >= 0
 
     def read_bytes(self) -> bytes:
@@ -62,7 +62,7 @@ class ZipMember:
 
 @lru_cache(maxsize=4)
 def _archive(path: Path) -> zipfile.ZipFile:
-    """The archive, its list read once in a process."""
+    """Return the archive, its list read once in a process."""
     return zipfile.ZipFile(path)
 
 
@@ -81,7 +81,7 @@ class FileSlice:
         return Path(self.name).suffix
 
     def is_file(self) -> bool:
-        """Whether the file reaches as far."""
+        """Return whether the file reaches as far."""
         return self.path.is_file() and self.path.stat().st_size >= self.start + self.size
 
     def read_bytes(self) -> bytes:
@@ -113,11 +113,11 @@ class CodedArray:
         return self.data.name
 
     def is_file(self) -> bool:
-        """Whether it is there."""
+        """Return whether it is there."""
         return self.data.is_file()
 
     def decode(self) -> NDArray[Any]:
-        """The numbers. Shape `shape`. Raises `FrameError`; `OptionError` without the extra."""
+        """Return the numbers. Shape `shape`. Raises `FrameError`; `OptionError` without the extra."""
         try:
             data = self.data.read_bytes()
         except OSError as error:

@@ -83,7 +83,7 @@ class DepthCalibration:
     """Edge pixels used."""
 
     def options(self, base: SourceOptions) -> SourceOptions:
-        """The source's options with what was found."""
+        """Return the source's options with what was found."""
         if self.status == "undetermined":
             return base
         if self.status == "registered":
@@ -97,7 +97,7 @@ class DepthCalibration:
         )
 
     def command_line(self) -> str:
-        """The options that say the same to `list3r build`; empty when nothing was determined."""
+        """Return the options that say the same to `list3r build`; empty when nothing was determined."""
         if self.status != "estimated":
             return ""
         matrix = ",".join(f"{v:.6g}" for v in self.T_color_depth.ravel())
@@ -186,7 +186,7 @@ def _judge(fit: EdgeFit, best: Array, std: dict[str, float], settings: DepthCali
 
 
 def _assumed(fit: EdgeFit, source: FolderSource) -> Array:
-    """The camera as the source is opened with."""
+    """Return the camera as the source is opened with."""
     optics, v = source.optics, fit.start()
     v[1] = optics.distortion[0] if optics.distortion else 0.0
     if optics.T_color_depth is not None:

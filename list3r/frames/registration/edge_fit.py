@@ -58,7 +58,7 @@ class EdgeFit:
         self._maps: tuple[float, Floats] = (-1.0, np.zeros(0, np.float32))
 
     def start(self) -> Array:
-        """The first guess: no offset, no distortion."""
+        """Return the first guess: no offset, no distortion."""
         v = np.zeros(len(NAMES))
         v[[0, 5, 6]] = self._camera.fx, self._camera.cx, self._camera.cy
         return v
@@ -89,7 +89,7 @@ class EdgeFit:
         return float(weights @ met / weights.sum())
 
     def grid(self, start: Array, focal_range: float, offset_range_m: float) -> Array:
-        """The best of a grid of focal lengths and offsets, on strongly blurred edges."""
+        """Return the best of a grid of focal lengths and offsets, on strongly blurred edges."""
         thin = max(1, len(self._slots) // _GRID_EDGES)
         found = []
         for f in start[0] * np.linspace(1 - focal_range, 1 + focal_range, 17):
@@ -101,7 +101,7 @@ class EdgeFit:
         return max(found, key=lambda pair: pair[0])[1]
 
     def climb(self, v: Array, free: list[int], blur_px: float, left_out: tuple[int, int] | None = None) -> Array:
-        """The best camera near `v` over the free numbers (Nelder and Mead's simplex)."""
+        """Return the best camera near `v` over the free numbers (Nelder and Mead's simplex)."""
         step, base = _STEP[free], v
 
         def miss(x: Array) -> float:

@@ -104,7 +104,7 @@ class DepthReprojection:
         return filled
 
     def _one_surface(self, a: NDArray[np.int32], b: NDArray[np.int32], fine: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether pixels a and b of the depth image are at most three apart on one surface. Shape (N,)."""
+        """Return whether pixels a and b of the depth image are at most three apart on one surface. Shape (N,)."""
         width = self._source.width
         (ay, ax), (by, bx) = np.divmod(a, width), np.divmod(b, width)
         near = (np.abs(ay - by) <= 3) & (np.abs(ax - bx) <= 3)
@@ -115,7 +115,7 @@ class DepthReprojection:
 
 
 def _finer(camera: Camera, factor: int) -> Camera:
-    """The camera of an image with `factor` samples for each pixel and axis, sharing the first pixel's centre."""
+    """Return the camera of an image with `factor` samples for each pixel and axis, sharing the first pixel's centre."""
     return Camera(
         (camera.width - 1) * factor + 1,
         (camera.height - 1) * factor + 1,

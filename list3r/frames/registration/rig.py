@@ -19,7 +19,7 @@ from list3r.memory.errors import FrameError, OptionError, SourceError
 
 
 def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, tuple[str, ...]]:
-    """What the layout knows, overruled by what the user says, with notes on what that leaves to assume."""
+    """Return what the layout knows, overruled by what the user says, with notes on what that leaves to assume."""
     optics, notes = layout.optics, []
     if options.registered:
         optics = replace(optics, depth_intrinsics=None, T_color_depth=None)
@@ -141,7 +141,7 @@ def _registration(
 
 
 def _of_size(camera: Camera | None, size: tuple[int, int], what: str) -> Camera | None:
-    """The camera for images of another size and the same shape. Raises `SourceError` for another shape."""
+    """Return the camera for images of another size and the same shape. Raises `SourceError` for another shape."""
     if camera is None or (camera.height, camera.width) == size:
         return camera
     if abs(camera.width * size[0] - camera.height * size[1]) > _MOST_SHEAR * camera.width * size[0]:

@@ -128,7 +128,7 @@ class _Change:
         self._either = cKDTree(np.concatenate([gone, *came]))
 
     def explains(self, support: Array) -> bool:
-        """Whether all of an instance has changed: what is not seen through lies where something else stands now.
+        """Return whether all of an instance has changed: what is not seen through lies where something else stands now.
 
         Two solid things that stood at one place leave surfaces that both sessions measure, so an instance is not asked
         to be seen through as a whole; what reaches beyond the change is a mixture of what went with what stayed.
@@ -202,7 +202,7 @@ class _Maker:
         self._up = R.T @ np.array([0.0, 0.0, 1.0]) if upright else np.array([0.0, -1.0, 0.0])
 
     def make(self, local_id: int, cluster: Array) -> LocalInstance | None:
-        """The local instance of a cluster, or None where its keyframes show too little of it."""
+        """Return the local instance of a cluster, or None where its keyframes show too little of it."""
         tree = cKDTree(cluster)
         reach = 1.5 * self._s.voxel_m * self._unit
         points, rgb, masks = [], [], {}

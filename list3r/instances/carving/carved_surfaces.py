@@ -82,7 +82,7 @@ def lift(view: DepthView) -> tuple[Array, Ints, Ints]:
 
 
 def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: ChangedPlaceSettings) -> CarvedSurfaces:
-    """The surfaces that a chunk's keyframes see, and what the frames of the other sessions tell of them."""
+    """Return the surfaces that a chunk's keyframes see, and what the frames of the other sessions tell of them."""
     points = _cells([lift(v) for v in own], own, unit, s)
     blocks = _SurfaceBlocks(points, s.block_m * unit)
     counts = {}
@@ -141,11 +141,11 @@ def _cells(
 
 
 def gone(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
-    """The surfaces that the other sessions see through. Shape (N, 3)."""
+    """Return the surfaces that the other sessions see through. Shape (N, 3)."""
     through = (seen.free >= s.least_told) & (seen.free >= s.free_share * (seen.free + seen.met))
     return np.asarray(seen.points[seen.own & through])
 
 
 def told(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
-    """The surfaces that the other sessions tell of, one way or the other. Shape (K, 3)."""
+    """Return the surfaces that the other sessions tell of, one way or the other. Shape (K, 3)."""
     return np.asarray(seen.points[seen.free + seen.met >= s.least_told])

@@ -85,5 +85,5 @@ class PrecomputedMasks:
 
 @lru_cache(maxsize=2)
 def _piece(path: Path) -> Piece:
-    """A file, read once for all anchors of a chunk."""
+    """Return a file, read once for all anchors of a chunk."""
     return read_piece(path)

@@ -63,7 +63,7 @@ class QuerySegmenter:
         return choose_candidates(self.look(frames[position].color), views, position, self._settings.candidates)
 
     def look(self, color: NDArray[np.uint8]) -> SoftMasks:
-        """What the network says of one picture (H, W, 3); queries that show nothing are left out."""
+        """Return what the network says of one picture (H, W, 3); queries that show nothing are left out."""
         import torch
 
         with torch.inference_mode():
@@ -78,7 +78,7 @@ class QuerySegmenter:
         return SoftMasks(probability.cpu().numpy(), score[keep].cpu().numpy(), features.cpu().numpy(), names)
 
     def _embedding(self, out: Any) -> torch.Tensor:
-        """The final embedding of each query. Shape (Q, D)."""
+        """Return the final embedding of each query. Shape (Q, D)."""
         if hasattr(out, "transformer_decoder_last_hidden_state"):
             states: torch.Tensor = out.transformer_decoder_last_hidden_state
             return states[0] if states.shape[0] == 1 else states[:, 0]

@@ -30,7 +30,7 @@ def with_movers(
     reconstruction: Reconstruction,
     settings: MoverInstanceSettings | None = None,
 ) -> LocalLibrary:
-    """The library with an instance more for everything that moves; `dynamic`, with its `motion`.
+    """Return the library with an instance more for everything that moves; `dynamic`, with its `motion`.
 
     Their points come from the frames' own depth, for the reconstruction holds what stays alone.
     """

@@ -284,7 +284,7 @@ def _bases(
 def _names(
     proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
 ) -> tuple[tuple[str, float], ...]:
-    """What an instance's candidates were called, with their scores, in order of the anchors."""
+    """Return what an instance's candidates were called, with their scores, in order of the anchors."""
     return tuple(
         (p.names[n], float(p.score[n]))
         for p, owner in zip(proposals, joined, strict=True)

@@ -248,7 +248,7 @@ class _Things:
         return new
 
     def most_wanted(self, live: dict[int, NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:
-        """The largest things in view, as many as may be followed."""
+        """Return the largest things in view, as many as may be followed."""
         order = sorted(live, key=lambda k: (-int(live[k].sum()), k))
         return {k: live[k] for k in sorted(order[: self._settings.most_live])}
 

@@ -41,7 +41,7 @@ class Aliked:
         self._device = torch.device(device)
 
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
-        """The `count` surest features of a picture (H, W, 3), the surest first."""
+        """Return the `count` surest features of a picture (H, W, 3), the surest first."""
         height, width = color.shape[:2]
         with torch.inference_mode():
             picture = torch.from_numpy(np.ascontiguousarray(color)).to(self._device).permute(2, 0, 1)[None].float()
@@ -173,7 +173,7 @@ class _Network(nn.Module):
 
 
 def _network_of(state: dict[str, Tensor], weights: Path) -> _Network:
-    """The network whose sizes the weights tell."""
+    """Return the network whose sizes the weights tell."""
     try:
         one, two = (state[f"block{k}.conv2.weight"].shape[0] for k in (1, 2))
         three, four = (state[f"block{k}.conv2.regular_conv.weight"].shape[0] for k in (3, 4))

@@ -33,7 +33,7 @@ class LearnedDetector(Protocol):
     """A network that detects and describes."""
 
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
-        """The `count` surest features of a picture (H, W, 3)."""
+        """Return the `count` surest features of a picture (H, W, 3)."""
         ...
 
 

@@ -104,7 +104,7 @@ def relative_pose(
     settings: FeatureSettings,
     noise: SensorNoise,
 ) -> FeaturePose | None:
-    """The rigid transform most pairs of 3D points agree on, by seeded RANSAC; None when too few do.
+    """Return the rigid transform most pairs of 3D points agree on, by seeded RANSAC; None when too few do.
 
     `points_a` and `points_b` have shape (M, 3), camera coordinates, metres; pairs with an unknown point are left out.
     """

@@ -32,7 +32,7 @@ class Vocabulary:
     @staticmethod
     @lru_cache(maxsize=1)
     def built_in() -> Vocabulary:
-        """The vocabulary that comes with the package."""
+        """Return the vocabulary that comes with the package."""
         with np.load(Path(__file__).with_name("vocabulary.npz"), allow_pickle=False) as data:
             return Vocabulary(*(data[name].astype(np.float32) for name in ("mean", "axes", "words")))
 

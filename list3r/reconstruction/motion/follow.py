@@ -101,7 +101,7 @@ def middles(blobs: Sequence[Blob], T_chunk_cam: Array) -> Array:
 
 
 def measure_blob(mask: NDArray[np.bool_], color: NDArray[np.uint8], frames: SmallFrames, position: int) -> Blob | None:
-    """A mask of a frame as a blob; None where its depth is unknown. `color` is RGB of any size."""
+    """Return a mask of a frame as a blob; None where its depth is unknown. `color` is RGB of any size."""
     depth = frames.depth[position]
     inside = mask & (depth > 0)
     if inside.sum() < 4:
@@ -227,7 +227,7 @@ def _union(a: Blob, b: Blob) -> Blob:
 
 
 def _expected(track: Followed, position: int, times_s: Array) -> Array:
-    """Where a track goes on to: half of its last speed, for things turn and stop."""
+    """Return where a track goes on to: half of its last speed, for things turn and stop."""
     if len(track.places) < 2:
         return track.places[-1]
     a, b = track.blobs[-2].position, track.blobs[-1].position

@@ -97,7 +97,7 @@ def surfaces(view: WorkingFrame, settings: MoverSettings, noise: SensorNoise) ->
 
 
 def without(view: WorkingFrame, mask: Mask) -> WorkingFrame:
-    """The view with a part unknown."""
+    """Return the view with a part unknown."""
     return replace(view, valid=view.valid & ~mask)
 
 
@@ -169,7 +169,7 @@ class MoverMemory:
         self._home = -1
 
     def expect(self, view: WorkingFrame) -> Mask | None:
-        """What of the next view still belongs to the mover."""
+        """Return what of the next view still belongs to the mover."""
         if self.mask is None or not self.mask.any():
             return None
         out = np.zeros_like(self.mask)

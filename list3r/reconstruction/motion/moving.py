@@ -56,7 +56,7 @@ class SmallFrames:
 def find_moving(
     frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: MovingSurfaceSettings | None = None
 ) -> NDArray[np.bool_] | None:
-    """What moves in each frame, at the size of the small frames; None where nothing does. Shape (F, h, w).
+    """Return what moves in each frame, at the size of the small frames; None where nothing does. Shape (F, h, w).
 
     `hints` are masks of any size by position: what the odometry found to move of its own.
     """
@@ -95,7 +95,7 @@ class _References:
         self._T_cam_chunk = {p: np.linalg.inv(frames.T_chunk_cam[p]) for p in self._positions}
 
     def anything(self, position: int) -> bool:
-        """Whether a coarse look finds something that was seen through."""
+        """Return whether a coarse look finds something that was seen through."""
         through, _ = self._ask(position, 2)
         solid = cv2.morphologyEx(through.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         return bool(solid.sum() >= self._s.least_share * through.size)
@@ -140,7 +140,7 @@ class _References:
         return out
 
     def _ask(self, position: int, step: int) -> tuple[Mask, Mask]:
-        """Which pixels were seen through, and which were seen to stay. Shapes (h, w), thinned out by `step`.
+        """Return which pixels were seen through, and which were seen to stay. Shapes (h, w), thinned out by `step`.
 
         Going away from the frame in time, what was seen through and is there again later was never seen through: so
         a surface that reads badly, or a pose that is wrong, is told from a thing that came or went.
@@ -195,7 +195,7 @@ class _References:
 
 
 def _disagreement(apart: Floats, z: Floats, s: MovingSurfaceSettings) -> float:
-    """By how much two frames disagree about what stands still, metres beyond noise: the error of their poses."""
+    """Return by how much two frames disagree about what stands still, metres beyond noise: the error of their poses."""
     few = slice(None, None, max(1, len(apart) // 1000))
     near = np.abs(apart[few]) < s.near_share * z[few]
     if near.sum() < 20:

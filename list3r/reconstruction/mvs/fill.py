@@ -88,7 +88,7 @@ def _plane_of_rim(
 def _best_plane(
     places: NDArray[np.float64], w: NDArray[np.float64], settings: RegionFillSettings
 ) -> NDArray[np.float64] | None:
-    """The plane through three pixels of the rim that most of it agrees with."""
+    """Return the plane through three pixels of the rim that most of it agrees with."""
     rng = np.random.default_rng(len(w))
     few = rng.choice(len(w), min(300, len(w)), replace=False)
     picks = rng.integers(0, len(w), (settings.hypotheses, 3))

@@ -36,7 +36,7 @@ class SweptDepth:
 def agree_and_fuse(
     seen: SweptDepth, others: Sequence[SweptDepth], warps: Sequence[Warp], settings: DepthFusionSettings
 ) -> DepthMap:
-    """What other keyframes confirm of a keyframe's depth, averaged with theirs."""
+    """Return what other keyframes confirm of a keyframe's depth, averaged with theirs."""
     inverse, variance = seen.inverse, seen.sigma**2
     total, weight = inverse / variance, 1.0 / variance
     square = inverse * total

@@ -37,7 +37,7 @@ def make_pictures(frames: Sequence[Frame], camera: Camera, width: int, device: s
 
 
 def sharpness(gray: NDArray[np.float32]) -> float:
-    """How sharp a picture is: variance of its Laplacian."""
+    """Return how sharp a picture is: variance of its Laplacian."""
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 

@@ -120,7 +120,7 @@ def _one_thread() -> Iterator[None]:
 def stereo_noise(
     depth: NDArray[np.float32], confidence: NDArray[np.float16], settings: MatchTrustSettings | None = None
 ) -> DepthNoise | None:
-    """How rough stereo depth (F, H, W) is: what small windows deviate from a plane, growing with depth squared.
+    """Return how rough stereo depth (F, H, W) is: what small windows deviate from a plane, growing with depth squared.
 
     None where too little is known to measure it. Structure looks like roughness, so the smoother windows decide.
     """
@@ -155,7 +155,7 @@ def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.floa
 
 
 def _prepare(given: PosedFrames, settings: MvsSettings, device: str) -> _Chunk | None:
-    """What every step looks at; None where the cameras do not move."""
+    """Return what every step looks at; None where the cameras do not move."""
     frames, posed, camera, sparse = given.frames, given.posed, given.camera, given.sparse
     T = np.where(posed[:, None, None], given.T_chunk_cam, np.eye(4))
     coarse = make_pictures(frames, camera, min(settings.sweep.coarse_width_px, camera.width), device)
@@ -248,7 +248,7 @@ def _coarse(chunk: _Chunk, row: int) -> tuple[CoarseDepth, list[int]] | None:
 
 
 def _parallax_px(chunk: _Chunk, row: int, sources: list[int], camera: Camera) -> float:
-    """How far one unit of inverse depth moves a pixel in the sources, px: the upper quartile."""
+    """Return how far one unit of inverse depth moves a pixel in the sources, px: the upper quartile."""
     angle = np.radians(chunk.pairs.angle_deg[row, sources])
     return float(np.quantile(np.tan(angle), 0.75) * chunk.depth[chunk.keyframes[row]] * camera.fx)
 
@@ -259,7 +259,7 @@ def _warps(chunk: _Chunk, key: int, others: Sequence[int], camera: Camera) -> li
 
 
 def _sweep(chunk: _Chunk, row: int) -> SweptDepth | None:
-    """A keyframe's own depth, None without parallax."""
+    """Return a keyframe's own depth, None without parallax."""
     swept = _coarse(chunk, row)
     if swept is None:
         return None
@@ -301,7 +301,7 @@ def _keyframe_maps(chunk: _Chunk) -> dict[int, DepthMap]:
 
 
 def _filled(chunk: _Chunk, row: int, depth: DepthMap, frames: Sequence[Frame]) -> DepthMap:
-    """A keyframe's depth with its flat regions without texture filled."""
+    """Return a keyframe's depth with its flat regions without texture filled."""
     height, width = depth.inverse.shape
     color = cv2.resize(frames[chunk.keyframes[row]].color, (width, height), interpolation=cv2.INTER_AREA)
     small = fill_flat(depth, chunk.settings.fusion)
@@ -322,7 +322,7 @@ def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> Depth
 
 
 def _remoteness(chunk: _Chunk, row: int, position: int) -> float:
-    """How little of a frame a keyframe sees; 0 for the frame itself."""
+    """Return how little of a frame a keyframe sees; 0 for the frame itself."""
     return 0.0 if chunk.keyframes[row] == position else 1.0 - float(chunk.pairs.overlap[row, position])
 
 

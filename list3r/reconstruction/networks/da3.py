@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
-    """The model with the weights that the options name."""
+    """Return the model with the weights that the options name."""
     return FeedforwardReconstructor(NETWORK, options)
 
 

@@ -88,7 +88,7 @@ class Network:
         return card
 
     def load(self, path: Path, device: torch.device) -> Any:
-        """The network with the weights at a path. Raises `OptionError` in one line."""
+        """Return the network with the weights at a path. Raises `OptionError` in one line."""
         return self.load_class(upstream_class(self.card, self.module, self.class_name), path, device)
 
 
@@ -165,7 +165,7 @@ def shrink(pictures: Sequence[NDArray[np.uint8]], height: int, width: int) -> ND
 
 
 def numpy(tensor: torch.Tensor) -> NDArray[Any]:
-    """A tensor as an array; half precision becomes float32."""
+    """Return a tensor as an array; half precision becomes float32."""
     return np.asarray(tensor.detach().float().cpu().numpy())
 
 

@@ -38,12 +38,12 @@ AT_ONCE = 4
 
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
-    """The model with the weights that the options name."""
+    """Return the model with the weights that the options name."""
     return FeedforwardReconstructor(NETWORK, options)
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """The network from its own weights and code alone; nothing is fetched."""
+    """Return the network from its own weights and code alone; nothing is fetched."""
     with _backbones_of_the_package():
         return load_upstream(cls, path, device)
 

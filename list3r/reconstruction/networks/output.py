@@ -41,7 +41,7 @@ class WindowOutput:
         return self.T_window_cam, self.depth, self.confidence, self.focal
 
     def part(self, which: slice | NDArray[Any]) -> WindowOutput:
-        """Some of the frames."""
+        """Return some of the frames."""
         return WindowOutput(*(a[which] for a in self.arrays()))
 
     def valid(self) -> NDArray[np.bool_]:
@@ -124,7 +124,7 @@ def to_reconstruction(
 
 
 def network_camera(camera: Camera, output: WindowOutput, posed: NDArray[np.bool_]) -> Camera:
-    """The camera of the frames with the median of the focal lengths that the network found, px of the frames."""
+    """Return the camera of the frames with the median of the focal lengths that the network found, px of the frames."""
     height, width = output.depth.shape[1:]
     fx, fy = (float(f) for f in np.median(output.focal[posed], axis=0))
     middle = (camera.width - 1) / 2.0, (camera.height - 1) / 2.0

@@ -24,7 +24,7 @@ PIXEL_LIMIT = 255_000
 
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
-    """The model with the weights that the options name."""
+    """Return the model with the weights that the options name."""
     return FeedforwardReconstructor(NETWORK, options)
 
 
@@ -34,7 +34,7 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
 
 
 def read(output: dict[str, torch.Tensor]) -> WindowOutput:
-    """The network's outputs in our terms."""
+    """Return the network's outputs in our terms."""
     import torch
 
     points = numpy(output["local_points"][0])

@@ -26,12 +26,12 @@ AT_ONCE = 8
 
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
-    """The model with the weights that the options name."""
+    """Return the model with the weights that the options name."""
     return FeedforwardReconstructor(NETWORK, options)
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """The network, whose decoder looks for no poses and whose heads take a few pictures at a time."""
+    """Return the network, whose decoder looks for no poses and whose heads take a few pictures at a time."""
     model = load_upstream(cls, path, device)
     if hasattr(model, "decode"):
         _decode_without_poses(model)

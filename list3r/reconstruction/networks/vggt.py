@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 def make(options: ModelOptions) -> FeedforwardReconstructor:
-    """The model with the weights that the options name."""
+    """Return the model with the weights that the options name."""
     return FeedforwardReconstructor(NETWORK, options)
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """The network without the heads whose answers are not read: a quarter of a pass and of its weights."""
+    """Return the network without the heads whose answers are not read: a quarter of a pass and of its weights."""
     model = load_upstream(cls, path, device)
     model.point_head = model.track_head = None
     return model

@@ -63,7 +63,7 @@ def join(before: WindowOutput, after: WindowOutput, shared: int) -> WindowOutput
 
 
 def regauged(output: WindowOutput, S: Sim3) -> WindowOutput:
-    """An answer in another gauge, S from its own."""
+    """Return an answer in another gauge, S from its own."""
     T = output.T_window_cam.copy()
     T[:, :3, :3] = S.rotation @ T[:, :3, :3]
     T[:, :3, 3] = S.apply(output.T_window_cam[:, :3, 3])

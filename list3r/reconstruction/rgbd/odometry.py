@@ -72,7 +72,7 @@ class CameraTracker:
         return self._join()
 
     def view(self, position: int) -> WorkingFrame:
-        """The frame at working resolution, without what moves of its own."""
+        """Return the frame at working resolution, without what moves of its own."""
         view = self._whole_view(position)
         return without(view, self._moving[position]) if position in self._moving else view
 
@@ -90,7 +90,7 @@ class CameraTracker:
         return {position: mask for position, mask in sorted(self._moving.items()) if mask.any()}
 
     def features(self, position: int) -> Features:
-        """The frame's local features, found once."""
+        """Return the frame's local features, found once."""
         if position not in self._features:
             frame = self.frames[position]
             assert frame.depth is not None
@@ -119,7 +119,7 @@ class CameraTracker:
         self._accept(self.segments[-1], position, np.eye(4))
 
     def _open_segments(self) -> list[TrackedSegment]:
-        """The last segment, and the longest one while the last may be no more than a few spoilt frames."""
+        """Return the last segment, and the longest one while the last may be no more than a few spoilt frames."""
         last = self.segments[-1:]
         longest = max(self.segments, key=lambda s: len(s.T_segment_cam), default=None)
         short = bool(last) and len(last[0].T_segment_cam) < self.settings.short_segment
@@ -158,7 +158,7 @@ class CameraTracker:
         return shows_more(step, far, self.settings.keyframes)
 
     def _follow(self, segment: TrackedSegment, position: int) -> Pose | None:
-        """The frame's pose in the segment, or None when nothing trustworthy is found."""
+        """Return the frame's pose in the segment, or None when nothing trustworthy is found."""
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
         found: list[FrameRegistration | None] = []
@@ -181,7 +181,7 @@ class CameraTracker:
         return best.T_model_cam
 
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
-        """Whether much less agrees than did in the frames before, as in a false minimum."""
+        """Return whether much less agrees than did in the frames before, as in a false minimum."""
         return found is None or found.inliers < self.settings.doubt * segment.usual_inliers
 
     def _predict(self, segment: TrackedSegment, last: int, gap_s: float) -> Pose | None:
@@ -215,7 +215,7 @@ class CameraTracker:
         return found if found is not None and self._trusted(found, samples, position, blind) else None
 
     def _trusted(self, found: FrameRegistration, samples: Samples, position: int, blind: bool) -> bool:
-        """Whether a registration can be believed; one from a blind guess must agree in brightness as well."""
+        """Return whether a registration can be believed; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
         share = float(view.valid.mean())
         agrees = found.correlation >= s.least_correlation if blind else not found.correlation < s.least_correlation

@@ -121,7 +121,7 @@ def steps_without(
     settings: RegistrationSettings,
     noise: SensorNoise,
 ) -> list[NDArray[np.float64] | None]:
-    """The step (4, 4) from a registered pose that the rest of the view would take if a part were left out.
+    """Return the step (4, 4) from a registered pose that the rest of the view would take if a part were left out.
 
     `masks` are the parts, (h, w) each; None where the rest is too little. One Gauss-Newton step, on shared residuals.
     """
@@ -333,7 +333,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _exp(step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A small rigid motion of (translation, rotation vector). Shape (6,) -> (4, 4)."""
+    """Return a small rigid motion of (translation, rotation vector). Shape (6,) -> (4, 4)."""
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(step[3:])[0]
     T[:3, 3] = step[:3]

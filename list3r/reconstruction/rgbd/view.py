@@ -84,7 +84,7 @@ def surface(depth: Floats, camera: Camera) -> tuple[Floats, Floats, NDArray[np.b
 
 
 def make_view(color: NDArray[np.uint8], depth: Floats, camera: Camera, noise: SensorNoise) -> WorkingFrame:
-    """The view of a frame for `camera`, which is the frame's own camera shrunk. `color` is RGB (H, W, 3)."""
+    """Return the view of a frame for `camera`, which is the frame's own camera shrunk. `color` is RGB (H, W, 3)."""
     small = shrink_depth(depth, camera, noise)
     points, normals, valid = surface(small, camera)
     gray = cv2.cvtColor(

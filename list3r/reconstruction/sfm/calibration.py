@@ -95,7 +95,7 @@ class _Estimate:
 
 
 def _estimated(source: FrameSource, start: Camera, sfm: SfmSettings, progress: Progress | None) -> _Estimate | None:
-    """What is said by the windows that could be mapped and can be believed; None where they make no sense."""
+    """Return what is said by the windows that could be mapped and can be believed; None where they make no sense."""
     settings = sfm.calibration
     windows, begins, spans = [], [], _spans(source.info.frame_count, settings)
     for done, (a, b) in enumerate(spans, start=1):
@@ -117,7 +117,7 @@ def _estimated(source: FrameSource, start: Camera, sfm: SfmSettings, progress: P
 
 
 def _believable(camera: Camera, k1: float, settings: CameraCalibrationSettings) -> bool:
-    """Whether a camera has such a lens."""
+    """Return whether a camera has such a lens."""
     share = camera.fx / max(camera.width, camera.height)
     (short, long), (least, most) = settings.focal_range, settings.distortion_range
     return short < share < long and least <= k1 <= most
@@ -132,12 +132,12 @@ def _agreeing(focals: NDArray[np.float64], settings: CameraCalibrationSettings) 
 
 
 def _index_at(source: FrameSource, position: int) -> int:
-    """The number in the source of the frame at a position."""
+    """Return the number in the source of the frame at a position."""
     return next((f.index for f in source.read(position, position + 1)), position)
 
 
 def _parted(found: _Estimate, stored_px: float, settings: CameraCalibrationSettings) -> tuple[str, ...]:
-    """What is said where windows that can be believed tell clearly different focal lengths."""
+    """Return what is said where windows that can be believed tell clearly different focal lengths."""
     if found.frames < settings.frames:
         return ()
     far = [
@@ -183,7 +183,7 @@ def _spans(count: int, settings: CameraCalibrationSettings) -> list[tuple[int, i
 def _window(
     source: FrameSource, start: int, stop: int, camera: Camera, settings: SfmSettings
 ) -> tuple[MapProblem, SparseMap] | None:
-    """The largest map of a window with a camera of its own."""
+    """Return the largest map of a window with a camera of its own."""
     frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
     if len(frames) < 2:
         return None
@@ -260,7 +260,7 @@ def _cam_from_map(T_map_cam: Poses) -> pycolmap.Rigid3d:
 
 
 def _lens(camera: Camera, k1: float, settings: CameraCalibrationSettings) -> Camera:
-    """The camera with its distortion, unless that shifts nothing."""
+    """Return the camera with its distortion, unless that shifts nothing."""
     x, y = max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)
     square = (x / camera.fx) ** 2 + (y / camera.fy) ** 2
     if abs(k1) * square * float(np.hypot(x, y)) < settings.least_shift_px:

@@ -43,17 +43,17 @@ def pixel_unit(camera: Camera) -> float:
 
 
 def matrix_of(rigid: Any) -> NDArray[np.float64]:
-    """The pose that a `Rigid3d` is. Shape (4, 4)."""
+    """Return the pose that a `Rigid3d` is. Shape (4, 4)."""
     T = np.eye(4)
     T[:3] = rigid.matrix()
     return T
 
 
 def rigid_of(T: NDArray[np.float64]) -> Any:
-    """A pose (4, 4) as a `Rigid3d`."""
+    """Return a pose (4, 4) as a `Rigid3d`."""
     return pycolmap.Rigid3d(T[:3].copy())
 
 
 def inverse(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of a pose (4, 4)."""
+    """Return the inverse of a pose (4, 4)."""
     return np.asarray(np.linalg.inv(T), np.float64)

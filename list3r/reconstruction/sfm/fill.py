@@ -82,7 +82,7 @@ def _fill(
 def _with_features(
     found: SparseMap, position: int, tracks: CornerTracks, xy: Floats, points: NDArray[np.float64]
 ) -> tuple[Floats, NDArray[np.float64]]:
-    """What a keyframe sees of the map by its corners, and what it sees by other features."""
+    """Return what a keyframe sees of the map by its corners, and what it sees by other features."""
     seen = found.seen[position]
     rows = np.flatnonzero(~np.isin(seen.ids, tracks.ids[position])).tolist()
     if not rows:

@@ -33,7 +33,7 @@ class LocalFeatures:
     """Lowe's ratio that suits them."""
 
     def surest(self, count: int) -> LocalFeatures:
-        """The first so many."""
+        """Return the first so many."""
         return LocalFeatures(self.xy[:count], self.descriptors[:count], self.ratio)
 
 

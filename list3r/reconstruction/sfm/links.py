@@ -25,7 +25,7 @@ _AHEAD_IDS = 500_000
 def keyframe_problem(
     tracks: CornerTracks, grays: Sequence[Gray], settings: LinkSettings | None = None, finder: Finder | None = None
 ) -> MapProblem:
-    """The keyframes of a chunk as a problem for the mapper, by position in the chunk.
+    """Return the keyframes of a chunk as a problem for the mapper, by position in the chunk.
 
     `finder` finds features where tracks do not reach; None takes SIFT.
     """
@@ -43,7 +43,7 @@ def keyframe_problem(
 
 
 def step_beside(tracks: CornerTracks, settings: LinkSettings) -> int:
-    """How many frames apart those that are mapped beside a chunk are."""
+    """Return how many frames apart those that are mapped beside a chunk are."""
     apart = settings.beside_step * len(tracks.run) / max(1, len(tracks.keyframes))
     return int(np.clip(round(apart), 1, settings.most_step))
 
@@ -80,7 +80,7 @@ def with_neighbours(
 
 
 def with_features(problem: MapProblem, finder: Finder, settings: LinkSettings) -> MapProblem:
-    """The problem with keyframes that look alike, and share no tracks, matched by features."""
+    """Return the problem with keyframes that look alike, and share no tracks, matched by features."""
     views, pairs = dict(problem.views), dict(problem.pairs)
     found = {key: finder(key) for key in sorted(views)}
     first = {key: len(view.ids) for key, view in views.items()}

@@ -37,7 +37,7 @@ class KeyframeView:
     """px. Shape (N, 2)."""
 
     def where(self, rows: Sequence[int]) -> KeyframeView:
-        """Some of the correspondences."""
+        """Return some of the correspondences."""
         chosen = np.array(rows, np.int64)
         return KeyframeView(self.ids[chosen], self.xy[chosen])
 
@@ -145,13 +145,13 @@ def _grown(
 
 
 def _turns(problem: MapProblem, keys: Collection[int], camera: Camera, settings: MappingSettings) -> bool:
-    """Whether the camera only turns in some of the views."""
+    """Return whether the camera only turns in some of the views."""
     places = {key: view.xy for key, view in problem.views.items()}
     return only_turns(places, problem.pairs, keys, camera, settings.turning)
 
 
 def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[SparseMap]:
-    """The maps without the views beside, the largest first."""
+    """Return the maps without the views beside, the largest first."""
     left = []
     for found in maps:
         poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
@@ -162,7 +162,7 @@ def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[Spar
 
 
 def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
-    """Whether two maps that fell into no pieces hold as many keyframes and explain the pictures alike.
+    """Return whether two maps that fell into no pieces hold as many keyframes and explain the pictures alike.
 
     Bent rooms may agree too, but where a room bends something is often left that does not fit.
     """
@@ -171,7 +171,7 @@ def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
 
 
 def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
-    """Those whose largest map has the least error among the ones that are about as large as any."""
+    """Return those whose largest map has the least error among the ones that are about as large as any."""
     most = max((len(maps[0].T_map_cam) for maps in grown if maps), default=0)
     large = [maps for maps in grown if maps and len(maps[0].T_map_cam) >= alike * most]
     return min(large, key=lambda maps: maps[0].error_px, default=[])
@@ -180,7 +180,7 @@ def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
 def _borne_out(
     found: SparseMap, problem: MapProblem, cache: Any, camera: Camera, settings: MappingSettings
 ) -> SparseMap:
-    """The map without keyframes that their matches contradict."""
+    """Return the map without keyframes that their matches contradict."""
     seen = {}
     for a, b in sorted(problem.pairs):
         if a in found.T_map_cam and b in found.T_map_cam:

@@ -184,7 +184,7 @@ def _gray(frame: Frame) -> Gray:
 
 
 def _renumbered(segment: PosedSegment, kept: Sequence[int]) -> PosedSegment:
-    """The segment with its frames numbered by their place in `kept`."""
+    """Return the segment with its frames numbered by their place in `kept`."""
     place = {k: n for n, k in enumerate(kept)}
     return PosedSegment(
         segment.found,
@@ -218,7 +218,7 @@ def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSe
 
 
 def _no_map(frames: Sequence[Frame], tracks: CornerTracks) -> TrackingError:
-    """What is wrong with frames of which no map could be made."""
+    """Return what is wrong with frames of which no map could be made."""
     if int(tracks.run.max()) > len(tracks.run) // 4:
         why = "the camera moves too fast to be followed; film slower, or take more frames"
         return TrackingError(f"{_span(frames)}: {why}")

@@ -26,13 +26,13 @@ Rows = Mapping[tuple[int, int], NDArray[np.int64]]
 def only_turns(
     places: Places, pairs: Rows, keys: Collection[int], camera: Camera, settings: TurningSettings | None = None
 ) -> bool:
-    """Whether the views `keys` of one camera can be explained without it having moved."""
+    """Return whether the views `keys` of one camera can be explained without it having moved."""
     s = settings or TurningSettings()
     return turning_error(_farthest_pairs(places, pairs, keys, s), camera, s) < s.most_px
 
 
 def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settings: TurningSettings) -> float:
-    """What the best rotations leave at the best focal length, px of a picture 640 wide; 0 without pairs."""
+    """Return what the best rotations leave at the best focal length, px of a picture 640 wide; 0 without pairs."""
     if not pairs:
         return 0.0
     longer = max(camera.width, camera.height)
@@ -64,7 +64,7 @@ def _farthest_pairs(
 
 
 def _pair_error(a: Floats, b: Floats, focal: float, settings: TurningSettings) -> float:
-    """The settings' percentile of what the best rotation between two views leaves, px."""
+    """Return the settings' percentile of what the best rotation between two views leaves, px."""
     rays_a, rays_b = (np.column_stack([xy, np.full(len(xy), focal)]) for xy in (a, b))
     rays_a, rays_b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (rays_a, rays_b))
     kept = np.ones(len(a), bool)

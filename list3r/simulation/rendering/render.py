@@ -52,7 +52,7 @@ class Renderer:
         self._y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
 
     def render(self, T_world_cam: Array) -> RenderedFrame:
-        """The picture from a pose. Shape (4, 4)."""
+        """Return the picture from a pose. Shape (4, 4)."""
         rects = screen_rectangles(self.scene.corners, T_world_cam, self._camera)
         depth, solid = self._cast(T_world_cam, *rects)
         shape = depth.shape

@@ -60,7 +60,7 @@ class SensedFrame:
 
 
 def sense(frame: RenderedFrame, settings: SensorSettings, seed: int, index: int, time_s: float) -> SensedFrame:
-    """The noisy reading of a rendered frame; the same for the same seed and index."""
+    """Return the noisy reading of a rendered frame; the same for the same seed and index."""
     low, high = settings.range_m
     if not settings.noise:
         depth = np.where((frame.depth >= low) & (frame.depth <= high), frame.depth, 0).astype(np.float32)

@@ -9,23 +9,23 @@ Parts = tuple[Part, ...]
 
 
 def block(size: Vec3, center: Vec3, material: Material, yaw: float = 0.0) -> Part:
-    """A box of full `size` about `center`."""
+    """Return a box of full `size` about `center`."""
     return Part(BOX, center, (size[0] / 2, size[1] / 2, size[2] / 2), material, yaw)
 
 
 def pillar(radius: float, height: float, base: Vec3, material: Material, *, open_top: bool = False) -> Part:
-    """A cylinder standing on `base`."""
+    """Return a cylinder standing on `base`."""
     x, y, z = base
     return Part(CYLINDER, (x, y, z + height / 2), (radius, radius, height / 2), material, open_top=open_top)
 
 
 def globe(radius: float, center: Vec3, material: Material, *, open_top: bool = False) -> Part:
-    """A sphere, or its lower half as a shell."""
+    """Return a sphere, or its lower half as a shell."""
     return Part(SPHERE, center, (radius, radius, radius), material, open_top=open_top)
 
 
 def table(size: Vec3, material: Material, leg_m: float = 0.06, top_m: float = 0.04) -> Parts:
-    """A top on four legs."""
+    """Return a top on four legs."""
     w, d, h = size
     x, y = w / 2 - leg_m, d / 2 - leg_m
     legs = [
@@ -35,7 +35,7 @@ def table(size: Vec3, material: Material, leg_m: float = 0.06, top_m: float = 0.
 
 
 def chair(material: Material, cushion: Material, seat_m: float = 0.44, slats: int = 2) -> Parts:
-    """A seat on four legs with a slatted back."""
+    """Return a seat on four legs with a slatted back."""
     h, leg, back = 0.45, 0.04, 0.90
     e = seat_m / 2 - leg / 2
     parts = [block((seat_m, seat_m, 0.04), (0, 0, h - 0.04), material)]
@@ -78,7 +78,7 @@ def bed(width: float, length: float, wood: Material, linen: Material, blanket: M
 
 
 def cabinet(size: Vec3, body: Material, front: Material, doors: int = 2) -> Parts:
-    """A body with doors and knobs."""
+    """Return a body with doors and knobs."""
     w, d, h = size
     parts = [block((w, d - 0.02, h), (0, -0.01, h / 2), body)]
     each = w / doors
@@ -104,7 +104,7 @@ def shelf_boards(height: float, boards: int) -> list[float]:
 
 
 def plant(pot: Material, leaf: Material) -> Parts:
-    """A pot with a stem and round leaves."""
+    """Return a pot with a stem and round leaves."""
     leaves = [(0, 0, 0.78, 0.16), (0.13, 0.04, 0.62, 0.13), (-0.12, -0.06, 0.60, 0.13), (0.0, 0.13, 0.92, 0.11)]
     return (
         pillar(0.15, 0.30, (0, 0, 0), pot),
@@ -114,7 +114,7 @@ def plant(pot: Material, leaf: Material) -> Parts:
 
 
 def mug(radius: float, height: float, material: Material) -> Parts:
-    """An open cylinder with a handle."""
+    """Return an open cylinder with a handle."""
     reach = 0.035
     return (
         pillar(radius, height, (0, 0, 0), material, open_top=True),
@@ -125,7 +125,7 @@ def mug(radius: float, height: float, material: Material) -> Parts:
 
 
 def carton(size: Vec3, material: Material, tape: Material) -> Parts:
-    """A closed box with a strip of tape."""
+    """Return a closed box with a strip of tape."""
     _, d, h = size
     return (block(size, (0, 0, h / 2), material), block((0.04, d + 0.002, h + 0.001), (0, 0, (h + 0.001) / 2), tape))
 
@@ -152,7 +152,7 @@ def book_row(covers: tuple[Material, ...], depth: float = 0.17) -> Parts:
 
 
 def bowl(radius: float, material: Material) -> Parts:
-    """A half sphere, open above, on a foot."""
+    """Return a half sphere, open above, on a foot."""
     return (
         globe(radius, (0, 0, radius), material, open_top=True),
         pillar(radius * 0.5, 0.02, (0, 0, 0), material),
@@ -160,12 +160,12 @@ def bowl(radius: float, material: Material) -> Parts:
 
 
 def ball(radius: float, material: Material) -> Parts:
-    """A sphere."""
+    """Return a sphere."""
     return (globe(radius, (0, 0, radius), material),)
 
 
 def vase(radius: float, height: float, material: Material) -> Parts:
-    """A belly with a neck."""
+    """Return a belly with a neck."""
     return (
         globe(radius, (0, 0, radius), material),
         pillar(radius * 0.6, height - radius, (0, 0, radius), material, open_top=True),
@@ -182,7 +182,7 @@ def lamp(height: float, base: Material, shade: Material) -> Parts:
 
 
 def monitor(width: float, frame: Material, screen: Material) -> Parts:
-    """A screen on a stand."""
+    """Return a screen on a stand."""
     h = width * 0.58
     return (
         block((width * 0.45, 0.18, 0.02), (0, 0, 0.01), frame),
@@ -193,7 +193,7 @@ def monitor(width: float, frame: Material, screen: Material) -> Parts:
 
 
 def basket(radius: float, height: float, material: Material) -> Parts:
-    """An open cylinder."""
+    """Return an open cylinder."""
     return (pillar(radius, height, (0, 0, 0), material, open_top=True),)
 
 

@@ -79,13 +79,13 @@ def _corner_to_side(a: Array, b: Array) -> Array:
 
 
 def _overlap(a: Array, b: Array) -> NDArray[np.bool_]:
-    """Whether two rectangles, or a rectangle and a point, overlap; two points never do. Shape (N, M)."""
+    """Return whether two rectangles, or a rectangle and a point, overlap; two points never do. Shape (N, M)."""
     wide = np.any(a[:, 0] != a[:, 2], axis=1)[:, None] | np.any(b[:, 0] != b[:, 2], axis=1)[None]
     return np.asarray(~(_parted(a, b) | _parted(b, a).T) & wide)
 
 
 def _parted(a: Array, b: Array) -> NDArray[np.bool_]:
-    """Whether a side of each of `a` has all of each of `b` beyond it. Shape (N, M)."""
+    """Return whether a side of each of `a` has all of each of `b` beyond it. Shape (N, M)."""
     out = np.zeros((len(a), len(b)), dtype=bool)
     for k in (0, 1):
         axis = a[:, k + 1] - a[:, k]

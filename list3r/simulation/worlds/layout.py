@@ -81,28 +81,28 @@ class Placer:
         return thing
 
     def add_structure(self, label: str, parts: f.Parts) -> SimulatedThing:
-        """A floor, wall or ceiling, whose parts are in world coordinates."""
+        """Return a floor, wall or ceiling, whose parts are in world coordinates."""
         thing = SimulatedThing(len(self.things) + 1, label, parts, (0.0, 0.0, 0.0), structure=label)
         self.things.append(thing)
         return thing
 
     def wood(self, tile_m: float = 0.8) -> Material:
-        """A wood drawn from the palette."""
+        """Return a wood drawn from the palette."""
         low, high = WOODS[self.rng.integers(len(WOODS))]
         return Material("wood", low, high, tile_m, int(self.rng.integers(1 << 16)))
 
     def fabric(self, kind: str = "fabric") -> Material:
-        """A cloth drawn from the palette."""
+        """Return a cloth drawn from the palette."""
         low, high = FABRICS[self.rng.integers(len(FABRICS))]
         return Material(kind, low, high, 0.6, int(self.rng.integers(1 << 16)))
 
     def bright(self, kind: str, tile_m: float) -> Material:
-        """A vivid surface for small things."""
+        """Return a vivid surface for small things."""
         low, high = BRIGHT[self.rng.integers(len(BRIGHT))]
         return Material(kind, low, high, tile_m, int(self.rng.integers(1 << 16)))
 
     def small(self, kind: str) -> tuple[f.Parts, float]:
-        """The parts of a small thing and the radius that it takes up, metres."""
+        """Return the parts of a small thing and the radius that it takes up, metres."""
         rng = self.rng
         if kind == "mug":
             radius = rng.uniform(0.042, 0.05)
@@ -278,7 +278,7 @@ def furnish_bedroom(p: Placer, room: Room, walls: dict[str, int], floor: int) ->
 
 
 def wall_paint(p: Placer) -> Material:
-    """A pale plaster, each time another."""
+    """Return a pale plaster, each time another."""
     tints = ((222, 210, 188), (196, 208, 214), (206, 214, 196), (224, 202, 192), (212, 206, 216))
     r, g, b = tints[int(p.rng.integers(len(tints)))]
     return Material("plaster", (r, g, b), (r - 46, g - 44, b - 40), 1.3, int(p.rng.integers(1 << 16)))

@@ -29,13 +29,13 @@ class Material:
 
 
 def bake(material: Material) -> Floats:
-    """The tile of a material, RGB in [0, 255]. Shape (TEXTURE_PX, TEXTURE_PX, 3)."""
+    """Return the tile of a material, RGB in [0, 255]. Shape (TEXTURE_PX, TEXTURE_PX, 3)."""
     rng = np.random.default_rng([material.seed, 77])
     return np.asarray(np.clip(_KINDS[material.kind](material, rng), 0, 255), dtype=np.float32)
 
 
 def mip_levels(tile: Floats, count: int) -> list[Floats]:
-    """The tile and its halvings by 2x2 means, as an image pyramid against aliasing."""
+    """Return the tile and its halvings by 2x2 means, as an image pyramid against aliasing."""
     levels = [tile]
     for _ in range(count - 1):
         t = levels[-1]

@@ -66,7 +66,7 @@ class SimulatedThing:
     """floor, wall or ceiling for what bounds the room."""
 
     def is_round(self) -> bool:
-        """Whether it looks the same from all sides, so that the yaw of its box means nothing."""
+        """Return whether it looks the same from all sides, so that the yaw of its box means nothing."""
         return all(part.kind != BOX and part.center[:2] == (0, 0) for part in self.parts)
 
     def rotation(self) -> Array:
@@ -75,7 +75,7 @@ class SimulatedThing:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def box(self) -> OrientedBox:
-        """The upright box of all its parts in the world."""
+        """Return the upright box of all its parts in the world."""
         extents = [part.extent() for part in self.parts]
         low, high = np.min([e[0] for e in extents], axis=0), np.max([e[1] for e in extents], axis=0)
         rotation = self.rotation()
@@ -124,7 +124,7 @@ class Solids:
 
 
 def stack_solids(things: Sequence[SimulatedThing]) -> Solids:
-    """The parts of all things in the world frame."""
+    """Return the parts of all things in the world frame."""
     pairs = [(thing, part) for thing in things for part in thing.parts]
     materials = tuple(dict.fromkeys(part.material for _, part in pairs))
     index = {material: k for k, material in enumerate(materials)}

@@ -21,7 +21,7 @@ SHARED_HEIGHT = 0.3
 
 
 def world_truth(world: SimulatedWorld, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
-    """The content of `truth.json`: frame, instances with boxes, relations.
+    """Return the content of `truth.json`: frame, instances with boxes, relations.
 
     `seen` maps the id of a thing to counts of the walk: frames in which it shows, and its largest area in pixels.
     """
@@ -78,7 +78,7 @@ def true_relations(world: SimulatedWorld) -> list[tuple[int, str, int]]:
 
 
 def _close(a: SimulatedThing, b: SimulatedThing) -> list[str]:
-    """Which of near and next_to two things are."""
+    """Return which of near and next_to two things are."""
     if a.id in (b.support, b.container) or b.id in (a.support, a.container):
         return []
     one, two = a.box(), b.box()

@@ -36,12 +36,12 @@ class SimulatedWorld:
     """A round through both rooms that comes back to where it starts."""
 
     def thing(self, thing_id: int) -> SimulatedThing:
-        """The thing of an id. Raises `KeyError`."""
+        """Return the thing of an id. Raises `KeyError`."""
         return {t.id: t for t in self.things}[thing_id]
 
 
 def make_world(seed: int = 0) -> SimulatedWorld:
-    """The world of a seed: sizes, colours, mirroring and small things are drawn from it."""
+    """Return the world of a seed: sizes, colours, mirroring and small things are drawn from it."""
     rng = np.random.default_rng([seed, 1])
     depth = 3.8
     living = Room(0.0, 4.0, depth, bool(rng.integers(2)))
@@ -85,7 +85,7 @@ def _floor(p: Placer, room: Room) -> int:
 
 
 def _dividing_wall(p: Placer, room: Room) -> f.Parts:
-    """The wall with the doorway in its middle and a wooden frame round it."""
+    """Return the wall with the doorway in its middle and a wooden frame round it."""
     paint, trim = wall_paint(p), p.wood(0.7)
     x, (wide, high) = room.x1 + WALL_M / 2, DOOR_M
     pier = (room.depth - wide) / 2
