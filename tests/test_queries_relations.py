@@ -15,7 +15,7 @@ from list3r.memory.records import Relation
 from list3r.memory.store.store import Store
 from list3r.queries.path import path
 from list3r.queries.relations import Relations, relations
-from list3r.queries.views.viewpoint import Viewer, between, viewed
+from list3r.queries.views.viewpoint import Viewpoint, between, viewed
 from tests.conftest import instance, write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
@@ -55,7 +55,7 @@ def test_from_an_instance_and_from_a_camera(store: Store) -> None:
 def test_sides_are_inverse_and_turn_with_the_world(places: list[float], sizes: list[float]) -> None:
     a = instance(1, tuple(places[:3]), tuple(sizes[:3]), (1, 1, 1))
     b = instance(2, tuple(places[3:6]), tuple(sizes[3:]), (1, 1, 1))
-    viewer = Viewer(np.array(places[6:]), UP, "here")
+    viewer = Viewpoint(np.array(places[6:]), UP, "here")
     one, two = viewed(viewer, a, b, 0.015), viewed(viewer, b, a, 0.015)
     assert (one is None) == (two is None)
     if one is None or two is None:
@@ -64,7 +64,7 @@ def test_sides_are_inverse_and_turn_with_the_world(places: list[float], sizes: l
     assert {(inverse[r.predicate], r.margin) for r in one} == {(r.predicate, r.margin) for r in two}
     assert all(r.margin > 0 and 0.5 <= r.confidence <= 1 for r in one)
     moved = [instance(n, tuple(i.center + 5), tuple(i.box.size), (1, 1, 1)) for n, i in ((1, a), (2, b))]
-    again = viewed(Viewer(viewer.place + 5, UP, "there"), *moved, 0.015) or []
+    again = viewed(Viewpoint(viewer.place + 5, UP, "there"), *moved, 0.015) or []
     assert {r.predicate for r in again if r.margin > 1e-4} == {r.predicate for r in one if r.margin > 1e-4}
 
 
@@ -104,7 +104,7 @@ def test_what_needs_gravity_is_unknown_without_it(store: Store) -> None:
 
 def test_parts_that_are_not_joined_have_no_sides(store: Store) -> None:
     a, b = instance(1, (1, 0, 0), (1, 1, 1), (1, 1, 1)), instance(2, (3, 3, 0), (1, 1, 1), (1, 1, 1), component=2)
-    assert viewed(Viewer(np.zeros(3), UP, "here"), a, b, 0.01) is None
+    assert viewed(Viewpoint(np.zeros(3), UP, "here"), a, b, 0.01) is None
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_ways_need_not_lead_over_the_floor(store: Store) -> None:
 
 
 def test_a_side_must_be_clear_of_half_of_the_larger_of_the_two() -> None:
-    viewer = Viewer(np.zeros(3), UP, "here")
+    viewer = Viewpoint(np.zeros(3), UP, "here")
     wide, small = (
         instance(1, (2, 0, 0), (0.4, 1.0, 0.4), (1, 1, 1)),
         instance(2, (2, 0.8, 0), (0.1, 0.1, 0.1), (1,) * 3),

@@ -15,7 +15,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera
 from list3r.queries.views.gather import is_large, sample
-from list3r.queries.views.viewpoint import VIEWPOINT, BetweenRelation, Viewer, between, viewed
+from list3r.queries.views.viewpoint import VIEWPOINT, BetweenRelation, Viewpoint, between, viewed
 from list3r.queries.words import not_borne, wanted_words, words_of
 
 VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "under", "attached_to"))
@@ -85,7 +85,7 @@ def relations(
     return Relations(kept, found.state, "; ".join([*([found.reason] if found.reason else []), *notes]))
 
 
-def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
+def viewer_from(store: Store, viewpoint: Place) -> Viewpoint | None:
     """Return who looks from a place, see `Place`; None where up is not known. Raises `OptionError` and
     `UnknownIdError`."""
     upright = store.get_value("gravity", "unknown") in ("known", "estimated")
@@ -93,12 +93,12 @@ def viewer_from(store: Store, viewpoint: Place) -> Viewer | None:
     where = _parse_place(store, viewpoint) if isinstance(viewpoint, str) else viewpoint
     if isinstance(where, PosedCamera):
         name = "the camera" if where.frame is None else f"frame {where.frame.frame_index}"
-        return Viewer(where.place, up if upright else where.up, name, None, where.component)
+        return Viewpoint(where.place, up if upright else where.up, name, None, where.component)
     if isinstance(where, int | np.integer):
         i = checked_instance(store, int(where))
-        return Viewer(i.center, up, f"#{i.id}", i.id, i.component) if upright else None
+        return Viewpoint(i.center, up, f"#{i.id}", i.id, i.component) if upright else None
     place = checked_point(where, "viewpoint")
-    return Viewer(place, up, "the point " + ", ".join(f"{x:g}" for x in place)) if upright else None
+    return Viewpoint(place, up, "the point " + ", ".join(f"{x:g}" for x in place)) if upright else None
 
 
 def _parse_place(store: Store, text: str) -> int | PosedCamera | list[float]:

@@ -23,7 +23,7 @@ VIEWPOINT = ("left_of", "right_of", "in_front_of", "behind")
 
 
 @dataclass(frozen=True)
-class Viewer:
+class Viewpoint:
     """The viewpoint of a question."""
 
     place: Array
@@ -46,7 +46,7 @@ class BetweenRelation(Relation):
     """The second of the two."""
 
 
-def viewed(viewer: Viewer, subject: Instance, object: Instance, noise: float) -> list[Relation] | None:
+def viewed(viewer: Viewpoint, subject: Instance, object: Instance, noise: float) -> list[Relation] | None:
     """Return the viewpoint relations of two things; None where they cannot be told: the viewer stands above, below or
     amidst them, or they are in different connected components.
 
