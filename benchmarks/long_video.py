@@ -22,6 +22,7 @@ from machine import _resident, descendants, write_json
 
 from list3r.frames.source import SourceOptions, open_source
 from list3r.pipeline.build import build
+from list3r.pipeline.request import Watch
 from list3r.pipeline.settings import BuildSettings
 
 
@@ -92,7 +93,7 @@ def measure(video: Path, memory: Path, every: int, chunks: int) -> dict[str, Any
 
     settings = BuildSettings("sfm", "estimate", device="cpu")
     try:
-        build(video, memory, options=SourceOptions(every=every), settings=settings, progress=progress, look=look)
+        build(video, memory, options=SourceOptions(every=every), settings=settings, watch=Watch(progress, look))
     except _EnoughError:
         pass
     return {"listing": listing, "scan": scan, "chunks": added, "memory_file_mb": round(memory.stat().st_size / 1e6, 1)}

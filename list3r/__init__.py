@@ -18,12 +18,24 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory, build, open, update
     from list3r.frames.options import SourceOptions
     from list3r.memory.errors import List3rError
+    from list3r.pipeline.request import BuildRequest
     from list3r.pipeline.settings import BuildSettings
 
 __version__ = "0.1.0"
-__all__ = ["BuildSettings", "List3rError", "SceneMemory", "SourceOptions", "__version__", "build", "open", "update"]
+__all__ = [
+    "BuildRequest",
+    "BuildSettings",
+    "List3rError",
+    "SceneMemory",
+    "SourceOptions",
+    "__version__",
+    "build",
+    "open",
+    "update",
+]
 
 _HOMES = {
+    "BuildRequest": "list3r.pipeline.request",
     "BuildSettings": "list3r.pipeline.settings",
     "SourceOptions": "list3r.frames.options",
     "List3rError": "list3r.memory.errors",

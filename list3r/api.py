@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from list3r.exporters.prompt.scene_text import ScenePrompt
     from list3r.frames.options import SourceOptions
+    from list3r.pipeline.request import BuildRequest, RunWords
     from list3r.pipeline.settings import BuildSettings
 
 
@@ -82,37 +83,36 @@ def build(
     memory: str | Path,
     *,
     options: SourceOptions | None = None,
-    settings: BuildSettings | None = None,
-    workers: int | None = None,
-    resume: bool = False,
-    force: bool = False,
-    licence: str = "research",
+    settings: BuildSettings | BuildRequest | None = None,
+    **run: Unpack[RunWords],
 ) -> SceneMemory:
     """Build the memory of a video or folder and open it.
 
-    `options` says what is known of the source (intrinsics, depth scale, ...), `settings` how it is worked on.
-    `resume` goes on with a build that was interrupted; `force` replaces an existing memory. `licence` is what networks
-    may be under: permissive (any use, no account), research (non-commercial, gated and own terms too) or any.
+    `options` says what is known of the source (intrinsics, depth scale, ...). `settings` says how it is worked on: a
+    `BuildRequest` names models or a preset and leaves the rest to the machine, `BuildSettings` decides all.
+
+    Further arguments: `workers`, processes; `resume` goes on with a build that was interrupted; `force` replaces an
+    existing memory. `licence` is what networks may be under: permissive (any use, no account), research
+    (non-commercial, gated and own terms too) or any. `scale_anchor` is a length that is known, `detector` (with
+    `detector_classes`) the file of a box detector that names things.
     Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`, each with the way to mend it.
+
+        >>> list3r.build("walk/", "house.l3r", settings=list3r.BuildRequest(preset="light"), workers=2)
     """
     from list3r.pipeline import build as pipeline
+    from list3r.pipeline.request import RunOptions
 
-    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
-    pipeline.build(source, memory, force=force, licence=licence, **run)
+    pipeline.build(source, memory, options=options, settings=settings, run=RunOptions(**run))
     return open(memory)
 
 
-@naming_extras()
 def update(
     memory: str | Path,
     source: str | Path,
     *,
     options: SourceOptions | None = None,
-    settings: BuildSettings | None = None,
-    workers: int | None = None,
-    resume: bool = False,
-    force: bool = False,
-    licence: str = "research",
+    settings: BuildSettings | BuildRequest | None = None,
+    **run: Unpack[RunWords],
 ) -> SceneMemory:
     """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
 
@@ -121,9 +121,9 @@ def update(
     `TrackingError` or `MemoryFileError`, each with the way to mend it.
     """
     from list3r.pipeline import update as updating
+    from list3r.pipeline.request import RunOptions
 
-    run: dict[str, Any] = {"options": options, "settings": settings, "workers": workers, "resume": resume}
-    updating.update(memory, source, force=force, licence=licence, **run)
+    updating.update(memory, source, options=options, settings=settings, run=RunOptions(**run))
     return open(memory)
 
 

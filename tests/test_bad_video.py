@@ -23,9 +23,11 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
-from list3r.pipeline.build import _runs, build
+from list3r.pipeline.build import build
 from list3r.pipeline.calibration import camera_notes
 from list3r.pipeline.chunk import ChunkTask, process_parts
+from list3r.pipeline.reports import _runs
+from list3r.pipeline.request import RunOptions, Watch
 from list3r.pipeline.session import Job, plan_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.sfm.calibration import _focal_sigma
@@ -130,13 +132,13 @@ def test_a_build_that_places_no_camera_leaves_no_memory_and_gives_the_old_one_ba
     folder, memory = save(tmp_path / "still", [3] * 6), tmp_path / "m.l3r"
     settings = BuildSettings("sfm", "estimate", device="cpu")
     with pytest.raises(TrackingError, match=r"any frame of .*still \(6 frames\); frames 0 to 5: the camera stands"):
-        build(folder, memory, options=OPTIONS, settings=settings, workers=1)
+        build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=1))
     assert list(tmp_path.glob("m.l3r*")) == []
     with Store.create(memory) as store, store.transaction():
         write_small_room(store)
         before = [i.id for i in store.instances()]
     with pytest.raises(TrackingError):
-        build(folder, memory, options=OPTIONS, settings=settings, workers=1, force=True)
+        build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=1, force=True))
     assert [p.name for p in tmp_path.glob("m.l3r*")] == ["m.l3r"]
     with Store.open(memory) as store:
         assert before and [i.id for i in store.instances()] == before
@@ -210,11 +212,13 @@ def test_more_windows_that_agree_make_the_focal_length_surer() -> None:
 def test_what_is_said_of_the_camera_is_in_pixels_of_the_pictures_as_stored(tmp_path: Path) -> None:
     for k in range(4):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((120, 160, 3), np.uint8))
-    job = Job(tmp_path, SourceOptions(max_side=80), BuildSettings("sfm"), open_source(tmp_path).info, 1)
+    job = Job(
+        tmp_path, SourceOptions(max_side=80), BuildSettings("sfm"), open_source(tmp_path).info, RunOptions(workers=1)
+    )
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
             session = store.add_session("here", "", {}, 4)
-        plan = plan_session(store, session, job)
+        plan = plan_session(store, session, job, Watch())
         assert "focal length of 192 px is a guess" in camera_notes(store, session)[0]
     assert plan.tasks[0].options.intrinsics == pytest.approx((192.0, 192.0, 79.5, 59.5))
 

@@ -47,6 +47,7 @@ from list3r.models.device import Gpu
 from list3r.models.licences import PROFILES, choose_weights, objection, terms
 from list3r.models.presets import ModelSelection, obstacle, select
 from list3r.models.upstream import load_upstream, upstream_class
+from list3r.pipeline.request import RunOptions
 from list3r.pipeline.session import prepare, with_weights
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import MODELS
@@ -364,7 +365,7 @@ def test_weights_of_a_build_are_named_by_commit(tmp_path: Path) -> None:
 def test_python_builds_video_without_depth_by_default(tmp_path: Path) -> None:
     source = neural_scenes.write_pictures(tmp_path / "pictures", neural_scenes.film())
     for settings in (None, BuildSettings(), BuildSettings(poses="auto")):
-        job = prepare(source, None, settings, None)
+        job = prepare(source, None, settings, RunOptions())
         assert (job.settings.reconstruction, job.settings.poses) == ("sfm", "estimate")
 
 

@@ -13,7 +13,6 @@ import pytest
 import list3r
 from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
 from list3r.cli.app import run
-from list3r.cli.build import model_options
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.options import SourceOptions
@@ -21,8 +20,11 @@ from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.records import Session
 from list3r.models.device import Gpu
+from list3r.pipeline import choice
+from list3r.pipeline.choice import settings_asked
 from list3r.pipeline.chunk import ChunkTask, joint_model, process_chunk, process_parts
 from list3r.pipeline.joint_windows import joint_windows
+from list3r.pipeline.request import BuildRequest
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.workers import OrderedPool
 from tests import neural_models, neural_scenes
@@ -134,27 +136,21 @@ def test_errors_are_one_line(pictures: Path, tmp_path: Path, capsys: pytest.Capt
 
 def test_explicit_options_win_over_the_preset(pictures: Path) -> None:
     info = open_source(pictures).info
-    cut = model_options.CutWords
-    settings, told = model_options.build_settings(
-        info, model_options.ModelWords(preset="cpu"), cut(), poses="auto", pictures=True
-    )
+    settings, told = settings_asked(BuildRequest(preset="cpu"), info, "research")
     assert (settings.reconstruction, settings.discovery, settings.features) == ("auto", "geometric", "geometric")
-    assert told == ["note: preset cpu: no weights"] and settings.chunks == ChunkSettings()
-    asked = model_options.ModelWords(preset="cpu", discovery="eomt")
-    settings, told = model_options.build_settings(info, asked, cut(chunk=50), poses="auto", pictures=True)
+    assert told == ["preset cpu: no weights"] and settings.chunks == ChunkSettings()
+    settings, told = settings_asked(BuildRequest(preset="cpu", discovery="eomt", chunk=50), info, "research")
     assert (settings.discovery, settings.features, settings.chunks) == ("eomt", "own", ChunkSettings(50, 15))
     assert settings.instance_weights == (("discovery/eomt", "tue-mps/coco_panoptic_eomt_large_640"),)
     assert "as asked" in told[0]
 
 
 def test_chunks_are_as_long_as_the_gpu_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    from list3r.models import device
-
     def length(free_mb: float, **given: object) -> ChunkSettings:
-        monkeypatch.setattr(device, "find_gpu", lambda name="auto": Gpu("a GPU", free_mb, free_mb))
+        monkeypatch.setattr(choice, "find_gpu", lambda name="auto": Gpu("a GPU", free_mb, free_mb))
         things: Any = given.pop("instance_weights", ())
         settings = BuildSettings(reconstruction=str(given.pop("name", "pi3")), instance_weights=things)
-        return model_options._cut(settings, given.get("chunk"), None)  # type: ignore[arg-type]
+        return choice._cut(settings, given.get("chunk"), None)  # type: ignore[arg-type]
 
     assert length(80_000) == ChunkSettings(240, 30)
     assert length(8_000) == ChunkSettings(65, 20)

@@ -11,13 +11,14 @@ import pytest
 
 import list3r
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
-from list3r.frames.source import SourceOptions, open_source
+from list3r.frames.source import SourceOptions
 from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
 from list3r.pipeline.chunk import PART_STEP, ChunkTask, process_parts
 from list3r.pipeline.precompute import precompute
+from list3r.pipeline.request import RunOptions, Watch
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.precomputed_files import read_piece
 from tests.rgbd_scenes import CAMERA, render
@@ -48,7 +49,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path):
     memory = tmp_path / "walk.l3r"
     settings = BuildSettings(reconstruction="auto", poses="auto", chunks=ChunkSettings(18, 8))
-    report = build(pictures, memory, settings=settings, workers=2)
+    report = build(pictures, memory, settings=settings, run=RunOptions(workers=2))
     assert report.posed == COUNT and report.components == 1 and report.chunks == 2
     assert any("estimated from the pictures" in line for line in report.notes)
     with Store.open(memory) as store:
@@ -66,7 +67,7 @@ def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path)
 def test_nothing_is_left_of_a_video_that_cannot_be_followed(tmp_path: Path):
     folder = save(tmp_path / "still", [pose(0)] * 5)
     with pytest.raises(TrackingError, match="stands still"):
-        build(folder, tmp_path / "still.l3r", settings=BuildSettings("auto", "auto"), workers=1)
+        build(folder, tmp_path / "still.l3r", settings=BuildSettings("auto", "auto"), run=RunOptions(workers=1))
 
 
 def test_parts_of_a_chunk_are_numbered_so_that_the_last_closes_the_span(tmp_path: Path):
@@ -87,10 +88,8 @@ def test_files_for_another_machine_have_one_estimated_camera_and_say_it(pictures
     report = precompute(
         pictures,
         tmp_path / "files",
-        SourceOptions(),
-        settings,
-        open_source(pictures).info,
-        look=lambda what, done, total: told.append(what),
+        settings=settings,
+        watch=Watch(look=lambda what, done, total: told.append(what)),
     )
     assert report.posed == COUNT and {"cuts", "camera"} <= set(told)
     cameras = np.concatenate([read_piece(p).intrinsics for p in sorted((tmp_path / "files").glob("*.npz"))])
@@ -105,7 +104,7 @@ def test_files_hold_frames_of_a_chunk_that_stands_still(tmp_path: Path) -> None:
     settings = BuildSettings(reconstruction="sfm", chunks=ChunkSettings(18, 2), device="cpu")
     task = ChunkTask(str(folder), options, ChunkSpan(1, 16, 30), settings, shot=(0, 30))
     assert process_parts(task)[-1].posed.all()
-    report = precompute(folder, tmp_path / "files", options, settings, open_source(folder, options).info)
+    report = precompute(folder, tmp_path / "files", options=options, settings=settings)
     still = read_piece(tmp_path / "files" / "chunk-0001.npz")
     assert report.files == 2 and report.posed == 30 and still.frames.tolist() == list(range(16, 30))
     assert np.allclose(still.T_world_cam[1:], still.T_world_cam[1], atol=0.01)

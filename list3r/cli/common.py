@@ -9,9 +9,9 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -36,14 +36,6 @@ def parse_point(text: str, option: str) -> tuple[float, float, float]:
     if not all(math.isfinite(v) for v in (x, y, z)):
         raise OptionError(f"{option} {text!r}: the numbers must be finite")
     return x, y, z
-
-
-def check_one_way(resume: bool, force: bool) -> None:
-    """Raises `OptionError` where `--resume` and `--force`, which say opposite things, are both given."""
-    from list3r.memory.errors import OptionError
-
-    if resume and force:
-        raise OptionError("--resume goes on with what is there and --force gives it up; give one of them")
 
 
 _AT: ContextVar[int | None] = ContextVar("at", default=None)
@@ -83,31 +75,65 @@ def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
     return asked
 
 
+def only(*names: str) -> tuple[str, ...]:
+    """Return the fields of a dataclass that a command takes as options: `words: Annotated[BuildRequest, only(...)]`."""
+    return names
+
+
 def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """The same command with one option for each field of those of its parameters that are dataclasses of options.
+    """Return the command with one option for each field of those of its parameters that are dataclasses of options.
 
     `words: SourceWords` in its signature stands for all fields of `SourceWords`, in that place and order.
     """
     signature = inspect.signature(command, eval_str=True)
-    groups: dict[str, Any] = {n: p.annotation for n, p in signature.parameters.items() if is_dataclass(p.annotation)}
+    groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in signature.parameters.items():
-        if name not in groups:
+        group, *told = get_args(parameter.annotation) or (parameter.annotation,)
+        if not is_dataclass(group):
             options.append(parameter)
             continue
-        types = get_type_hints(groups[name], include_extras=True)
-        for f in fields(groups[name]):
-            kind = inspect.Parameter.KEYWORD_ONLY
-            options.append(inspect.Parameter(f.name, kind, default=f.default, annotation=types[f.name]))
+        names = told[0] if told else [f.name for f in fields(group)]
+        types = get_type_hints(group, include_extras=True)
+        groups[name] = group, [_as_option(f, types[f.name]) for f in fields(group) if f.name in names]
+        options += groups[name][1]
 
     @functools.wraps(command)
     def gathered(**words: Any) -> None:
-        made = {n: group(**{f.name: words.pop(f.name) for f in fields(group)}) for n, group in groups.items()}
+        given = {n: {p.name: words.pop(p.name) for p in parameters} for n, (_, parameters) in groups.items()}
+        made = {n: group(**{k: _given(group, k, v) for k, v in given[n].items()}) for n, (group, _) in groups.items()}
         command(**words, **made)
 
     gathered.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
     gathered.__annotations__ = {p.name: p.annotation for p in options}
     return gathered
+
+
+def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:
+    """Return the parameter that typer makes an option of."""
+    told = f.metadata.get("help")
+    if told is None:
+        return inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kind)
+    default = f.default
+    if get_origin(kind) is tuple:
+        kind, default = list[str] | None, None
+    option = typer.Option(
+        told.flag or f"--{f.name.replace('_', '-')}",
+        metavar=told.metavar,
+        help=told.text,
+        show_default=default is not None and default is not False,
+    )
+    return inspect.Parameter(
+        f.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
+    )
+
+
+def _given(group: Any, name: str, value: Any) -> Any:
+    """Return the value of an option as the dataclass has it: several words are a tuple."""
+    told = any(f.name == name and "help" in f.metadata for f in fields(group))
+    several = told and (value is None or isinstance(value, list))
+    default = next(f.default for f in fields(group) if f.name == name)
+    return tuple(value or ()) if several and isinstance(default, tuple) else value
 
 
 def print_json(value: object) -> None:

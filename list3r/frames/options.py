@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import OptionError
+
+if TYPE_CHECKING:
+    from list3r.frames.base import SourceInfo
 
 KINDS = (
     "auto",
@@ -82,6 +85,18 @@ class SourceOptions:
     max_side: int | None = None
     """Longest side of the frames handed out, px; larger pictures are reduced. 0 for as stored; None: 960, 1280 with
     depth. Intrinsics are given for pictures as stored."""
+
+    def check_fits(self, info: SourceInfo) -> None:
+        """Raise `OptionError` for what is said of a depth camera that the source has not got."""
+        said = {
+            "--depth-scale": self.depth_scale is not None,
+            "--depth-intrinsics": self.depth_intrinsics is not None,
+            "--depth-to-color": self.T_color_depth is not None,
+            "--registered": self.registered,
+        }
+        given = [option for option, is_given in said.items() if is_given]
+        if given and not info.has_depth:
+            raise OptionError(f"{info.path} has no depth; leave out {' and '.join(given)}")
 
     def topics_by_role(self) -> dict[str, str]:
         """Return the topics that were chosen, by role."""

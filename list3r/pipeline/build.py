@@ -1,15 +1,13 @@
 """From a video to a memory: the page that reads like the paper's method, and the only writer of memories.
 
-frames -> chunks -> reconstruction + local instance library        (any process, side by side; `chunk_stage`)
+frames -> chunks -> reconstruction + local instance library        (any process, side by side; `chunk`)
        -> edges -> graph -> up -> global instance library -> store (in order, one transaction each; `mapping`)
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from itertools import pairwise
+from dataclasses import replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -19,53 +17,14 @@ from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.memory.errors import TrackingError
 from list3r.memory.store.store import Store
-from list3r.models.licences import DEFAULT_PROFILE
+from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
-from list3r.pipeline.session import (
-    Job,
-    Look,
-    Plan,
-    Progress,
-    add_chunks,
-    lost_reasons,
-    plan_session,
-    prepare,
-    settled_notes,
-    shot_cuts,
-)
+from list3r.pipeline.reports import BuildReport, build_report
+from list3r.pipeline.request import BuildRequest, RunOptions, Watch
+from list3r.pipeline.session import Job, Plan, add_chunks, lost_reasons, plan_session, prepare
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import make_folder, open_target
 from list3r.reconstruction.registry import entry
-
-
-@dataclass(frozen=True)
-class BuildReport:
-    """What a build did."""
-
-    frames: int
-    posed: int
-    lost: int
-    bad: int
-    chunks: int
-    components: int
-    loops: int
-    instances: int
-    structure: int
-    relations: int
-    seconds: float
-    """Wall time of this run."""
-    frames_per_second: float
-    """Frames of this run (a resumed build counts only what it did itself) by wall time."""
-    resumed_chunks: int
-    """Chunks that an earlier run had finished."""
-    stage_seconds: dict[str, float]
-    """CPU seconds by stage, over all runs."""
-    notes: tuple[str, ...]
-    """What the user should know, one sentence each."""
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def build(
@@ -73,29 +32,35 @@ def build(
     memory: str | Path,
     *,
     options: SourceOptions | None = None,
-    settings: BuildSettings | None = None,
-    workers: int | None = None,
-    resume: bool = False,
-    force: bool = False,
-    licence: str = DEFAULT_PROFILE,
-    debug_dir: str | Path | None = None,
-    progress: Progress | None = None,
-    look: Look | None = None,
+    settings: BuildSettings | BuildRequest | None = None,
+    run: RunOptions | None = None,
+    watch: Watch | None = None,
 ) -> BuildReport:
-    """Build the memory of one video; see `list3r.build` for the arguments. `look` hears of what is done before chunks.
+    """Build the memory of one video; see `list3r.build` for the arguments. `watch` hears of the work as it goes on.
 
     Raises `SourceError`, `MemoryFileError`, `OptionError`, `TrackingError`; then nothing half-written is left, except a
-    memory in which cameras are placed, which `resume` goes on with.
+    memory in which cameras are placed, which `resume` goes on with. `FinishingError` where the memory is built and only
+    its scale or its names are not.
     """
     started = time.monotonic()
-    job = prepare(source, options, settings, workers, licence)
-    if debug_dir is not None:
-        make_folder(Path(debug_dir))
-    with open_target(Path(memory), job.info, job.settings, resume=resume, force=force) as target:
+    run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
+    job = prepare(source, options, settings, run, memory)
+    watch.tell(job.notes)
+    if watch.debug_dir is not None:
+        make_folder(watch.debug_dir)
+    with open_target(memory, job.info, job.settings, resume=run.resume, force=run.force) as target:
         session = _session(target.store, job)
-        plan = plan_session(target.store, session, job, look, debug_dir)
-        add_chunks(target.store, job, plan, progress, added=lambda part: target.keep() if part.posed.any() else None)
-        return _finish(target.store, job, plan, started)
+        plan = plan_session(target.store, session, job, watch)
+        add_chunks(target.store, job, plan, watch, added=lambda part: target.keep() if part.posed.any() else None)
+        _check_posed(target.store, job.info, plan)
+        with threadpool_limits(1):
+            finish_session(target.store, session, job.settings.association, job.settings.carving)
+        report = build_report(target.store, plan, started)
+    notes, failure = finish(memory, source, job.options, run, watch)
+    report = replace(report, notes=(*report.notes, *notes))
+    if failure is not None:
+        raise FinishingError(failure, report)
+    return report
 
 
 def _session(store: Store, job: Job) -> int:
@@ -130,74 +95,12 @@ def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:
     return "given poses" if settings.poses == "given" else "none"
 
 
-def _finish(store: Store, job: Job, plan: Plan, started: float) -> BuildReport:
-    info, settings = job.info, job.settings
+def _check_posed(store: Store, info: SourceInfo, plan: Plan) -> None:
+    """Raise `TrackingError` where the camera is placed in no frame."""
     frames = store.frames(plan.session)
-    posed = sum(f.state == "posed" for f in frames)
-    if posed == 0:
-        why = lost_reasons(store, plan.session)
-        hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
-        raise TrackingError(
-            f"the camera could not be followed in any frame of {info.path} ({_count(len(frames), 'frame')}); "
-            + "; ".join(filter(None, (*why[:1], hint)))
-        )
-    with threadpool_limits(1):
-        finish_session(store, plan.session, settings.association, settings.carving)
-    seconds = time.monotonic() - started
-    components = len({c.component for c in store.chunks()})
-    lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
-    return BuildReport(
-        frames=len(frames),
-        posed=posed,
-        lost=lost,
-        bad=bad,
-        chunks=len(plan.spans),
-        components=components,
-        loops=sum(e.kind == "loop" and e.accepted for e in store.edges()),
-        instances=len(store.instances(structure=False)),
-        structure=len(store.instances(structure=True)),
-        relations=len(store.relations()),
-        seconds=round(seconds, 2),
-        frames_per_second=round(plan.fresh_frames() / seconds, 2),
-        resumed_chunks=len(plan.done),
-        stage_seconds={k: round(v, 2) for k, v in store.stage_seconds().items()},
-        notes=_notes(store, plan.session, lost, bad, components),
-    )
-
-
-def _notes(store: Store, session: int, lost: int, bad: int, components: int) -> tuple[str, ...]:
-    notes = list(settled_notes(store, session))
-    cuts = shot_cuts(store, session)
-    if cuts:
-        notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
-    if bad:
-        notes.append(f"{_count(bad, 'frame')} could not be used, skipped: {_listed(store)}")
-    if lost and store.get_value("poses") == "given":
-        notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
-    elif lost:
-        where = _runs([f.frame_index for f in store.frames(session) if f.state == "lost"])
-        notes.append(f"the camera could not be followed in {_count(lost, 'frame')} ({where}); they have no pose")
-    notes += lost_reasons(store, session)
-    if components > 1:
-        notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
-    if store.get_value("gravity") == "unknown":
-        notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
-    return tuple(notes)
-
-
-def _runs(numbers: Sequence[int], most: int = 5) -> str:
-    """Ascending numbers in words: those that follow each other by their first and last."""
-    breaks = [k for k in range(1, len(numbers)) if numbers[k] != numbers[k - 1] + 1]
-    runs = [(numbers[a], numbers[b - 1]) for a, b in pairwise([0, *breaks, len(numbers)])]
-    shown = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in runs[:most])
-    return shown + (f" and {len(runs) - most} more stretches" if len(runs) > most else "")
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def _listed(store: Store, most: int = 5) -> str:
-    rows = store.bad_frames()
-    shown = ", ".join(f"{index} ({reason})" for _, index, reason in rows[:most])
-    return shown + (f" and {len(rows) - most} more" if len(rows) > most else "")
+    if any(f.state == "posed" for f in frames):
+        return
+    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
+    reasons = "; ".join(filter(None, (*lost_reasons(store, plan.session)[:1], hint)))
+    raise TrackingError(f"the camera could not be followed in any frame of {info.path} ({count}); {reasons}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,10 +15,10 @@ from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
-from list3r.models.licences import DEFAULT_PROFILE
 from list3r.pipeline.calibration import estimated_camera, told_camera
 from list3r.pipeline.chunk import ChunkTask, reconstruct
-from list3r.pipeline.session import Look, check_buildable, resolve_settings, with_weights
+from list3r.pipeline.request import BuildRequest, RunOptions, Watch
+from list3r.pipeline.session import prepare
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import make_folder
 from list3r.reconstruction.base import Reconstruction
@@ -53,30 +52,28 @@ class PrecomputeReport:
 def precompute(
     source: str | Path,
     out: Path,
-    options: SourceOptions,
-    settings: BuildSettings,
-    info: SourceInfo,
     *,
-    force: bool = False,
-    licence: str = DEFAULT_PROFILE,
-    progress: Callable[[int, int], None] | None = None,
-    look: Look | None = None,
+    options: SourceOptions | None = None,
+    settings: BuildSettings | BuildRequest | None = None,
+    run: RunOptions | None = None,
+    watch: Watch | None = None,
 ) -> PrecomputeReport:
     """Reconstruct every chunk of a source and write one file for each into `out`; finished files are kept.
 
-    `look` hears of what is done before the chunks: as in a build, jumps are looked for and an unknown camera estimated.
-    Raises `SourceError`, and `OptionError` when the folder holds files of other settings.
+    As in a build, jumps are looked for and an unknown camera is estimated. Raises `SourceError`, and `OptionError` when
+    the folder holds files of other settings.
     """
-    settings = resolve_settings(settings, info)
-    check_buildable(info, settings)
-    settings = with_weights(settings, licence)
+    run, watch = run or RunOptions(), watch or Watch()
+    job = prepare(source, options, settings, run)
+    watch.tell(job.notes)
+    options, settings, info, force = job.options, job.settings, job.info, run.force
     _begin(out, settings, info, force)
-    scan = None if look is None else (lambda done, total: look("cuts", done, total))
-    cuts = () if settings.poses == "given" else tuple(find_cuts(open_source(source, options), settings.cuts, scan))
+    looking = watch.looking("cuts")
+    cuts = () if settings.poses == "given" else tuple(find_cuts(open_source(source, options), settings.cuts, looking))
     spans = plan_chunks(info.frame_count, settings.chunks, cuts)
     notes: list[str] = []
     if force or not all(_file(out, span).exists() for span in spans):
-        camera = estimated_camera(source, options, settings, info, look)
+        camera = estimated_camera(source, options, settings, info, watch.look)
         if camera is not None:
             options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
     opened = open_source(source, options)
@@ -93,8 +90,8 @@ def precompute(
                 continue
         piece = read_piece(path)
         posed.update(piece.frames[np.isfinite(piece.T_world_cam).all(axis=(1, 2))].tolist())
-        if progress is not None:
-            progress(span.stop, info.frame_count)
+        if watch.progress is not None:
+            watch.progress(span.stop, info.frame_count)
     check_bad_share(len(bad), info.frame_count, next(iter(bad.values()), ""))
     files = sorted(out.glob("chunk-*.npz"))
     if not files:

@@ -24,17 +24,15 @@ from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
 from list3r.pipeline.calibration import camera_key, camera_notes, with_camera
+from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
 from list3r.pipeline.chunk import ChunkTask, process_parts
+from list3r.pipeline.finishing import check_run
 from list3r.pipeline.joint_windows import joint_windows
 from list3r.pipeline.mapping import add_chunk, place_chunks
+from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.pipeline.settings import AssociationSettings, BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
 from list3r.reconstruction.registry import entry, usual_model
-
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all) at the start and after every chunk."""
-Look = Callable[[str, int, int], None]
-"""Called with (what is looked for, done, in all) while a video is looked at before its chunks."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +43,9 @@ class Job:
     options: SourceOptions
     settings: BuildSettings
     info: SourceInfo
-    workers: int | None
-    """Processes; None for as many as are usual."""
+    run: RunOptions
+    notes: tuple[str, ...] = ()
+    """What the user should know before the work begins, one sentence each."""
 
 
 @dataclass(frozen=True)
@@ -70,34 +69,52 @@ class Plan:
 def prepare(
     source: str | Path,
     options: SourceOptions | None,
-    settings: BuildSettings | None,
-    workers: int | None,
-    licence: str = DEFAULT_PROFILE,
+    settings: BuildSettings | BuildRequest | None,
+    run: RunOptions,
+    memory: Path | None = None,
+    *,
+    later: bool = False,
 ) -> Job:
-    """Open a source and make everything definite that was left open. Raises `SourceError` and `OptionError`."""
+    """Open a source and make everything definite that was left open. Raises `SourceError` and `OptionError`.
+
+    A resumed session of the `memory` goes on with its own settings. A `later` session of it takes the settings of its
+    first one, but for what is asked for.
+    """
     options = options or SourceOptions()
+    check_run(run)
     info = open_source(source, options).info
-    settings = resolve_settings(settings or BuildSettings(poses="auto"), info)
-    check_buildable(info, settings)
-    if workers is not None and workers < 1:
-        raise OptionError(f"--workers {workers}: at least 1 process is needed")
-    return Job(source, options, with_weights(settings, licence), info, workers)
+    options.check_fits(info)
+    first, begun = (None, None) if memory is None else stored_sessions(memory)
+    first, begun = first if later else None, begun if run.resume else None
+    notes: list[str] = []
+    if settings is None or isinstance(settings, BuildRequest):
+        request = settings or BuildRequest()
+        if begun is not None:
+            chosen, notes = settings_resumed(request, begun, info, run.licence)
+        else:
+            chosen, notes = settings_asked(request, info, run.licence)
+            chosen = chosen if first is None else settings_beside(chosen, first)
+    else:
+        chosen = settings
+        if first is not None:
+            check_beside(chosen, first)
+    chosen = resolve_settings(chosen, info)
+    check_buildable(info, chosen)
+    return Job(source, options, with_weights(chosen, run.licence), info, run, (*info.notes, *notes))
 
 
-def plan_session(
-    store: Store, session: int, job: Job, look: Look | None = None, debug_dir: str | Path | None = None
-) -> Plan:
+def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     """The chunks of a session, and of those the ones that are not in the memory yet."""
     count = job.info.frame_count
-    cuts = _cuts(store, session, job, look)
-    step = _depth_step(store, session, job, look)
+    cuts = _cuts(store, session, job, watch)
+    step = _depth_step(store, session, job, watch)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks(session)}
-    options = with_camera(store, session, job.source, job.options, job.settings, job.info, look)
+    options = with_camera(store, session, job.source, job.options, job.settings, job.info, watch.look)
     tasks = []
     for span in spans:
         if span.index not in done:
-            where = None if debug_dir is None else str(debug_dir)
+            where = None if watch.debug_dir is None else str(watch.debug_dir)
             tasks.append(
                 ChunkTask(str(job.source), options, span, job.settings, where, shot_of(span, cuts, count), step)
             )
@@ -108,7 +125,7 @@ def add_chunks(
     store: Store,
     job: Job,
     plan: Plan,
-    progress: Progress | None = None,
+    watch: Watch,
     *,
     library: bool = True,
     added: Callable[[ChunkResult], None] | None = None,
@@ -121,13 +138,12 @@ def add_chunks(
     if not plan.tasks:
         return
     first, session, count = plan.tasks[0], plan.session, job.info.frame_count
-    debug_dir = None if first.debug_dir is None else Path(first.debug_dir)
     bad = {index for s, index, _ in store.bad_frames() if s == session}
-    if progress is not None:
-        progress(len(store.frames(session)), count)
+    if watch.progress is not None:
+        watch.progress(len(store.frames(session)), count)
     known = {c.index for c in store.chunks(session)}
     how = job.settings.association
-    workers = min(job.workers or usual_workers(job.settings), len(plan.tasks))
+    workers = min(job.run.workers or usual_workers(job.settings), len(plan.tasks))
     with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
         for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):
@@ -135,12 +151,12 @@ def add_chunks(
             bad.update(index for index, _ in found)
             check_bad_share(len(bad), count, found[0][1] if found else "")
             for part in (p for p in results if p.index not in known):
-                add_chunk(store, session, part, joint, how, library=library, debug_dir=debug_dir)
+                add_chunk(store, session, part, joint, how, library=library, debug_dir=watch.debug_dir)
                 _note_lost(store, session, part)
                 if added is not None:
                     added(part)
-            if progress is not None:
-                progress(task.span.stop, count)
+            if watch.progress is not None:
+                watch.progress(task.span.stop, count)
 
 
 MOST_DEPTH_EVERY = 8
@@ -182,7 +198,7 @@ def settled_notes(store: Store, session: int) -> tuple[str, ...]:
     return (*notes, f"{why}: depth and things are from every {nth} frame (--depth-every 1 takes all)")
 
 
-def _depth_step(store: Store, session: int, job: Job, look: Look | None) -> int:
+def _depth_step(store: Store, session: int, job: Job, watch: Watch) -> int:
     """From every how many frames depth is computed, settled once; 1 for models that take it from elsewhere."""
     if not entry(job.settings.reconstruction).thins:
         return 1
@@ -191,10 +207,9 @@ def _depth_step(store: Store, session: int, job: Job, look: Look | None) -> int:
     if known is None:
         known = job.settings.depth_every
         if known is None:
-            scan = None if look is None else (lambda done, total: look("pace", done, total))
             begun = store.chunks(session)  # by a version that took all frames
             source, length = open_source(job.source, job.options), job.settings.chunks.length
-            known = 1 if begun else depth_step(source, length, job.settings.pace, progress=scan)
+            known = 1 if begun else depth_step(source, length, job.settings.pace, progress=watch.looking("pace"))
         with store.transaction():
             store.set_value(name, known)
     return known
@@ -214,16 +229,19 @@ def _note_lost(store: Store, session: int, result: ChunkResult) -> None:
             store.set_value(name, [*store.get_value(name, []), result.lost_reason])
 
 
-def _cuts(store: Store, session: int, job: Job, look: Look | None) -> tuple[int, ...]:
+def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]:
     """Where the video jumps, found once; given poses know where the camera is on either side."""
     if job.settings.poses == "given":
         return ()
     name = _name(store, session, "cuts")
     known = store.get_value(name)
     if known is None:
-        scan = None if look is None else (lambda done, total: look("cuts", done, total))
         begun = store.chunks(session)  # by a version that did not look for any
-        known = [] if begun else list(find_cuts(open_source(job.source, job.options), job.settings.cuts, scan))
+        known = (
+            []
+            if begun
+            else list(find_cuts(open_source(job.source, job.options), job.settings.cuts, watch.looking("cuts")))
+        )
         with store.transaction():
             store.set_value(name, known)
     return tuple(known)

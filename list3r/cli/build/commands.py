@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from list3r.cli.build import model_options as mod
 from list3r.cli.build import source_options as src
-from list3r.cli.build.finishing import finish
-from list3r.cli.build.progress import report_lines, run_build
-from list3r.cli.common import JsonOption, check_one_way, note, print_json, spread
-from list3r.cli.edit.scale import ScaleAnchor, check_anchor
-from list3r.cli.models.detect import ClassFile, DetectorFile, check_detector
+from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
+from list3r.cli.common import JsonOption, print_json, spread
 from list3r.cli.terminal import say
+from list3r.pipeline.request import BuildRequest, RunOptions
+
+if TYPE_CHECKING:
+    from list3r.pipeline.reports import BuildReport
 
 
 def register(app: typer.Typer) -> None:
@@ -50,7 +49,7 @@ def inspect(
     if overlay is not None:
         _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
-    words.check_fits(opened.info)
+    options.check_fits(opened.info)
     report = describe(opened.info)
     if calibrate:
         from list3r.frames.registration.calibrate import calibrate as estimate
@@ -83,21 +82,9 @@ def build(
     source: src.SourceArgument,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
     *,
-    models: mod.ModelWords,
-    poses: Annotated[
-        str, typer.Option("--poses", help="estimate, given or auto (given where the source has them).")
-    ] = "auto",
+    request: BuildRequest,
     words: src.SourceWords,
-    cut: mod.BuildCutWords,
-    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Keep a JPEG of each keyframe.")] = True,
-    workers: Annotated[
-        int | None, typer.Option("--workers", metavar="N", help="Processes; default: cores, up to 4.")
-    ] = None,
-    scale_anchor: ScaleAnchor = None,
-    detector: DetectorFile = None,
-    detector_classes: ClassFile = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a build that was interrupted.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing memory.")] = False,
+    run: RunOptions,
     debug: Annotated[
         Path | None, typer.Option("--debug", metavar="DIR", help="Write overlays of masks and tracks there.")
     ] = None,
@@ -108,29 +95,13 @@ def build(
     Example: list3r build walk/ -m house.l3r
     """
     options = words.options()
-    from list3r.frames.source import open_source
+    from list3r.pipeline.build import build as build_memory
 
-    check_one_way(resume, force)
-    check_anchor(scale_anchor)
-    check_detector(detector, detector_classes)
-    info = open_source(source, options).info
-    words.check_fits(info)
-    resumed = memory if resume else None
-    settings, told = mod.build_settings(info, models, cut, poses=poses, pictures=pictures, resumed=resumed)
-    if not json:
-        for line in (*(f"note: {n}" for n in info.notes), *told):
-            note(line)
-    run = {"options": options, "settings": settings, "workers": workers, "resume": resume, "force": force}
-    report = run_build(source, memory, quiet=json, debug_dir=debug, licence=models.licence, **run)
-    after: dict[str, Any] = {"scale_anchor": scale_anchor, "detector": detector, "classes": detector_classes}
-    notes, failure = finish(memory, source, options, quiet=json, **after)
-    report = replace(report, notes=(*report.notes, *notes))
-    if json:
-        print_json({"memory": str(memory), **report.as_dict()})
-    else:
-        say(*report_lines(memory, report))
-    if failure is not None:
-        raise failure
+    def work() -> BuildReport:
+        with watching("building", build_interrupted(memory, run.resume), quiet=json, debug=debug) as watch:
+            return build_memory(source, memory, options=options, settings=request, run=run, watch=watch)
+
+    say_result(memory, work, report_lines, json)
 
 
 def demo(

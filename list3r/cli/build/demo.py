@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from list3r.api import SceneMemory
-from list3r.cli.build.progress import report_lines, run_build
+from list3r.cli.build.progress import build_interrupted, report_lines, watching
 from list3r.cli.common import open_memory, print_table
 from list3r.cli.measure.commands import score_rows
 from list3r.cli.terminal import say
 from list3r.memory.errors import OptionError
+from list3r.pipeline.request import BuildRequest, RunOptions
 
 EXPORTS = (("json", "json"), ("usd", "usda"), ("plan", "png"), ("glb", "glb"), ("ply", "ply"), ("tum", "txt"))
 
@@ -27,10 +28,11 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     _say(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
     _render(walk, seed=seed, frames=frames, workers=workers, quiet=quiet)
     _say(quiet, f"\n2. list3r build {walk} -m {memory} --poses estimate")
-    from list3r.pipeline.settings import BuildSettings
+    from list3r.pipeline.build import build
 
-    settings = BuildSettings(poses="estimate")
-    report = run_build(walk, memory, quiet=quiet, settings=settings, workers=workers, resume=memory.exists())
+    request, run = BuildRequest(poses="estimate"), RunOptions(workers=workers, resume=memory.exists())
+    with watching("building", build_interrupted(memory, run.resume), quiet=True) as watch:
+        report = build(walk, memory, settings=request, run=run, watch=watch)
     _say(quiet, "\n".join(report_lines(memory, report)))
     with open_memory(memory) as scene:
         _ask(scene, memory, quiet)

@@ -1,43 +1,49 @@
-"""A build with a progress bar, and what it says at the end."""
+"""Progress of a build, and what is said at its end."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import typer
 
-from list3r.cli.common import note
+from list3r.cli.common import note, print_json
+from list3r.cli.terminal import say
+from list3r.pipeline.request import Watch
 
 if TYPE_CHECKING:
-    from list3r.pipeline.build import BuildReport
+    from list3r.pipeline.reports import BuildReport, UpdateReport
+
+Report = TypeVar("Report", "BuildReport", "UpdateReport")
 
 
-def run_build(source: str | Path, memory: Path, *, quiet: bool, **arguments: Any) -> BuildReport:
-    """Build with a progress bar; Ctrl-C says how to go on."""
+@contextmanager
+def watching(
+    title: str, interrupted: Callable[[bool], str], *, quiet: bool, debug: Path | None = None
+) -> Iterator[Watch]:
+    """Show progress in a bar and notes above it.
+
+    Ctrl-C ends the command with what `interrupted` says, which is told whether a chunk was finished.
+    """
     from tqdm import tqdm
 
-    from list3r.pipeline.build import build as build_memory
-
     tqdm.monitor_interval = 0
-    with tqdm(unit="frame", desc="building", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
-        kept = bool(arguments.get("resume"))
+    begun = False
+    with tqdm(unit="frame", desc=title, disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
 
         def progress(done: int, total: int) -> None:
-            nonlocal kept
-            kept = kept or done > 0
+            nonlocal begun
+            begun = begun or done > 0
             show(bar, done, total)
 
         try:
-            return build_memory(source, memory, progress=progress, look=looking(bar, "building"), **arguments)
+            yield Watch(progress, looking(bar, title), None if quiet else (lambda line: note(f"note: {line}")), debug)
         except KeyboardInterrupt:
             bar.close()
-            if kept and memory.exists():
-                note("", f"interrupted; {memory} keeps the finished chunks: go on with the same command and --resume")
-            else:
-                note("", "interrupted before a chunk was finished; nothing was changed")
+            note("", interrupted(begun))
             raise typer.Exit(1) from None
 
 
@@ -49,20 +55,39 @@ def show(bar: Any, done: int, total: int) -> None:
 
 
 def looking(bar: Any, then: str) -> Callable[[str, int, int], None]:
-    """What moves a progress bar while a video is looked at before its chunks; afterwards it begins anew as `then`."""
+    """Return what moves a progress bar while a video is looked at before its chunks; then it begins anew as `then`."""
 
     def look(what: str, done: int, total: int) -> None:
         bar.set_description(f"looking for {what}", refresh=False)
         show(bar, done, total)
-        if done == total:
+        if done == total and what != "names":
             bar.set_description(then, refresh=False)
             bar.reset(total)
 
     return look
 
 
+def say_result(
+    memory: Path, work: Callable[[], Report], lines: Callable[[Path, Report], list[str]], json: bool
+) -> None:
+    """Do the work and print its report. What failed after the memory was written is raised when that is told."""
+    from list3r.pipeline.finishing import FinishingError
+
+    failure = None
+    try:
+        report = work()
+    except FinishingError as error:
+        report, failure = cast(Report, error.report), error
+    if json:
+        print_json({"memory": str(memory), **report.as_dict()})
+    else:
+        say(*lines(memory, report))
+    if failure is not None:
+        raise failure
+
+
 def report_lines(memory: Path, report: BuildReport) -> list[str]:
-    """What a build did, for people."""
+    """Return what a build did, for people."""
     size = memory.stat().st_size / 1e6
     lines = [
         f"{memory}  {size:.1f} MB",
@@ -72,3 +97,14 @@ def report_lines(memory: Path, report: BuildReport) -> list[str]:
         f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
     ]
     return lines + [f"note: {line}" for line in report.notes]
+
+
+def build_interrupted(memory: Path, resumed: bool) -> Callable[[bool], str]:
+    """Return what is said when a build is interrupted."""
+
+    def said(begun: bool) -> str:
+        if (begun or resumed) and memory.exists():
+            return f"interrupted; {memory} keeps the finished chunks: go on with the same command and --resume"
+        return "interrupted before a chunk was finished; nothing was changed"
+
+    return said

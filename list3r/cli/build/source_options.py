@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from list3r.frames.base import SourceInfo
     from list3r.frames.options import SourceOptions
 
 SourceArgument = Annotated[
@@ -92,15 +91,6 @@ class SourceWords:
     end: End = None
     sharpest: Sharpest = None
     max_side: MaxSide = None
-
-    def check_fits(self, info: SourceInfo) -> None:
-        """Raises `OptionError` for what is said of a depth camera that the source has not got."""
-        from list3r.memory.errors import OptionError
-
-        said = ("depth_scale", "depth_intrinsics", "depth_to_color", "registered")
-        given = [f"--{name.replace('_', '-')}" for name in said if getattr(self, name) not in (None, False)]
-        if given and not info.has_depth:
-            raise OptionError(f"{info.path} has no depth; leave out {' and '.join(given)}")
 
     def options(self) -> SourceOptions:
         """What they mean. Raises `OptionError` naming the option."""

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json
 from list3r.cli.edit.commands import AuthorOption
 from list3r.cli.terminal import say
-
-if TYPE_CHECKING:
-    from list3r.memory.maintenance.edits import EditReport
-
-ScaleAnchor = Annotated[
-    str | None,
-    typer.Option(
-        "--scale-anchor",
-        metavar="ANCHOR",
-        help="A length that you know, for videos without depth: camera_height=1.5m, x,y,z:x,y,z=1.2m or ID=0.095m.",
-        show_default=False,
-    ),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +36,8 @@ def scale(
     Example: list3r scale house.l3r --anchor "12=0.095m"
     """
     if anchor is not None:
+        from list3r.pipeline.finishing import anchor_scale
+
         report = anchor_scale(memory, anchor, author)
         if not json:
             say(f"{report.text} (entry {report.entry})")
@@ -60,22 +48,6 @@ def scale(
         told = None if anchor is None else report.as_dict()
         print_json({"scale": kind, "scale_source": source, "units": units, "edit": told})
     elif kind == "relative":
-        say('scale relative: lengths are in units that nobody knows; --anchor "ID=0.095m" makes them metres')
+        say('scale relative: the length of a unit is unknown; --anchor "ID=0.095m" makes them metres')
     else:
         say(f"scale {kind}: lengths are metres ({source})")
-
-
-def anchor_scale(memory: Path, anchor: str, author: str | None = None) -> EditReport:
-    """ScaleAnchor the scale of a memory file; the `EditReport`."""
-    from list3r.api import open as open_scene
-
-    with open_scene(memory, writable=True) as scene:
-        return scene.scale(anchor, author=author)
-
-
-def check_anchor(anchor: str | None) -> None:
-    """Raises `OptionError` for an anchor that nothing can be made of, before hours are spent."""
-    if anchor is not None:
-        from list3r.memory.world.scale import parse_anchor
-
-        parse_anchor(anchor)

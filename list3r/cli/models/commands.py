@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import functools
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from list3r.cli.build import model_options as mod
 from list3r.cli.build import source_options as src
-from list3r.cli.build.progress import looking, show
-from list3r.cli.common import JsonOption, note, print_json, print_table, spread
+from list3r.cli.build.progress import watching
+from list3r.cli.common import JsonOption, only, print_json, print_table, spread
 from list3r.cli.terminal import say
+from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
-    from list3r.frames.base import SourceInfo
-    from list3r.frames.options import SourceOptions
     from list3r.models.cards import ModelCard, Weights
-    from list3r.pipeline.settings import BuildSettings
 
 models = typer.Typer(
     no_args_is_help=True,
@@ -70,9 +65,11 @@ def list_models(
 
 
 @models.command("fetch")
+@spread
 def fetch_model(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A model, or owner/name of weights.", show_default=False)],
-    licence: mod.LicenceProfile = "research",
+    *,
+    run: Annotated[RunOptions, only("licence")],
     revision: Annotated[
         str | None,
         typer.Option("--revision", help="Commit, tag or branch; default: the card's.", show_default=False),
@@ -86,7 +83,7 @@ def fetch_model(
     from list3r.models.cache import fetch, find_cached
 
     done = []
-    for weights in _wanted(name, licence):
+    for weights in _wanted(name, run.licence):
         before = find_cached(weights.repository, revision or weights.revision)
         cached = fetch(weights, revision)
         done.append({"weights": cached.name, "folder": str(cached.folder), "bytes": cached.size_bytes})
@@ -102,10 +99,9 @@ def precompute(
     source: src.SourceArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
     *,
-    geometry: mod.GeometryWords,
-    poses: Annotated[str, typer.Option("--poses", help="estimate, given or auto.")] = "auto",
-    cut: mod.CutWords,
+    request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
     words: src.SourceWords,
+    run: Annotated[RunOptions, only("licence")],
     force: Annotated[bool, typer.Option("--force", help="Write chunks anew that are there already.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -114,44 +110,19 @@ def precompute(
     Example: list3r precompute walk.mp4 --out walk-pi3/ --reconstruction pi3
     """
     options = words.options()
-    from list3r.frames.source import open_source
-
-    info = open_source(source, options).info
-    words.check_fits(info)
-    settings, told = mod.build_settings(info, geometry.models(), cut, poses=poses, pictures=False)
-    if not json:
-        for line in told:
-            note(line)
-    report = _write_all(source, out, options, settings, info, force=force, licence=geometry.licence, quiet=json)
-    if json:
-        print_json({"folder": str(out), **report})
-        return
-    say(
-        f"{out}  {report['files']} files, {report['bytes'] / 1e6:.1f} MB, {report['posed']} of {report['frames']} posed"
-    )
-    for line in report["notes"]:
-        say(f"note: {line}")
-
-
-def _write_all(
-    source: str,
-    out: Path,
-    options: SourceOptions,
-    settings: BuildSettings,
-    info: SourceInfo,
-    *,
-    force: bool,
-    licence: str,
-    quiet: bool,
-) -> dict[str, Any]:
-    from tqdm import tqdm
-
     from list3r.pipeline.precompute import precompute as write
 
-    with tqdm(unit="frame", desc="reconstructing", disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
-        progress = functools.partial(show, bar)
-        run: dict[str, Any] = {"progress": progress, "look": looking(bar, "reconstructing")}
-        return write(source, out, options, settings, info, force=force, licence=licence, **run).as_dict()
+    def interrupted(begun: bool) -> str:
+        return f"interrupted; finished files in {out} are kept: give the command again"
+
+    how = replace(run, force=force)
+    with watching("reconstructing", interrupted, quiet=json) as watch:
+        report = write(source, out, options=options, settings=request, run=how, watch=watch)
+    if json:
+        print_json({"folder": str(out), **report.as_dict()})
+        return
+    say(f"{out}  {report.files} files, {report.bytes / 1e6:.1f} MB, {report.posed} of {report.frames} posed")
+    say(*(f"note: {line}" for line in report.notes))
 
 
 def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
@@ -224,4 +195,4 @@ def _licence(facts: dict[str, Any]) -> str:
     if facts["repository"] is None:
         return "-"
     marks = [facts["weights_licence"], *(["gated"] if facts["gated"] else [])]
-    return ", ".join(marks) + ("" if facts["any_use"] else "  (not for any use)")
+    return ", ".join(marks) + ("" if facts["any_use"] else "  (restricted)")

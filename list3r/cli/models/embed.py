@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from list3r.cli.build.model_options import LicenceProfile
-from list3r.cli.common import JsonOption, MemoryArgument, print_json
+from list3r.cli.common import JsonOption, MemoryArgument, only, print_json, spread
 from list3r.cli.terminal import say
+from list3r.pipeline.request import RunOptions
 
 
 def register(app: typer.Typer) -> None:
@@ -16,15 +16,17 @@ def register(app: typer.Typer) -> None:
     app.command("embed")(embed)
 
 
+@spread
 def embed(
     memory: MemoryArgument,
+    *,
     model: Annotated[str, typer.Option("--model", help="siglip2 or clip.")] = "siglip2",
     weights: Annotated[
         str | None,
         typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
     ] = None,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto.")] = "auto",
-    licence: LicenceProfile = "research",
+    run: Annotated[RunOptions, only("licence")],
     json: JsonOption = False,
 ) -> None:
     """Look at the stored pictures of every thing with a text and image model; then free words find things.
@@ -41,7 +43,7 @@ def embed(
             bar.total, bar.n = total, done
             bar.refresh()
 
-        report = embed_memory(memory, weights, device, shown, model=model, licence=licence)
+        report = embed_memory(memory, weights, device, shown, model=model, licence=run.licence)
     if json:
         print_json(vars(report))
         return

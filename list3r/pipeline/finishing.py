@@ -1,0 +1,91 @@
+"""What is done to a memory once its video is in: its scale is anchored and its things are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from list3r.frames.options import SourceOptions
+from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.maintenance.edits import EditReport, scale
+from list3r.memory.store.store import Store
+from list3r.memory.world.scale import parse_anchor
+from list3r.pipeline.request import Progress, RunOptions, Watch
+from list3r.semantics.detection import DetectReport, detect, open_sources
+
+if TYPE_CHECKING:
+    from list3r.semantics.nanodet import NanoDet
+
+
+class FinishingError(List3rError):
+    """The memory is built, but its scale could not be anchored or its things could not be named."""
+
+    def __init__(self, error: List3rError, report: object) -> None:
+        super().__init__(str(error))
+        self.report = report
+        """The `BuildReport` or `UpdateReport`: the memory is there all the same."""
+
+
+def check_run(run: RunOptions) -> None:
+    """Raise `OptionError` for what cannot be done, before hours are spent."""
+    if run.workers is not None and run.workers < 1:
+        raise OptionError(f"--workers {run.workers}: at least 1 process is needed")
+    if run.resume and run.force:
+        raise OptionError("--resume goes on with what is there and --force gives it up; give one of them")
+    if run.scale_anchor is not None:
+        parse_anchor(run.scale_anchor)
+    if run.detector is not None:
+        load_detector(run.detector, run.detector_classes)
+    elif run.detector_classes is not None:
+        raise OptionError(
+            f"--detector-classes {run.detector_classes} are those of a detector; give it with --detector FILE"
+        )
+
+
+def finish(
+    memory: Path, source: str | Path, options: SourceOptions, run: RunOptions, watch: Watch
+) -> tuple[tuple[str, ...], List3rError | None]:
+    """Anchor the scale and name things where that is asked for; return notes for the report, and what went wrong."""
+    notes: list[str] = []
+    failure: List3rError | None = None
+    try:
+        if run.scale_anchor is not None:
+            notes.append(anchor_scale(memory, run.scale_anchor).text)
+    except List3rError as error:
+        failure = error
+        notes.append(f"the scale is not anchored; `list3r scale {memory} --anchor ANCHOR` does it")
+    try:
+        if run.detector is not None:
+            network = load_detector(run.detector, run.detector_classes)
+            seen = name_things(memory, network, str(source), options, watch.looking("names"))
+            notes.append(f"{seen.detector} named {len(seen.labels)} things")
+    except List3rError as error:
+        failure = failure or error
+    return tuple(notes), failure
+
+
+def anchor_scale(memory: Path, anchor: str, author: str | None = None) -> EditReport:
+    """Say how long something in a memory is; return what was edited."""
+    with Store.open(memory, writable=True) as store:
+        return scale(store, anchor, author)
+
+
+def name_things(
+    memory: Path, network: NanoDet, source: str | None, options: SourceOptions | None, progress: Progress | None = None
+) -> DetectReport:
+    """Let a detector look at a memory: at frames of the source's session where one is named, else at all pictures.
+
+    Of a memory with several sessions, those that the source is not of keep their votes.
+    """
+    with Store.open(memory, writable=True) as store:
+        opened = None if source is None else open_sources(store, source, options)
+        chunks = None if opened is None else [c.chunk_id for c in store.chunks() if c.session_id in opened]
+        return detect(store, network, opened, chunks=chunks, progress=progress)
+
+
+def load_detector(file: Path, classes: Path | None) -> NanoDet:
+    """Return a box detector with its classes, those of COCO unless a file names others. Raises `OptionError`."""
+    from list3r.semantics.coco import COCO_80
+    from list3r.semantics.nanodet import NanoDet, read_class_names
+
+    return NanoDet(file, COCO_80 if classes is None else read_class_names(classes))

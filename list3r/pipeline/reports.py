@@ -1,0 +1,199 @@
+"""What a build and an update say when they are done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+from list3r.association.revisits.session_ties import HELD
+from list3r.memory.records import Edge
+from list3r.memory.store.store import Store
+from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """What a build did."""
+
+    frames: int
+    posed: int
+    lost: int
+    bad: int
+    chunks: int
+    components: int
+    loops: int
+    instances: int
+    structure: int
+    relations: int
+    seconds: float
+    """Wall time of this run."""
+    frames_per_second: float
+    """Frames of this run (a resumed build counts only what it did itself) by wall time."""
+    resumed_chunks: int
+    """Chunks that an earlier run had finished."""
+    stage_seconds: dict[str, float]
+    """CPU seconds by stage, over all runs."""
+    notes: tuple[str, ...]
+    """What the user should know, one sentence each."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did."""
+
+    session: int
+    """Number of the new session."""
+    frames: int
+    posed: int
+    lost: int
+    bad: int
+    chunks: int
+    placed: int
+    """Chunks of the session that lie in the world of an earlier one."""
+    ties: int
+    """Accepted relations between chunks of this session and of earlier ones."""
+    components: int
+    instances: int
+    events: dict[str, int]
+    """How many things were seen_again, moved, removed and added."""
+    seconds: float
+    frames_per_second: float
+    resumed_chunks: int
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return asdict(self)
+
+
+def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
+    """Return what a build did that began at a time of `time.monotonic`."""
+    frames = store.frames(plan.session)
+    seconds = time.monotonic() - started
+    components = len({c.component for c in store.chunks()})
+    lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
+    return BuildReport(
+        frames=len(frames),
+        posed=sum(f.state == "posed" for f in frames),
+        lost=lost,
+        bad=bad,
+        chunks=len(plan.spans),
+        components=components,
+        loops=sum(e.kind == "loop" and e.accepted for e in store.edges()),
+        instances=len(store.instances(structure=False)),
+        structure=len(store.instances(structure=True)),
+        relations=len(store.relations()),
+        seconds=round(seconds, 2),
+        frames_per_second=round(plan.fresh_frames() / seconds, 2),
+        resumed_chunks=len(plan.done),
+        stage_seconds={k: round(v, 2) for k, v in store.stage_seconds().items()},
+        notes=_build_notes(store, plan.session, lost, bad, components),
+    )
+
+
+def update_report(store: Store, plan: Plan, started: float) -> UpdateReport:
+    """Return what an update did that began at a time of `time.monotonic`."""
+    session = plan.session
+    frames = store.frames(session)
+    rows = store.chunks()
+    own = [c for c in rows if c.session_id == session]
+    known = {c.component for c in rows if c.session_id < session}
+    placed = sum(c.component in known for c in own)
+    lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
+    events = [e.kind for e in store.events(session)]
+    seconds = time.monotonic() - started
+    tied = ties(store, session)
+    return UpdateReport(
+        session=session,
+        frames=len(frames),
+        posed=sum(f.state == "posed" for f in frames),
+        lost=lost,
+        bad=bad,
+        chunks=len(own),
+        placed=placed,
+        ties=len(tied),
+        components=len({c.component for c in rows}),
+        instances=len(store.instances(structure=False)),
+        events={kind: events.count(kind) for kind in ("seen_again", "moved", "removed", "added")},
+        seconds=round(seconds, 2),
+        frames_per_second=round(plan.fresh_frames() / seconds, 2),
+        resumed_chunks=len(plan.done),
+        notes=(
+            *settled_notes(store, session),
+            *_update_notes(len(own), placed, held(store, session), lost, len(frames)),
+            *lost_reasons(store, session),
+        ),
+    )
+
+
+def _update_notes(chunks: int, placed: int, held: int, lost: int, frames: int) -> tuple[str, ...]:
+    notes = []
+    if placed == 0:
+        notes.append(
+            "no place in this video was recognised: it is kept apart, in a frame of its own, and is joined "
+            "when a later session connects the two"
+            if not held
+            else "a place in this video seems known, but no second relation agrees on how the two worlds lie: it "
+            "is kept apart until another does, or a later session connects the two"
+        )
+    elif placed < chunks:
+        notes.append(f"{chunks - placed} of {chunks} chunks could not be placed; they are kept apart")
+    if lost:
+        notes.append(f"the camera could not be followed in {lost} of {frames} frames; they have no pose")
+    return tuple(notes)
+
+
+def ties(store: Store, session: int) -> list[Edge]:
+    """The accepted relations between chunks of a session and chunks of the sessions before it."""
+    owner = {c.chunk_id: c.session_id for c in store.chunks()}
+    return [e for e in store.edges() if e.accepted and owner[e.u] < owner[e.v] == session]
+
+
+def held(store: Store, session: int) -> int:
+    """How many relations of a session to earlier ones are held back, see `association.session_ties`."""
+    owner = {c.chunk_id: c.session_id for c in store.chunks()}
+    return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges())
+
+
+def _build_notes(store: Store, session: int, lost: int, bad: int, components: int) -> tuple[str, ...]:
+    notes = list(settled_notes(store, session))
+    cuts = shot_cuts(store, session)
+    if cuts:
+        notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
+    if bad:
+        notes.append(f"{_count(bad, 'frame')} could not be used, skipped: {_listed(store)}")
+    if lost and store.get_value("poses") == "given":
+        notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
+    elif lost:
+        where = _runs([f.frame_index for f in store.frames(session) if f.state == "lost"])
+        notes.append(f"the camera could not be followed in {_count(lost, 'frame')} ({where}); they have no pose")
+    notes += lost_reasons(store, session)
+    if components > 1:
+        notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
+    if store.get_value("gravity") == "unknown":
+        notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
+    return tuple(notes)
+
+
+def _runs(numbers: Sequence[int], most: int = 5) -> str:
+    """Ascending numbers in words: those that follow each other by their first and last."""
+    breaks = [k for k in range(1, len(numbers)) if numbers[k] != numbers[k - 1] + 1]
+    runs = [(numbers[a], numbers[b - 1]) for a, b in pairwise([0, *breaks, len(numbers)])]
+    shown = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in runs[:most])
+    return shown + (f" and {len(runs) - most} more stretches" if len(runs) > most else "")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _listed(store: Store, most: int = 5) -> str:
+    rows = store.bad_frames()
+    shown = ", ".join(f"{index} ({reason})" for _, index, reason in rows[:most])
+    return shown + (f" and {len(rows) - most} more" if len(rows) > most else "")

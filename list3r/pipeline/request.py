@@ -1,0 +1,162 @@
+"""What a user asks of a build or an update: the arguments of Python and the options of the command line, written once.
+
+A field with help is an option of the commands; `list3r.cli.common.spread` makes it from what stands here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypedDict
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all) at the start and after every chunk."""
+Look = Callable[[str, int, int], None]
+"""Called with (what is looked for, done, in all) while a video is looked at before its chunks, or named after them."""
+
+
+@dataclass(frozen=True)
+class Help:
+    """How a field is shown as an option of a command."""
+
+    text: str
+    metavar: str | None = None
+    flag: str | None = None
+    """The option, where it is not the field's name."""
+
+
+def option(text: str, metavar: str | None = None, flag: str | None = None) -> dict[str, Help]:
+    """Return the metadata of a field that is also an option of a command."""
+    return {"help": Help(text, metavar, flag)}
+
+
+@dataclass(frozen=True)
+class BuildRequest:
+    """Which models work on a video and how it is cut. What is left out is chosen by the source and the machine.
+
+    A resumed build or update takes what is left out from the session that it goes on with.
+    """
+
+    reconstruction: str | None = field(
+        default=None,
+        metadata=option(
+            "rgbd, sfm, pi3, pi3x, vggt, mapanything, da3, precomputed or auto (rgbd with depth, else sfm).", "MODEL"
+        ),
+    )
+    preset: str | None = field(
+        default=None,
+        metadata=option(
+            "cpu (no weights), light (small networks, free for any use), paper, or auto (what this machine has)."
+        ),
+    )
+    discovery: str | None = field(
+        default=None,
+        metadata=option("What finds things: geometric, learned, eomt, mask2former, sam2, sam3 or precomputed."),
+    )
+    tracking: str | None = field(
+        default=None, metadata=option("What follows things from frame to frame: reprojection, sam2, sam3 or edgetam.")
+    )
+    features: str | None = field(
+        default=None, metadata=option("What describes the look of a thing: geometric, own, dinov2 or dinov3.")
+    )
+    device: str = field(default="auto", metadata=option("Where networks run: cpu, cuda, cuda:1, or auto."))
+    weights: tuple[str, ...] = field(
+        default=(),
+        metadata=option(
+            "Weights instead of the model's own: a folder, a file or owner/name@revision. PART is reconstruction "
+            "(when left out), discovery, tracking or features.",
+            "[PART=]WHERE",
+        ),
+    )
+    local_features: str = field(
+        default="sift",
+        metadata=option(
+            "What finds a keyframe again: sift, or aliked=FILE with its weights. With colour alone, aliked also joins "
+            "frames between which nothing can be followed.",
+            "KIND[=FILE]",
+        ),
+    )
+    poses: str = field(default="auto", metadata=option("estimate, given or auto (given where the source has them)."))
+    chunk: int | None = field(
+        default=None, metadata=option("Frames in a chunk; default: 100, or what the GPU holds of a network.", "N")
+    )
+    overlap: int | None = field(
+        default=None, metadata=option("Frames that neighbouring chunks share; default: 30 %.", "N")
+    )
+    depth_every: int | None = field(
+        default=None,
+        metadata=option(
+            "With colour alone: depth and things from every n-th frame, the others get a pose; default: by how fast "
+            "the picture moves.",
+            "N",
+        ),
+    )
+    pictures: bool = field(
+        default=True, metadata=option("Keep a JPEG of each keyframe.", flag="--pictures/--no-pictures")
+    )
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a build or an update is run, and what is done to the memory once the video is in it."""
+
+    licence: str = field(
+        default="research",
+        metadata=option("permissive (nothing non-commercial, gated, copyleft or of own terms), research, or any."),
+    )
+    workers: int | None = field(default=None, metadata=option("Processes; default: cores, up to 4.", "N"))
+    scale_anchor: str | None = field(
+        default=None,
+        metadata=option(
+            "A length that you know, for videos without depth: camera_height=1.5m, x,y,z:x,y,z=1.2m or ID=0.095m.",
+            "ANCHOR",
+        ),
+    )
+    detector: Path | None = field(
+        default=None,
+        metadata=option("A NanoDet box detector for ncnn (.param, with its .bin beside it) that names things.", "FILE"),
+    )
+    detector_classes: Path | None = field(
+        default=None, metadata=option("The detector's classes, one name a line; default: the 80 of COCO.", "FILE")
+    )
+    resume: bool = field(default=False, metadata=option("Go on with what was interrupted."))
+    force: bool = field(
+        default=False,
+        metadata=option("build: replace an existing memory. update: give up an update that was interrupted."),
+    )
+
+
+class RunWords(TypedDict, total=False):
+    """The fields of `RunOptions` as arguments of Python."""
+
+    licence: str
+    workers: int | None
+    scale_anchor: str | None
+    detector: Path | None
+    detector_classes: Path | None
+    resume: bool
+    force: bool
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who hears of the work while it goes on."""
+
+    progress: Progress | None = None
+    look: Look | None = None
+    note: Callable[[str], None] | None = None
+    """Called with what the user should know before the work begins, one sentence each."""
+    debug_dir: Path | None = None
+    """Folder for pictures of what was found."""
+
+    def tell(self, notes: Iterable[str]) -> None:
+        """Hand on notes."""
+        if self.note is not None:
+            for line in notes:
+                self.note(line)
+
+    def looking(self, what: str) -> Progress | None:
+        """Return who hears of the progress in looking for something."""
+        look = self.look
+        return None if look is None else (lambda done, total: look(what, done, total))
