@@ -37,7 +37,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def one(walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The memory of the first walk."""
     path = tmp_path_factory.mktemp("memory") / "one.l3r"
-    list3r.build(walks[0], path, settings=SETTINGS, run=RunOptions(workers=1)).close()
+    list3r.build(walks[0], path, settings=SETTINGS, workers=1).close()
     return path
 
 

@@ -45,7 +45,7 @@ def build(
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
     job = prepare(source, options, settings, run, memory)
-    watch.tell(job.notes)
+    watch.tell((*job.info.notes, *job.notes))
     if watch.debug_dir is not None:
         make_folder(watch.debug_dir)
     with open_target(memory, job.info, job.settings, resume=run.resume, force=run.force) as target:

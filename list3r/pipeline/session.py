@@ -85,6 +85,7 @@ def prepare(
     info = open_source(source, options).info
     options.check_fits(info)
     first, begun = (None, None) if memory is None else stored_sessions(memory)
+    begun = begun or (None if later else first)  # a build that is done has nothing left to do
     first, begun = first if later else None, begun if run.resume else None
     notes: list[str] = []
     if settings is None or isinstance(settings, BuildRequest):
@@ -100,7 +101,7 @@ def prepare(
             check_beside(chosen, first)
     chosen = resolve_settings(chosen, info)
     check_buildable(info, chosen)
-    return Job(source, options, with_weights(chosen, run.licence), info, run, (*info.notes, *notes))
+    return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes))
 
 
 def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
