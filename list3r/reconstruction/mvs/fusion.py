@@ -131,13 +131,13 @@ def _window_sums(values: Tensor, radius: int) -> Tensor:
     return values
 
 
-def carry(maps: Sequence[DepthMap], warps: Sequence[Warp], tolerance: float = 0.03) -> DepthMap:
+def carry(maps: Sequence[DepthMap], warps: Sequence[Warp], settings: DepthFusionSettings) -> DepthMap:
     """Depth of keyframes as another frame sees it: what is nearest in each pixel, averaged. `warps` lead into it."""
     height, width = maps[0].inverse.shape
     device, size = maps[0].inverse.device, height * width
     index, inverse, sigma, share = (torch.cat(parts) for parts in zip(*map(_splat, maps, warps), strict=True))
     nearest = torch.zeros(size, device=device).scatter_reduce_(0, index, inverse, "amax")
-    keep = inverse > (1.0 - tolerance) * nearest[index]
+    keep = inverse > (1.0 - settings.carried_tolerance) * nearest[index]
     weight = torch.where(keep, share / sigma**2, torch.zeros((), device=device))
     total = torch.zeros(size, device=device).index_add_(0, index, weight)
     mean = torch.zeros(size, device=device).index_add_(0, index, weight * inverse) / total.clamp_min(1e-20)
@@ -166,7 +166,7 @@ def _splat(depth: DepthMap, warp: Warp) -> tuple[Tensor, Tensor, Tensor, Tensor]
     return index, inverse, sigma, share
 
 
-def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: float = 0.04) -> tuple[Tensor, Tensor]:
+def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: float) -> tuple[Tensor, Tensor]:
     """Inverse depth and sigma at the size of the picture `full` (H, W), by joint bilateral upsampling.
 
     Kopf et al. 2007: each large pixel takes the four small ones around it, those of its own brightness most; where
@@ -205,9 +205,10 @@ def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: floa
     return torch.where(known >= 2, mean / total, zero), torch.where(known >= 2, sigma / total, zero)
 
 
-def speckles_out(depth: DepthMap, radius: int = 2, share: float = 0.35) -> DepthMap:
+def speckles_out(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
     """Depth without pixels that few neighbours of about the same depth surround."""
     known = (depth.inverse > 0).float()
-    alone = box_sum(known, radius) < share * (2 * radius + 1) ** 2
+    radius = settings.speckle_radius_px
+    alone = box_sum(known, radius) < settings.speckle_share * (2 * radius + 1) ** 2
     zero = torch.zeros((), device=known.device)
     return DepthMap(torch.where(alone, zero, depth.inverse), torch.where(alone, zero, depth.sigma))

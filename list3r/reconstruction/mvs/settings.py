@@ -84,6 +84,14 @@ class DepthFusionSettings:
     """Deviation that filled depth is said to have, share of depth."""
     carried_from: int = 6
     """Keyframes whose depth is carried into a frame."""
+    carried_tolerance: float = 0.03
+    """Depths of a pixel that are averaged lie no farther behind the nearest than this share of it."""
+    enlarged_step: float = 0.04
+    """Depths that lie on two surfaces when a picture is enlarged, share of depth."""
+    speckle_radius_px: int = 2
+    """Half the window in which a pixel needs neighbours,"""
+    speckle_share: float = 0.35
+    """and the share of it that must be known."""
 
 
 @dataclass(frozen=True)

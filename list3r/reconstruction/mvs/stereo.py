@@ -296,7 +296,7 @@ def _keyframe_maps(chunk: _Chunk) -> dict[int, DepthMap]:
         key, others = chunk.keyframes[row], [chunk.keyframes[k] for k in near]
         warps = _warps(chunk, key, others, chunk.fine.camera)
         fused = agree_and_fuse(own, [seen[k] for k in near], warps, chunk.settings.fusion)
-        out[row] = speckles_out(fused)
+        out[row] = speckles_out(fused, chunk.settings.fusion)
     return out
 
 
@@ -317,7 +317,7 @@ def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> Depth
         return None
     T = chunk.T_chunk_cam
     warps = [Warp.between(T[chunk.keyframes[r]], T[position], chunk.fine.camera, chunk.device) for r in rows]
-    carried = carry([maps[r] for r in rows], warps)
+    carried = carry([maps[r] for r in rows], warps, chunk.settings.fusion)
     return fill_flat(carried, chunk.settings.fusion)
 
 
@@ -332,7 +332,7 @@ def _full_size(
     """Depth and confidence at the camera's size."""
     full = make_pictures([frame], camera, camera.width, chunk.device).gray[0]
     gray = _resized(full, small.inverse.shape)
-    inverse, sigma = enlarge(small, gray, full, chunk.settings.sweep.path_edge)
+    inverse, sigma = enlarge(small, gray, full, chunk.settings.sweep.path_edge, chunk.settings.fusion.enlarged_step)
     zero = torch.zeros((), device=full.device)
     depth = torch.where(inverse > 0, 1.0 / inverse.clamp_min(1e-9), zero)
     confidence = torch.where(inverse > 0, 1.0 / (1.0 + (sigma / chunk.settings.trust.half_sigma) ** 2), zero)

@@ -254,7 +254,10 @@ class CameraTracker:
         view, T_last = self.view(position), segment.T_segment_cam[last]
         far = float(np.median(view.depth[view.depth > 0]))
         samples = segment.model.samples(T_last, self.small, self.settings.sweep_samples)
-        found = [register(samples, view, T_last @ T, self.settings.sweep, self.settings.noise) for T in _starts(far)]
+        found = [
+            register(samples, view, T_last @ T, self.settings.sweep, self.settings.noise)
+            for T in _starts(far, self.settings)
+        ]
         ranked = sorted((f for f in found if f is not None), key=lambda f: -f.overlap * f.inliers)
         return [f.T_model_cam for f in ranked[:3]]
 
@@ -296,14 +299,14 @@ class CameraTracker:
         return True
 
 
-def _starts(far_m: float) -> list[Pose]:
-    """No motion, shifts by a tenth of the depth, and orbits of twelve degrees about a point at that depth."""
+def _starts(far_m: float, settings: OdometrySettings) -> list[Pose]:
+    """Return no motion, shifts, and orbits about a point at the median depth."""
     out = [np.eye(4)]
     for axis in (0, 1):
         for sign in (-1.0, 1.0):
             shift, orbit, turn = np.eye(4), np.eye(4), np.zeros(3)
-            shift[axis, 3] = 0.1 * sign * far_m
-            turn[1 - axis] = np.radians(12.0) * sign
+            shift[axis, 3] = settings.start_shift * sign * far_m
+            turn[1 - axis] = np.radians(settings.start_turn_deg) * sign
             orbit[:3, :3] = cv2.Rodrigues(turn)[0]
             orbit[:3, 3] = far_m * (np.eye(3) - orbit[:3, :3])[:, 2]
             out += [shift, orbit]

@@ -100,6 +100,10 @@ class OdometrySettings:
     """Most keyframes whose features are compared in a search."""
     sweep_samples: int = 800
     """Model points used by the coarse registrations of a search."""
+    start_shift: float = 0.1
+    """Sideways starts of a search, share of the median depth: what a slow video moves between frames."""
+    start_turn_deg: float = 12.0
+    """Starts of a search that turn about a point at the median depth."""
     sweep: RegistrationSettings = field(
         default_factory=lambda: RegistrationSettings(
             iterations=10, gate_m=0.4, gate_halvings=4, gate_hold=2, huber=3.0, normal_agreement=0.6

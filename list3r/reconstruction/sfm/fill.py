@@ -104,8 +104,8 @@ def pose_of(
     lens, px = make_lens(camera, ""), xy.astype(np.float64) + 0.5
     gate = settings.pose_error_px * pixel_unit(camera)
     if start is not None:
-        found = _refined(px, points, camera, start, np.ones(len(px), bool), gate)
-        if found is not None and found[1].mean() > 0.6:
+        found = _refined(px, points, camera, start, np.ones(len(px), bool), settings)
+        if found is not None and found[1].mean() > settings.refined_share:
             return found
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, settings.seed, 1
@@ -113,8 +113,8 @@ def pose_of(
     if guess is None or guess["num_inliers"] < settings.least_matches:
         return None
     T = inverse(matrix_of(guess["cam_from_world"]))
-    found = _refined(px, points, camera, T, np.asarray(guess["inlier_mask"], bool), gate)
-    return found if found is not None and found[1].mean() > 0.3 else None
+    found = _refined(px, points, camera, T, np.asarray(guess["inlier_mask"], bool), settings)
+    return found if found is not None and found[1].mean() > settings.sampled_share else None
 
 
 def _refined(
@@ -123,9 +123,10 @@ def _refined(
     camera: Camera,
     start: Poses,
     rows: NDArray[np.bool_],
-    gate: float,
+    settings: FramePoseSettings,
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
     T_cam_map, lens = inverse(start), make_lens(camera, "")
+    gate = settings.pose_error_px * pixel_unit(camera)
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.loss_function_scale, options.gradient_tolerance = 0.5 * pixel_unit(camera), 1e-3
     for _ in range(2):
@@ -137,7 +138,7 @@ def _refined(
         z = np.maximum(seen[:, 2], 1e-9)
         at = seen[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx + 0.5, camera.cy + 0.5)
         rows = (seen[:, 2] > 0) & (np.linalg.norm(at - px, axis=1) < gate)
-        if rows.sum() < 12:
+        if rows.sum() < settings.least_inliers:
             return None
     return inverse(T_cam_map), rows
 
@@ -168,8 +169,12 @@ def _look_for(
     place, found, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, np.zeros_like(xy), winSize=size, maxLevel=5)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, place, np.zeros_like(xy), winSize=size, maxLevel=5)
     place = np.asarray(place, np.float32)
-    good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(np.asarray(back) - xy, axis=1) < 2.0)
+    good = (
+        (found.ravel() > 0)
+        & (returned.ravel() > 0)
+        & (np.linalg.norm(np.asarray(back) - xy, axis=1) < settings.bridge_return_px)
+    )
     made = pose_of(place[good], points[good], segment.found.camera, segment.T_map_cam[near], settings)
-    if made is not None and made[1].mean() > 0.5:
+    if made is not None and made[1].mean() > settings.bridged_share:
         segment.T_map_cam[position] = made[0]
         segment.seen[position] = place[good][made[1]], points[good][made[1]]

@@ -158,6 +158,16 @@ class FramePoseSettings:
     """Fewest points of the map that a frame must see."""
     pose_error_px: float = 4.0
     """Largest error of a point that agrees with a pose, px of a picture 640 wide."""
+    refined_share: float = 0.6
+    """Share of the points that must agree with a pose refined from the frame before; else a pose is sampled."""
+    sampled_share: float = 0.3
+    """... and with a sampled one."""
+    bridged_share: float = 0.5
+    """... and with the pose of a bridged frame."""
+    bridge_return_px: float = 2.0
+    """Farthest from its start that a point of a bridged frame may come out when it is followed back, px."""
+    least_inliers: int = 12
+    """Fewest points that agree with a pose."""
     seed: int = 1
 
 
