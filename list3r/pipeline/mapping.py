@@ -37,7 +37,7 @@ from list3r.memory.library.labels import apply_labels, put_votes, votes_of_names
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.memory.world.gravity import estimate_gravity, world_from_graph
-from list3r.memory.world.scale import settle_scale
+from list3r.memory.world.scale import write_scale
 from list3r.pipeline.settings import AssociationSettings, session_settings
 from list3r.reconstruction.registry import MODELS
 
@@ -196,7 +196,7 @@ def place_chunks(
     gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
     upright = world_from_graph(gravity)
     rows = [replace(c, component=graph.components[c.chunk_id]) for c in store.chunks()]
-    S_world_graph = settle_scale(store, rows, graph.S_graph_chunk) @ upright
+    S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
     store.set_value("T_world_graph", S_world_graph.as_matrix().tolist())
     store.set_value("gravity", gravity.status)
     store.place_chunks({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)

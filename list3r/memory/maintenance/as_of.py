@@ -97,7 +97,7 @@ class _PastStore(Store):
         vertical = self.get_value("gravity", "unknown") != "unknown"
         self.show(self.session_id, then)
         changed = {i.id for i in then if _has_changed(i, now.get(i.id))}
-        self.relate([*_kept(known, then, changed), *_told_anew(self, then, changed, vertical)])
+        self.relate([*_kept(known, then, changed), *_found_anew(self, then, changed, vertical)])
 
     def verify(self) -> list[str]:
         """Every damage of the file itself."""
@@ -147,7 +147,7 @@ def _kept(known: Sequence[Relation], then: Sequence[Instance], changed: set[int]
     return [r for r in known if r.subject in same and r.object in same]
 
 
-def _told_anew(past: Store, then: Sequence[Instance], changed: set[int], vertical: bool) -> list[Relation]:
+def _found_anew(past: Store, then: Sequence[Instance], changed: set[int], vertical: bool) -> list[Relation]:
     """Return relations of what has changed since."""
     out: list[Relation] = []
     first = min((c.component for c in past.chunks()), default=0)

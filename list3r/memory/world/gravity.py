@@ -43,9 +43,9 @@ class GravitySettings:
     """Share of the cameras that may come nearer to the floor than `floor_camera_height_m`."""
     floor_camera_height_m: float = 0.8
     """A level surface that the cameras come nearer to than this is a table, not the floor."""
-    settled_deg: float = 0.4
+    hysteresis_deg: float = 0.4
     """An estimate that differs by less from the one before is not worth moving the world for."""
-    settled_m: float = 0.02
+    hysteresis_m: float = 0.02
     """The same for the height of the floor."""
 
 
@@ -182,8 +182,8 @@ def estimate_gravity(
     of the first component (see `ChunkRow.component`), or 64 of them in a long memory.
 
     Call it inside a transaction; `world_from_graph` then gives what stands the chunks upright. An estimate that still
-    agrees with the one before within `settled_deg` gives way to that one, so that the world does not tremble with every
-    chunk.
+    agrees with the one before within `hysteresis_deg` gives way to that one, so that the world does not tremble with
+    every chunk.
     """
     s = settings or stored_settings(store, GravitySettings, "library", "gravity")
     chunks = store.chunks()
@@ -201,20 +201,20 @@ def estimate_gravity(
     if summaries.metre is not None:
         unit *= float(inside[0].S_world_chunk.scale) / float(rows[0].S_world_chunk.scale)
     found = gravity_from_planes(planes, cameras_of(store, inside), unit, s)
-    settled = _settled(found, store.get_value("gravity_estimate"), unit, s)
+    settled = _with_hysteresis(found, store.get_value("gravity_estimate"), unit, s)
     if settled is found and found.status != "unknown":
         store.set_value("gravity_estimate", {"up": found.up.tolist(), "floor_height": found.floor_height})
     return settled
 
 
-def _settled(found: Gravity, before: dict[str, Any] | None, unit: float, s: GravitySettings) -> Gravity:
+def _with_hysteresis(found: Gravity, before: dict[str, Any] | None, unit: float, s: GravitySettings) -> Gravity:
     """Return the estimate before where it holds still, else the one found now."""
     if found.status == "unknown" or before is None or (before["floor_height"] is None) != (found.floor_height is None):
         return found
     up = np.array(before["up"])
     turned = float(np.degrees(np.arccos(np.clip(up @ found.up, -1.0, 1.0))))
     risen = 0.0 if found.floor_height is None else abs(found.floor_height - before["floor_height"])
-    if turned > s.settled_deg or risen > s.settled_m * unit:
+    if turned > s.hysteresis_deg or risen > s.hysteresis_m * unit:
         return found
     return replace(found, up=up, floor_height=before["floor_height"])
 

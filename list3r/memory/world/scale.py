@@ -104,7 +104,7 @@ def measure(store: Store, anchor: ScaleAnchor) -> MeasuredAnchor:
     return MeasuredAnchor(length, chunk.chunk_id, anchor.metres / length * float(chunk.S_world_chunk.scale), keys)
 
 
-def settle_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int, Sim3]) -> Sim3:
+def write_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int, Sim3]) -> Sim3:
     """Write down what kind of scale the memory has; what takes the upright graph to the world. Within `transaction()`.
 
     `S_graph_chunk` holds the chunks in the frame of the pose graph.
@@ -145,7 +145,7 @@ def rescale(store: Store) -> None:
     chunks = store.chunks()
     S_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
     S_graph_world = S_world_graph.inverse()
-    grow = settle_scale(store, chunks, {c.chunk_id: S_graph_world @ c.S_world_chunk for c in chunks})
+    grow = write_scale(store, chunks, {c.chunk_id: S_graph_world @ c.S_world_chunk for c in chunks})
     factor = float(grow.scale) / float(S_world_graph.scale)
     if abs(factor - 1.0) < 1e-12:
         return
