@@ -14,7 +14,7 @@ import numpy as np
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store.store import Store
 from list3r.queries.relations import noise_of, viewer_from
-from list3r.queries.views.viewpoint import Viewer, between, viewed
+from list3r.queries.views.viewpoint import Viewpoint, between, viewed
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.worlds.things import SimulatedThing
 
@@ -49,7 +49,7 @@ def _from_viewpoints(
     said: set[tuple[object, ...]] = set()
     for k in sorted(posed & set(range(0, len(poses), EVERY))):
         here = viewer_from(store, f"camera:{k}")
-        there = Viewer(poses[k][:3, 3], np.array([0.0, 0.0, 1.0]), "truth")
+        there = Viewpoint(poses[k][:3, 3], np.array([0.0, 0.0, 1.0]), "truth")
         assert here is not None
         for a, b in pairs:
             answer = viewed(there, true[a], true[b], 0.0)

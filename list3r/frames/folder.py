@@ -99,7 +99,10 @@ class FolderSource:
         return self._color(file), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
     def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
-        """The colour image in grey as stored, each side reduced by 1, 2, 4 or 8; None where it cannot be decoded."""
+        """Return the colour image in grey as stored, each side reduced by 1, 2, 4 or 8.
+
+        None where it cannot be decoded.
+        """
         try:
             return read_gray(self._layout.files[self._number(position)].color, reduction)
         except FrameError:

@@ -159,7 +159,10 @@ def check_weights(path: Path) -> None:
 
 
 def read_header(file: Path) -> dict[str, Any]:
-    """The table of contents of a `.safetensors` file. Raises `OptionError` when the file is not as long as it says."""
+    """Return the table of contents of a `.safetensors` file.
+
+    Raises `OptionError` when the file is not as long as it says.
+    """
     size = file.stat().st_size
     with file.open("rb") as stream:
         length = int.from_bytes(stream.read(8), "little")

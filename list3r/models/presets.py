@@ -80,7 +80,10 @@ def _by_machine(has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelectio
 
 
 def obstacle(name: str, part: str, profile: str) -> str | None:
-    """What keeps a model from running here without a download: licence, package, weights; None where nothing does."""
+    """Return what keeps a model from running here without a download: licence, package, weights.
+
+    None where nothing does.
+    """
     card = find_card(name, part)
     if card is None:
         return "unknown"

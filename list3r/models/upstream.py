@@ -29,7 +29,10 @@ def quiet() -> Iterator[None]:
 
 
 def upstream_class(card: ModelCard, module: str, name: str) -> Any:
-    """A class of the package that a card names. Raises `OptionError`, with what installs it, where it is missing."""
+    """Return a class of the package that a card names.
+
+    Raises `OptionError`, with what installs it, where it is missing.
+    """
     try:
         with quiet():
             found = import_module(module)

@@ -54,7 +54,10 @@ class ThumbnailSource(FrameSource, Protocol):
     """A source that can decode grey pictures for less than whole frames: by `read_gray`, or by the other two."""
 
     def read_gray(self, position: int, reduction: int) -> Gray | None:
-        """The colour image in grey, each side reduced by about `reduction` (1, 2, 4 or 8); None where it is bad."""
+        """Return the colour image in grey, each side reduced by about `reduction` (1, 2, 4 or 8).
+
+        None where it is bad.
+        """
         ...
 
     def thumbnails(self) -> Iterator[Gray | None]:
@@ -118,7 +121,10 @@ Alike = Callable[[int, int], bool]
 
 
 def suspected(likeness: NDArray[np.float64], k: int, enough: float, settings: ShotCutSettings) -> bool:
-    """Whether a frame is far less like the one before than is usual around it; 1 is alike, of F frames the first is."""
+    """Return whether a frame is far less like the one before than is usual around it.
+
+    1 is alike, of F frames the first is.
+    """
     if likeness[k] >= enough:
         return False
     around = 1.0 - likeness[max(1, k - settings.window) : k + settings.window + 1]

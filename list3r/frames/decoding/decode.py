@@ -121,7 +121,10 @@ def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR, name: str = "the 
 
 
 def _cut_off(data: bytes) -> bool:
-    """Whether a JPEG or PNG ends before its picture does. Phones put a film or maps of brightness behind a JPEG."""
+    """Return whether a JPEG or PNG ends before its picture does.
+
+    Phones put a film or maps of brightness behind a JPEG.
+    """
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data
     return data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", _scan_start(data)) < 0

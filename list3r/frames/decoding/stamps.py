@@ -123,7 +123,10 @@ def _listed(path: Path, words: dict[str, str]) -> tuple[Stamps, float]:
 
 
 def open_container(path: Path, words: dict[str, str]) -> Any:
-    """The opened file. Its name is made absolute, because FFmpeg takes what stands before a colon for a protocol."""
+    """Return the opened file.
+
+    Its name is made absolute, because FFmpeg takes what stands before a colon for a protocol.
+    """
     return av.open(str(path.absolute()), options=words)
 
 

@@ -60,7 +60,10 @@ class TransformTree:
             self.moving[_name(name)] = self.moving.pop(child)
 
     def world_of(self, frame: str) -> str | None:
-        """The frame of reference that a frame moves in: one of `WORLDS`, else the root; None where nothing moves it."""
+        """Return the frame of reference that a frame moves in: one of `WORLDS`, else the root.
+
+        None where nothing moves it.
+        """
         chain = self._up(_name(frame))
         if not any(child in self.moving for child in chain[:-1]):
             return None

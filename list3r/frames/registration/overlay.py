@@ -16,7 +16,10 @@ _RED = (230, 20, 20)
 
 
 def draw_overlay(frame: Frame) -> NDArray[np.uint8]:
-    """The colour image with the near sides of depth steps in red, beside the depth in colours. Shape (H, 2W, 3)."""
+    """Return the colour image with the near sides of depth steps in red, beside the depth in colours.
+
+    Shape (H, 2W, 3).
+    """
     if frame.depth is None:
         raise SourceError("the source has no depth to draw over its colour images")
     edges = depth_edges(frame.depth)

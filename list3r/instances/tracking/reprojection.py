@@ -78,7 +78,10 @@ class LabelledChunk:
     settings: InstanceSettings
 
     def library(self, labels_of: Callable[[int], NDArray[np.int32]], feature_space: str) -> LocalLibrary:
-        """The stable tracks; `labels_of` gives instance + 1 of each pixel of a frame at working size, by position."""
+        """Return the stable tracks.
+
+        `labels_of` gives instance + 1 of each pixel of a frame at working size, by position.
+        """
         return self._library(self._follow(labels_of), feature_space)
 
     def _follow(self, labels_of: Callable[[int], NDArray[np.int32]]) -> list[_Track]:

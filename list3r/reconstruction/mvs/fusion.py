@@ -105,7 +105,10 @@ def fill_flat(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
 
 
 def _enclosed(known: Tensor, radius: int) -> Tensor:
-    """Where something is known within `radius` on the left, on the right, above and below. Shape (h, w), bool."""
+    """Return where something is known within `radius` on the left, on the right, above and below.
+
+    Shape (h, w), bool.
+    """
     values = known.float()[None, None]
     out = torch.ones_like(known)
     for pad, kernel in (
