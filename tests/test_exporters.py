@@ -54,7 +54,7 @@ def write_split_memory(path: Path) -> Path:
             ]
         )
         store.set_observations([Observation(1, 1, 0), Observation(2, 2, 0)])
-        store.replace_relations(None, [Relation(3, "next to!", 2, 0.5, 0.1), Relation(3, "near", 2, 0.5, float("inf"))])
+        store.replace_relations(None, [Relation(3, "next to!", 2, 0.5, 0.1), Relation(3, "near", 2, 0.5, 0.2)])
     return path
 
 
