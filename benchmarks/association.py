@@ -164,10 +164,10 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth)
     peer = variant.startswith("vggt-long")
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:
         with store.transaction():
-            store.set_value("scale_kind", "relative")
-            store.set_value("gravity", "unknown")
-            store.set_value("poses", "estimate")
-            session = store.add_session("simulation", "", {}, truth.frames)
+            store.facts.scale_kind = "relative"
+            store.facts.gravity = "unknown"
+            store.facts.poses = "estimate"
+            session = store.sessions.add("simulation", "", {}, truth.frames)
         if peer:
             _place_as_vggt_long(store, session, results, model)
         for result in () if peer else results:
@@ -190,7 +190,7 @@ def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], model:
 
     placed, loops, _ = place(results, model.descriptors, model)
     with store.transaction():
-        ids = [store.add_chunk(session, result) for result in results]
+        ids = [store.chunks.add(session, result) for result in results]
         edges = []
         for loop in loops:
             w = loop.window
@@ -199,8 +199,8 @@ def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], model:
             middles = (sum(frames_u) // 2, sum(frames_v) // 2)
             S_v_u = loop.S_b_a.inverse()
             edges.append(Edge(u, v, "loop", S_v_u, 1.0, 1.0, 0, 0.0, True, "as VGGT-Long", {"s_det": 1.0}, middles))
-        store.add_edges(edges)
-        store.place_chunks(dict(zip(ids, placed, strict=True)), dict.fromkeys(ids, ids[0]), {})
+        store.edges.add(edges)
+        store.chunks.place(dict(zip(ids, placed, strict=True)), dict.fromkeys(ids, ids[0]), {})
 
 
 class _Truth:
@@ -222,7 +222,7 @@ class _Truth:
         from list3r.evaluation.revisits import Candidates, judge, score
         from list3r.evaluation.trajectory import Trajectory, align, evaluate_trajectory
 
-        placed = store.camera_poses()
+        placed = store.trajectory.poses()
         rows = np.array([f.frame_index for f, _ in placed])
         poses = np.stack([_rigid(S) for _, S in placed])
         truth = Trajectory(rows.astype(float), self._video.T_world_cam[rows])
@@ -231,9 +231,9 @@ class _Truth:
         scaled = Trajectory(estimate.time_s, _moved(S_truth_world, poses))
         errors = evaluate_trajectory(truth, scaled, delta_frames=30)
         cloud = evaluate_cloud(self._cloud, S_truth_world.apply(_points(store)))
-        edges = store.edges()
+        edges = store.edges.all()
         loops = [e for e in edges if e.kind == "loop"]
-        spans = {c.chunk_id: (c.first_frame, c.last_frame) for c in store.chunks()}
+        spans = {c.chunk_id: (c.first_frame, c.last_frame) for c in store.chunks.all()}
         candidates = Candidates.of_edges(edges)
         judged = judge(candidates, self._covisibility, spans)
         errors_m = np.array(
@@ -243,7 +243,7 @@ class _Truth:
         revisits = score([judged])
         return {
             "posed": len(rows) / self.frames,
-            "components": len({c.component for c in store.chunks()}),
+            "components": len({c.component for c in store.chunks.all()}),
             "ate_sim3_m": round(errors.ate_sim3_m.rmse, 5),
             "rte_m": round(errors.rpe_translation_m.rmse, 5),
             "rre_deg": round(errors.rpe_rotation_deg.rmse, 4),
@@ -260,7 +260,7 @@ class _Truth:
 
     def _loop_error(self, store: Any, edge: Any) -> float:
         """How far a loop edge puts the camera of its frame in v from the truth, as seen from u; metres."""
-        ends = [store.frame_samples(k) for k in (edge.u, edge.v)]
+        ends = [store.chunks.samples(k) for k in (edge.u, edge.v)]
         to_truth = [self._placed(samples, frame) for samples, frame in zip(ends, edge.frames, strict=True)]
         if None in to_truth:
             return 0.0
@@ -315,9 +315,9 @@ def _points(store: Any) -> Array:
     """Points where the frames that saw them lie, the bending of chunks undone."""
     from list3r.memory.geometry import Sim3
 
-    parts, bends = [], store.bends()
-    for chunk in store.chunks():
-        samples = store.frame_samples(chunk.chunk_id)
+    parts, bends = [], store.bends.all()
+    for chunk in store.chunks.all():
+        samples = store.chunks.samples(chunk.chunk_id)
         kept = np.flatnonzero(samples.confidence > 0.3)[::5]
         points = samples.points[kept].astype(np.float64)
         if chunk.chunk_id in bends:

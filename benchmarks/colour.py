@@ -182,7 +182,7 @@ def _alignment(memory: Path, walk: Path) -> tuple[Sim3, float]:
     """From the memory's world to the truth's, and the RMS distance of the cameras, metres."""
     truth = read_tum(walk / "groundtruth.txt")
     with Store.open(memory) as store:
-        poses = {f.frame_index: S for f, S in store.camera_poses()}
+        poses = {f.frame_index: S for f, S in store.trajectory.poses()}
     rows = np.array(sorted(poses))
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     for k, row in enumerate(rows.tolist()):
@@ -219,9 +219,9 @@ def memory_masks(memory: Path, frames: range) -> Masks:
     """What a memory saw where, all chunks together."""
     out: Masks = {frame: {} for frame in frames}
     with Store.open(memory) as store:
-        present = {i.id for i in store.instances()}
-        for seen in store.observations():
-            track = store.mask_track(seen.chunk_id, seen.local_id)
+        present = {i.id for i in store.instances.all()}
+        for seen in store.observations.all():
+            track = store.local_instances.mask_track(seen.chunk_id, seen.local_id)
             for frame, runs in zip(track.frames.tolist(), track.masks, strict=True):
                 if frame in out and seen.instance_id in present:
                     mask = decode_mask(runs, track.image_size)[::STEP, ::STEP]

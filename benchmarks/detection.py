@@ -43,12 +43,12 @@ LEAST_OVERLAP = 0.3
 
 def instances_of(store: Store) -> dict[str, int | None]:
     """The instance that each true thing is, None where the memory holds none."""
-    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
     found: dict[str, int | None] = {}
     for name, (_, frame, box) in TRUTH.items():
         boxes: dict[tuple[int, int], np.ndarray] = {}
         for (chunk_id, local_id), instance in home.items():
-            track = store.mask_track(chunk_id, local_id)
+            track = store.local_instances.mask_track(chunk_id, local_id)
             away = np.where(track.areas_px > 0, np.abs(track.frames - frame), NEAR + 1)
             at = np.flatnonzero(away == away.min(initial=NEAR + 1))
             if len(at) and away[at[0]] <= NEAR:
@@ -66,14 +66,14 @@ def judged(path: Path) -> dict[str, Any]:
     """What the true things are called, and what else bears their names."""
     with Store.open(path) as store:
         home = instances_of(store)
-        things = {i.id: i for i in store.instances(structure=None)}
+        things = {i.id: i for i in store.instances.all(structure=None)}
         wanted = {name: TRUTH[name][0] for name in TRUTH}
         said = {name: None if home[name] is None else things[home[name]].label for name in TRUTH}
         others: dict[str, int] = {}
         for i in things.values():
             if i.label is not None and i.id not in home.values():
                 others[i.label] = others.get(i.label, 0) + 1
-        poses = store.get_value("poses")
+        poses = store.facts.poses
         structure = sum(i.label is not None for i in things.values() if i.structure is not None)
     answers, _ = run_list3r("query", "find", str(path), "cup on dining table")
     mugs = {home["white mug"], home["printed mug"]}

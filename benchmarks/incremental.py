@@ -118,8 +118,8 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
 def begin(store: Store, chunks: int) -> None:
     """A session of so many chunks."""
     with store.transaction():
-        store.set_value("scale_kind", "metric")
-        store.add_session("walk", "synthetic", {}, HOP * chunks + FRAMES)
+        store.facts.scale_kind = "metric"
+        store.sessions.add("walk", "synthetic", {}, HOP * chunks + FRAMES)
 
 
 def end(store: Store, session: int) -> float:
@@ -127,13 +127,13 @@ def end(store: Store, session: int) -> float:
     started = user_s()
     with store.transaction():
         consolidate(store)
-        store.complete_session(session)
+        store.sessions.complete(session)
     return round(user_s() - started, 3)
 
 
 def edited(store: Store) -> tuple[float, float]:
     """User seconds of an operator's merge of two things, and of its undo."""
-    a, b = (i.id for i in store.instances(structure=False)[:2])
+    a, b = (i.id for i in store.instances.all(structure=False)[:2])
     started = user_s()
     edits.merge(store, a, b, "benchmark")
     merged = user_s()
@@ -186,21 +186,21 @@ def add(store: Store, result: ChunkResult, session: int = 1) -> dict[str, float]
         library_s = user_s() - started
         return report
 
-    before, started = len(store.vectors_touched), user_s()
+    before, started = len(store.embeddings.touched), user_s()
     mapping.consolidate = timed  # type: ignore[assignment]
     try:
         if session == 1:
             mapping.add_chunk(store, session, result)
         else:
             with store.transaction():
-                chunk_id = store.add_chunk(session, result)
-                first = min(c.component for c in store.chunks())
-                store.place_chunks({chunk_id: store.chunks()[0].S_world_chunk}, {chunk_id: first})
+                chunk_id = store.chunks.add(session, result)
+                first = min(c.component for c in store.chunks.all())
+                store.chunks.place({chunk_id: store.chunks.all()[0].S_world_chunk}, {chunk_id: first})
                 mapping.consolidate(store, chunk_id)
     finally:
         mapping.consolidate = consolidate
     taken = user_s() - started
-    written = len(store.vectors_touched) - before
+    written = len(store.embeddings.touched) - before
     return {"placing_s": taken - library_s, "library_s": library_s, "all_s": taken, "written": written}
 
 

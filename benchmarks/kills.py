@@ -24,9 +24,12 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.records import MergeDecision, Relation
 from list3r.memory.store.connection import remove_memory
+from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
 
 Result = dict[str, Any]
+_EDIT = Fact[int]("edit", int, 0)
+"""The number of the change that was written last."""
 CHUNKING = ("--poses", "given", "--chunk", "12", "--overlap", "4", "--workers", "1")
 
 
@@ -44,7 +47,7 @@ def chunks_in(memory: Path) -> int:
     """Chunks that a reader sees now."""
     try:
         with Store.open(memory) as store:
-            return len(store.chunks())
+            return len(store.chunks.all())
     except MemoryFileError:
         return 0
 
@@ -56,7 +59,7 @@ def judge(memory: Path, committed: int) -> list[str]:
     try:
         with Store.open(memory) as store:
             found = store.verify()
-            held = len(store.chunks())
+            held = len(store.chunks.all())
     except Exception as error:  # whatever it is, it is a problem to report
         return [f"{type(error).__name__}: {error}"]
     return [*found, *([f"{committed} chunks were committed, {held} are left"] if held < committed else [])]
@@ -204,7 +207,7 @@ def _cpu_s(pid: int) -> float:
 def write_for_ever(path: str, first: int) -> None:
     """Write one transaction after another and say the number of each once it is committed."""
     with Store.open(path, writable=True) as store:
-        ids = [i.id for i in store.instances()]
+        ids = [i.id for i in store.instances.all()]
         n = first
         while True:
             n += 1
@@ -217,20 +220,20 @@ def write_round(store: Store, ids: list[int], n: int) -> None:
     """One change in several tables, all of which say `n`."""
     from dataclasses import replace
 
-    store.set_value("edit", n)
-    store.put_instances([replace(store.instance(k), label=f"edit {n}") for k in ids])
-    store.log_decisions(1, [MergeDecision("edit", f"#{n}", "#0", {"n": n}, "an edit")])
+    store.facts[_EDIT] = n
+    store.instances.put([replace(store.instances.get(k), label=f"edit {n}") for k in ids])
+    store.merges.add_all(1, [MergeDecision("edit", f"#{n}", "#0", {"n": n}, "an edit")])
     pair = [ids[n % len(ids)], ids[(n + 1) % len(ids)]]
-    store.replace_relations([pair[0]], [Relation(pair[0], "near", pair[1], 1.0, float(n))])
+    store.relations.replace([pair[0]], [Relation(pair[0], "near", pair[1], 1.0, float(n))])
 
 
 def rounds_in(store: Store) -> set[int]:
     """Numbers of rounds that the tables speak of; one number where none is torn."""
-    logged = [int(d.scores["n"]) for d in store.decisions() if d.kind == "edit"]
-    labels = {i.label for i in store.instances()}
+    logged = [int(d.scores["n"]) for d in store.merges.decisions() if d.kind == "edit"]
+    labels = {i.label for i in store.instances.all()}
     if logged != list(range(1, len(logged) + 1)):
         return {-1}
-    return {int(store.get_value("edit", 0)), len(logged), *(int((x or "edit 0").split()[1]) for x in labels)}
+    return {store.facts[_EDIT], len(logged), *(int((x or "edit 0").split()[1]) for x in labels)}
 
 
 def kill_writes(memory: Path, kills: int, seed: int = 0) -> Result:
@@ -277,7 +280,7 @@ def edit_for_ever(path: str, seed: int) -> None:
     rng = random.Random(seed)
     with Store.open(path, writable=True) as store:
         while True:
-            ids = [i.id for i in store.instances(structure=False)]
+            ids = [i.id for i in store.instances.all(structure=False)]
             verbs: list[Callable[[], Any]] = [lambda: edits.undo(store)] * 2
             if len(ids) > 4:
                 a, b = rng.sample(ids, 2)
@@ -304,13 +307,13 @@ def kill_edits(memory: Path, kills: int, seed: int = 0) -> Result:
         told = _killed([str(Path(__file__).resolve()), "--edit", str(memory), str(seed * 1000 + n)], rng, 0.5)
         problems += judge(memory, 0)
         with Store.open(memory) as store:
-            entries = {e.entry for e in store.edits()}
+            entries = {e.entry for e in store.edits.all()}
         lost = sorted(set(told) - entries)
         if lost:
             problems.append(f"edits {lost} were committed and are lost")
         problems += _underived(memory)
     with Store.open(memory) as store:
-        return {"kills": kills, "edits": len(store.edits()), "problems": problems}
+        return {"kills": kills, "edits": len(store.edits.all()), "problems": problems}
 
 
 def _underived(memory: Path) -> list[str]:
@@ -329,9 +332,9 @@ def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
     counts: Counter[str] = Counter()
     while counts["kills"] < kills:
         with Store.open(memory) as store:
-            known = {e.entry for e in store.edits()}
+            known = {e.entry for e in store.edits.all()}
             before = scene_dict(store)
-            ids = [i.id for i in store.instances(structure=False)]
+            ids = [i.id for i in store.instances.all(structure=False)]
         command = _edit_command(memory, ids, known, rng)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         if _runs_for(process, rng.uniform(0.5, 1.6)):
@@ -340,7 +343,7 @@ def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
         process.communicate()
         problems += judge(memory, 0)
         with Store.open(memory) as store:
-            fresh = {e.entry for e in store.edits()} - known
+            fresh = {e.entry for e in store.edits.all()} - known
             counts["edits"] += len(fresh)
             if process.returncode == 0 and len(fresh) != 1:
                 problems.append(f"{command[3]} ended well and left {len(fresh)} edits")

@@ -92,10 +92,9 @@ def made_memory(path: Path, count: int) -> None:
         name = "table" if n == table else _NAMES[int(rng.integers(len(_NAMES)))]
         instances.append(_instance(n, name, center, size, float(rng.uniform(0.4, 1.0))))
     with Store.create(path) as store, store.transaction():
-        for key, value in (("scale_kind", "metric"), ("gravity", "known")):
-            store.set_value(key, value)
-        store.put_instances(instances)
-        store.replace_relations(None, relations)
+        store.facts.scale_kind, store.facts.gravity = "metric", "known"
+        store.instances.put(instances)
+        store.relations.replace(None, relations)
 
 
 def _instance(n: int, name: str, center: np.ndarray, size: np.ndarray, confidence: float) -> Instance:

@@ -68,27 +68,27 @@ def measure(
     rng = None if seed is None else np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:
         with store.transaction():
-            store.set_value("scale_kind", "metric" if rng is None else "relative")
-            store.set_value("poses", "estimate")
-            session = store.add_session(str(path), "", {}, len(truth.time_s))
-        joint = RgbdJointReconstructor(store)
+            store.facts.scale_kind = "metric" if rng is None else "relative"
+            store.facts.poses = "estimate"
+            session = store.sessions.add(str(path), "", {}, len(truth.time_s))
+        joint = RgbdJointReconstructor({s.session_id: s.source for s in store.sessions.all()})
         for result in results:
             if rng is None:
                 add_chunk(store, session, result, library=False)
             else:
                 add_chunk(store, session, regauge(result, _random(rng)), _Regauged(joint, rng), library=False)
         finish_session(store, session, library=False)
-        poses = store.camera_poses()
+        poses = store.trajectory.poses()
         times = np.array([f.time_s for f, _ in poses])
         matrices = np.tile(np.eye(4), (len(poses), 1, 1))
         matrices[:, :3, :3] = [S.rotation for _, S in poses]
         matrices[:, :3, 3] = [S.translation for _, S in poses]
         errors = evaluate_trajectory(truth, Trajectory(times, matrices))
-        loops = [e for e in store.edges() if e.kind == "loop"]
+        loops = [e for e in store.edges.all() if e.kind == "loop"]
         return {
             "gauge": name,
             "posed": len(poses),
-            "components": len({c.component for c in store.chunks()}),
+            "components": len({c.component for c in store.chunks.all()}),
             "ate_sim3_m": round(errors.ate_sim3_m.rmse, 5),
             "ate_se3_m": round(errors.ate_se3_m.rmse, 5),
             "loops": sum(e.accepted for e in loops),

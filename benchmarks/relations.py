@@ -94,7 +94,7 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
     with Store.create(memory) as store:
         told = build(store, walk, truth, poses)
         truth_of = _most_common(store, told)
-        claimed = [(r.subject, r.predicate, r.object) for r in store.relations()]
+        claimed = [(r.subject, r.predicate, r.object) for r in store.relations.all()]
         kept = {i for i, e in truth.items() if e["frames_seen"] >= MIN_FRAMES and e["largest_px"] >= MIN_PX}
         matched = {k: v for k, v in truth_of.items() if v in kept}
         floors = sorted(i for i, e in truth.items() if e["label"] == "floor")
@@ -108,7 +108,7 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
         near = {(s, o) for s, p, o in true if p == "near"}
         told_when_asked = asked(store, WalkSettings(seed=seed), matched, near)
         with store.transaction():
-            store.set_value("gravity", "unknown")
+            store.facts.gravity = "unknown"
         vertical = _vertical_without_gravity(store)
     row: dict[str, Any] = {"seed": seed, "things": len(set(matched.values())), "true_things": len(kept)}
     for name, entry in errors.by_predicate.items():
@@ -135,9 +135,9 @@ def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str
     settings = BuildSettings("rgbd", poses, keep_pictures=False)
     source = open_source(walk, SourceOptions())
     with store.transaction():
-        store.set_value("scale_kind", "metric")
-        store.set_value("poses", poses)
-        session = store.add_session(str(walk), "", {"poses": poses}, source.info.frame_count)
+        store.facts.scale_kind = "metric"
+        store.facts.poses = poses
+        session = store.sessions.add(str(walk), "", {"poses": poses}, source.info.frame_count)
     told: dict[tuple[int, int], int] = {}
     for span in plan_chunks(source.info.frame_count, settings.chunks):
         discoverer = ToldMasks(walk, truth, settings.instances)
@@ -211,7 +211,7 @@ def _true_id(walk: Path, track: Any) -> int:
 def _most_common(store: Store, told: dict[tuple[int, int], int]) -> dict[int, int]:
     """True id of every global instance; of several instances of one thing the one with most observations counts."""
     votes: dict[int, Counter[int]] = {}
-    for seen in store.observations():
+    for seen in store.observations.all():
         votes.setdefault(seen.instance_id, Counter())[told[seen.chunk_id, seen.local_id]] += 1
     best: dict[int, tuple[int, int]] = {}
     for instance, counter in sorted(votes.items()):
@@ -274,7 +274,7 @@ def _vertical_without_gravity(store: Store) -> int:
 
     with store.transaction():
         consolidate(store)
-    return sum(r.predicate in VERTICAL for r in store.relations())
+    return sum(r.predicate in VERTICAL for r in store.relations.all())
 
 
 def _truth(walk: Path) -> dict[int, dict[str, Any]]:

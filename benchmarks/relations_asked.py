@@ -28,7 +28,7 @@ Counts = dict[str, int]
 def asked(store: Store, settings: WalkSettings, truth_of: Mapping[int, int], near: set[tuple[int, int]]) -> Counts:
     """Counts of true, claimed and right answers. `near` holds the pairs of true ids that viewpoints are asked of."""
     things = {t.id: t for t in settings.world().things}
-    found = {truth_of[i.id]: i for i in store.instances() if truth_of.get(i.id) in things and i.structure is None}
+    found = {truth_of[i.id]: i for i in store.instances.all() if truth_of.get(i.id) in things and i.structure is None}
     found = {k: i for k, i in found.items() if things[k].structure is None}
     true = {k: _true(i, things[k]) for k, i in found.items()}
     out = _from_viewpoints(store, settings, found, true, near)
@@ -43,7 +43,7 @@ def _from_viewpoints(
     near: set[tuple[int, int]],
 ) -> Counts:
     poses = settings.poses()[1]
-    posed = {f.frame_index for f in store.frames() if f.state == "posed"}
+    posed = {f.frame_index for f in store.frames.all() if f.state == "posed"}
     pairs = [(a, b) for a, b in combinations(sorted(found), 2) if (a, b) in near]
     want: set[tuple[object, ...]] = set()
     said: set[tuple[object, ...]] = set()

@@ -34,10 +34,13 @@ from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.maintenance.repair import repair
 from list3r.memory.records import Observation, Relation
 from list3r.memory.store.connection import remove_memory
+from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 Result = dict[str, Any]
+_ROUND, _HELD = Fact[int]("round", int, 0), Fact[int]("held", int, 0)
+"""What a writer says of the transaction it wrote last: its number, and how many instances it left."""
 
 
 # ------------------------------------------------------------------------------------------- readers
@@ -86,9 +89,9 @@ def _worker(work: Callable[..., Any], memory: str, seconds: float, k: int, queue
 def _write(memory: str, end: float, _: int, problems: list[str]) -> int:
     count = 0
     with Store.open(memory, writable=True) as store:
-        kept = {i.id: i for i in store.instances()}
-        nodes = [(n.chunk_id, n.local_id) for n in store.local_nodes()]
-        n = int(store.get_value("round", 0))
+        kept = {i.id: i for i in store.instances.all()}
+        nodes = [(n.chunk_id, n.local_id) for n in store.local_instances.nodes()]
+        n = store.facts[_ROUND]
         while time.time() < end:
             n += 1
             with store.transaction():
@@ -101,18 +104,18 @@ def _write_round(store: Store, instances: list[Any], nodes: list[tuple[int, int]
     """All instances get new ids, and everything that points to them follows."""
     from dataclasses import replace
 
-    old = [i.id for i in store.instances()]
+    old = [i.id for i in store.instances.all()]
     for k in old:
-        store.drop_instance(k, None)
+        store.instances.drop(k, None)
     fresh = [replace(i, id=1 + 10 * n + k, label=f"round {n}") for k, i in enumerate(instances[: 3 + n % 4])]
     ids = [i.id for i in fresh]
-    store.put_instances(fresh)
-    store.clear_observations()
-    store.set_observations(Observation(ids[k % len(ids)], *node) for k, node in enumerate(nodes))
-    store.put_embeddings("test@1/16", ids, np.full((len(ids), 16), n, np.float32))
-    store.replace_relations(None, [Relation(a, "near", b, 1.0, 0.0) for a in ids for b in ids if a != b])
-    store.set_value("round", n)
-    store.set_value("held", len(ids))
+    store.instances.put(fresh)
+    store.observations.clear()
+    store.observations.set(Observation(ids[k % len(ids)], *node) for k, node in enumerate(nodes))
+    store.embeddings.put("test@1/16", ids, np.full((len(ids), 16), n, np.float32))
+    store.relations.replace(None, [Relation(a, "near", b, 1.0, 0.0) for a in ids for b in ids if a != b])
+    store.facts[_ROUND] = n
+    store.facts[_HELD] = len(ids)
 
 
 def _read(memory: str, end: float, k: int, problems: list[str]) -> int:
@@ -129,21 +132,21 @@ def _read(memory: str, end: float, k: int, problems: list[str]) -> int:
 
 def torn(store: Store) -> list[str]:
     """What does not fit together in one snapshot."""
-    instances = store.instances()
+    instances = store.instances.all()
     ids = {i.id for i in instances}
-    n, held = store.get_value("round", 0), store.get_value("held", len(ids))
+    n, held = store.facts[_ROUND], store.facts[_HELD] or len(ids)
     found = []
     if len(ids) != held:
         found.append(f"{len(ids)} instances, {held} are counted")
     if n and {i.label for i in instances} != {f"round {n}"}:
         found.append("instances of several rounds")
-    if not {o.instance_id for o in store.observations()} <= ids:
+    if not {o.instance_id for o in store.observations.all()} <= ids:
         found.append("an observation of an instance that is not there")
-    if n and len(store.relations()) != held * (held - 1):
+    if n and len(store.relations.all()) != held * (held - 1):
         found.append("relations are missing")
-    if set(store.ids_in_box([-1e3] * 3, [1e3] * 3)) != ids:
+    if set(store.instances.ids_in_box([-1e3] * 3, [1e3] * 3)) != ids:
         found.append("the R*Tree holds other instances")
-    vectors = store.embeddings("test@1/16")
+    vectors = store.embeddings.all("test@1/16")
     if n and (set(vectors[0].tolist()) != ids or not (vectors[1] == n).all()):
         found.append("vectors of another round")
     return found
@@ -235,16 +238,20 @@ def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
 
 def answers(store: Store) -> list[Any]:
     """All that a memory can be asked."""
-    out: list[Any] = [scene_dict(store), sorted(store.aliases().items()), [repr(d) for d in store.decisions()]]
-    for chunk in store.chunks():
-        out += [chunk.S_world_chunk.as_matrix(), *(k.depth_small for k in store.keyframes(chunk.chunk_id))]
-        out += [store.frame_samples(chunk.chunk_id).points, store.cannot_links(chunk.chunk_id)]
-    for instance in store.instances():
-        out.append(store.support(instance.id).points)
-    for o in store.observations():
-        out += store.mask_track(o.chunk_id, o.local_id).masks
-    out += [store.embeddings(space) for space in store.embedding_spaces()]
-    return out + [f.T_chunk_cam for f in store.frames()] + [e.S_v_u.as_matrix() for e in store.edges()]
+    out: list[Any] = [
+        scene_dict(store),
+        sorted(store.ids.aliases().items()),
+        [repr(d) for d in store.merges.decisions()],
+    ]
+    for chunk in store.chunks.all():
+        out += [chunk.S_world_chunk.as_matrix(), *(k.depth_small for k in store.keyframes.of(chunk.chunk_id))]
+        out += [store.chunks.samples(chunk.chunk_id).points, store.chunks.cannot_links(chunk.chunk_id)]
+    for instance in store.instances.all():
+        out.append(store.surfaces.of(instance.id).points)
+    for o in store.observations.all():
+        out += store.local_instances.mask_track(o.chunk_id, o.local_id).masks
+    out += [store.embeddings.all(space) for space in store.embeddings.spaces()]
+    return out + [f.T_chunk_cam for f in store.frames.all()] + [e.S_v_u.as_matrix() for e in store.edges.all()]
 
 
 def same(a: Any, b: Any) -> bool:

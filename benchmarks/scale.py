@@ -103,7 +103,7 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
     row |= timed("within_1m", [lambda p=p: within(store, center=p, radius=1.0) for p in points])
     ids = rng.integers(1, count + 1, questions)
     row |= timed("near_instance", [lambda n=n: nearest(store, instance_id=int(n), k=5) for n in ids])
-    _, stored = store.embeddings_of(SPACE, sorted({int(n) for n in ids}))
+    _, stored = store.embeddings.of(SPACE, sorted({int(n) for n in ids}))
     asked = views(stored, rng)
     for name, text in QUESTIONS.items():
         row |= timed(f"find_{name}", [lambda text=text: find(store, text)] * 5, warm=1)
@@ -149,15 +149,15 @@ def write_memory(path: Path, count: int, seed: int) -> float:
     side = int(rooms(count)[0] / ROOM_M[0] + 0.5)
     with Store.create(path) as store:
         with store.transaction():
-            store.set_value("scale_kind", "metric")
-            store.set_value("gravity", "estimated")
+            store.facts.scale_kind = "metric"
+            store.facts.gravity = "estimated"
         for first in range(1, count + 1, BATCH):
             ids = np.arange(first, min(first + BATCH, count + 1))
             rng = np.random.default_rng([seed, first])
             with store.transaction():
-                store.put_instances(things(ids, side, rng))
-                store.put_embeddings(SPACE, ids.tolist(), features(len(ids), seed, rng))
-                store.replace_relations(
+                store.instances.put(things(ids, side, rng))
+                store.embeddings.put(SPACE, ids.tolist(), features(len(ids), seed, rng))
+                store.relations.replace(
                     [], [Relation(int(n), "near", int(n) - 1, 0.9, 0.1) for n in ids if n % THINGS != 1]
                 )
     return round(time.perf_counter() - started, 1)
@@ -231,13 +231,13 @@ def one_more_chunk(store: Store, n: int, count: int) -> None:
     """What the store writes when a chunk has changed 30 things of one room and found 5 new ones."""
     first = 1 + THINGS * (n % max(1, count // THINGS))
     changed = list(range(first, min(first + THINGS, count)))
-    new = [store.next_id() + k for k in range(5)]
+    new = [store.ids.next() + k for k in range(5)]
     rng = np.random.default_rng(n)
     side = int(rooms(count)[0] / ROOM_M[0] + 0.5)
     with store.transaction():
-        store.put_instances(things(np.array(changed + new), side, rng))
-        store.put_embeddings(SPACE, changed + new, features(len(changed) + 5, 1, rng))
-        store.replace_relations(changed, [Relation(a, "near", a - 1, 0.9, 0.1) for a in changed[1:]])
+        store.instances.put(things(np.array(changed + new), side, rng))
+        store.embeddings.put(SPACE, changed + new, features(len(changed) + 5, 1, rng))
+        store.relations.replace(changed, [Relation(a, "near", a - 1, 0.9, 0.1) for a in changed[1:]])
 
 
 # ---------------------------------------------------------------------------------------------- beside it
@@ -248,7 +248,7 @@ def beside(
 ) -> dict[str, Any]:
     """A plain NumPy scan over the same data, which is also the truth for the recall, and a vector database."""
     out: dict[str, Any] = {}
-    ids, vectors = store.embeddings(SPACE)
+    ids, vectors = store.embeddings.all(SPACE)
     asked = asked[: min(len(asked), 100)]
     truth: dict[int, list[int]] = {}
 
@@ -258,9 +258,9 @@ def beside(
 
     out |= timed("numpy_similar", [lambda n=n: scan(n) for n in range(len(asked))])
     out["similar_recall_at_10"] = recall(found, truth)
-    bounds = store.world_bounds()
+    bounds = store.instances.bounds()
     assert bounds is not None
-    _, boxes = store.boxes_in_box(bounds[0], bounds[1])
+    _, boxes = store.instances.boxes_in_box(bounds[0], bounds[1])
 
     def scan_boxes(p: Floats) -> None:
         apart = np.maximum(0.0, np.maximum(boxes[:, 0] - p, p - boxes[:, 1]))

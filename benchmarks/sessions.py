@@ -105,8 +105,8 @@ def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
     now = {e: t for t, e, _ in evaluate_scene(_scene(after), scenes[1], S_truth_two)["matched_ids"]}
     done = _changes(scenes)
     unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
-    kept = sum(now.get(after.resolve(i)) == t for i, t in unchanged)
-    told = {_told(e, was, now, scenes, S_truth_two) for e in after.events(2) if e.kind in KINDS}
+    kept = sum(now.get(after.ids.resolve(i)) == t for i, t in unchanged)
+    told = {_told(e, was, now, scenes, S_truth_two) for e in after.events.all(2) if e.kind in KINDS}
     faint = _changes(scenes, 0) - done
     told -= faint | {(kind, t) for k, t in faint if k == "moved" for kind in ("removed", "added")}
     wrong = sorted((k, t) for k, t in told - done)
@@ -183,7 +183,7 @@ def _scene(store: Store) -> dict[str, Any]:
 
 
 def _path(store: Store, session: int) -> Trajectory:
-    poses = store.camera_poses(session)
+    poses = store.trajectory.poses(session)
     T = np.array([Sim3(1.0, S.rotation, S.translation).as_matrix() for _, S in poses])
     return Trajectory(np.array([f.time_s for f, _ in poses]), T)
 
@@ -225,13 +225,13 @@ def redkitchen(root: Path, source: Path, workers: str, cut: int = 500) -> dict[s
     common = ("--poses", "estimate", "--workers", workers)
     run_list3r("build", str(source), "-m", str(memory), "--frames", f"0:{cut}", *common)
     with Store.open(memory) as store:
-        before = {i.id: i for i in store.instances(structure=False)}
+        before = {i.id: i for i in store.instances.all(structure=False)}
     report, usage = run_list3r("update", str(memory), str(source), "--frames", f"{cut}:100000", *common)
     with Store.open(memory) as store:
-        events = {e.instance_id: e for e in store.events(2)}
+        events = {e.instance_id: e for e in store.events.all(2)}
         small = [k for k, i in before.items() if np.linalg.norm(i.box.size) < 0.4]
         again = [k for k in small if k in events and events[k].kind == "seen_again"]
-        gone = [k for k in small if store.resolve(k) != k]
+        gone = [k for k in small if store.ids.resolve(k) != k]
     changed = [(e.kind, k) for k, e in events.items() if e.kind in KINDS]
     small_things = {"small": len(small), "small_seen_again": len(again), "small_aliased": len(gone)}
     return {**report["events"], "placed": report["placed"], **usage, **small_things, "false": changed}

@@ -117,8 +117,8 @@ def _ours(folder: Path, scratch: Path, words: argparse.Namespace, truth: Traject
     report, usage = run_list3r("build", str(folder), "-m", str(memory), *options)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     with Store.open(memory) as store:
-        rows = [(f.frame_index, S.rotation, S.translation) for f, S in store.camera_poses()]
-        focal = store.chunks()[0].intrinsics[0]
+        rows = [(f.frame_index, S.rotation, S.translation) for f, S in store.trajectory.poses()]
+        focal = store.chunks.all()[0].intrinsics[0]
     return {
         "frames": report["frames"],
         "posed": report["posed"],

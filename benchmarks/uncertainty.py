@@ -79,8 +79,8 @@ class Truth:
         """Mahalanobis distances of all chunks but the first of each component."""
         gauges: dict[int, Any] = {}
         rows = []
-        for chunk in sorted(store.chunks(), key=lambda c: c.chunk_id):
-            samples = store.frame_samples(chunk.chunk_id)
+        for chunk in sorted(store.chunks.all(), key=lambda c: c.chunk_id):
+            samples = store.chunks.samples(chunk.chunk_id)
             if chunk.chunk_id == chunk.component:
                 gauges[chunk.component] = chunk.S_world_chunk @ self._chunk_from_truth(samples)
                 continue
@@ -126,7 +126,7 @@ class Truth:
     def _ate(self, store: Any) -> float:
         from list3r.memory.geometry import umeyama
 
-        placed = store.camera_poses()
+        placed = store.trajectory.poses()
         estimate = np.stack([S.translation for _, S in placed])
         truth = self._video.T_world_cam[[f.frame_index for f, _ in placed], :3, 3]
         off = umeyama(estimate, truth, with_scale=True).apply(estimate) - truth

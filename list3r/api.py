@@ -152,18 +152,18 @@ class SceneMemory(MemoryEdits):
     def units(self) -> str:
         """`m` when lengths are metres, `unit` when the memory has no known scale."""
         with self._lock:
-            return "unit" if self.store.get_value("scale_kind") == "relative" else "m"
+            return "unit" if self.store.facts.scale_kind == "relative" else "m"
 
     @property
     def gravity(self) -> str:
         """known, estimated (z is up in both) or unknown."""
         with self._lock:
-            return str(self.store.get_value("gravity", "unknown"))
+            return self.store.facts.gravity
 
     @_alone
     def instances(self, *, structure: bool | None = False) -> list[Instance]:
         """All things by id; the structure of the room with `structure=True`, both with None."""
-        return self.store.instances(structure=structure)
+        return self.store.instances.all(structure=structure)
 
     @_alone
     def instances_at(self, session_id: int) -> list[Instance]:
@@ -178,17 +178,17 @@ class SceneMemory(MemoryEdits):
     @_alone
     def instance(self, instance_id: int) -> Instance:
         """One instance, by its id or by any id it ever had. Raises `UnknownIdError`."""
-        return self.store.instance(instance_id)
+        return self.store.instances.get(instance_id)
 
     @_alone
     def support(self, instance_id: int) -> Support:
         """Surface points of an instance, world coordinates."""
-        return self.store.support(instance_id)
+        return self.store.surfaces.of(instance_id)
 
     @_alone
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where a moving (`dynamic`) instance was: seconds (V,) and places in the world (V, 3); nothing for others."""
-        return self.store.track(instance_id)
+        return self.store.tracks.of(instance_id)
 
     @_alone
     def nearest(
@@ -389,12 +389,12 @@ class SceneMemory(MemoryEdits):
     @_alone
     def sessions(self) -> list[Session]:
         """The videos that the memory was made from, in order."""
-        return self.store.sessions()
+        return self.store.sessions.all()
 
     @_alone
     def camera_poses(self, session: int | None = None) -> list[tuple[FrameRow, Sim3]]:
         """Every posed frame in order, of one session or of all, with its `S_world_cam`."""
-        return self.store.camera_poses(session)
+        return self.store.trajectory.poses(session)
 
     @_alone
     def pictures(self, instance_ids: Sequence[int] | None = None) -> list[KeyframePicture]:

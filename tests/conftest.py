@@ -176,23 +176,18 @@ def write_small_room(store: Store, jpeg: bytes = b"") -> None:
         local_instance(k, box_points(center, size, 400, k), rgb, frames)
         for k, (_, center, size, rgb, _) in enumerate(SMALL_ROOM)
     )
-    session = store.add_session("walk", "abc", {"length": 100}, 20)
-    chunk = store.add_chunk(session, chunk_result(0, 0, 20, local, jpeg))
-    store.place_chunks({chunk: Sim3.identity()}, {chunk: chunk})
-    for key, value in (
-        ("scale_kind", "metric"),
-        ("scale_source", "sensor depth"),
-        ("gravity", "estimated"),
-        ("feature_space", "test@1/16"),
-    ):
-        store.set_value(key, value)
-    store.put_instances(
+    session = store.sessions.add("walk", "abc", {"length": 100}, 20)
+    chunk = store.chunks.add(session, chunk_result(0, 0, 20, local, jpeg))
+    store.chunks.place({chunk: Sim3.identity()}, {chunk: chunk})
+    store.facts.scale_kind, store.facts.scale_source = "metric", "sensor depth"
+    store.facts.gravity = "estimated"
+    store.instances.put(
         instance(k + 1, center, size, rgb, structure=structure, component=chunk, label=None, description=name)
         for k, (name, center, size, rgb, structure) in enumerate(SMALL_ROOM)
     )
-    store.set_observations(Observation(k + 1, chunk, k) for k in range(len(local)))
-    store.put_embeddings("test@1/16", range(1, len(local) + 1), np.stack([i.feature for i in local]))
-    store.replace_relations(
+    store.observations.set(Observation(k + 1, chunk, k) for k in range(len(local)))
+    store.embeddings.put("test@1/16", range(1, len(local) + 1), np.stack([i.feature for i in local]))
+    store.relations.replace(
         None,
         [
             Relation(3, "on", 2, 0.95, 0.02),
@@ -201,4 +196,4 @@ def write_small_room(store: Store, jpeg: bytes = b"") -> None:
             Relation(5, "next_to", 2, 0.8, 0.1),
         ],
     )
-    store.complete_session(session)
+    store.sessions.complete(session)

@@ -9,7 +9,7 @@ import numpy as np
 from list3r.memory.geometry import Sim3
 from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes
 from list3r.memory.records import Support
-from list3r.memory.store.tables.chunks import LocalNode
+from list3r.memory.store.tables.local_instances import LocalNode
 
 IMAGE = (480, 640)
 

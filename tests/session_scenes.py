@@ -76,8 +76,8 @@ def cast(room: Mapping[str, Box], T_world_cam: Array) -> tuple[Array, np.ndarray
 
 def add_session(store: Store, room: Mapping[str, Box], poses: Array) -> int:
     """One session of one chunk whose chunk frame is the world; its chunk's id. Call inside a transaction."""
-    session = store.add_session("simulated", f"{len(store.sessions())}", {}, len(poses))
-    return store.add_chunk(session, simulated_chunk(room, poses))
+    session = store.sessions.add("simulated", f"{len(store.sessions.all())}", {}, len(poses))
+    return store.chunks.add(session, simulated_chunk(room, poses))
 
 
 def simulated_chunk(room: Mapping[str, Box], poses: Array, index: int = 0) -> ChunkResult:
@@ -156,6 +156,6 @@ def _instance(
 
 def place_together(store: Store) -> None:
     """All chunks where they are, in one component, z up."""
-    ids = [c.chunk_id for c in store.chunks()]
-    store.place_chunks({k: Sim3.identity() for k in ids}, dict.fromkeys(ids, ids[0]))
-    store.set_value("gravity", "known")
+    ids = [c.chunk_id for c in store.chunks.all()]
+    store.chunks.place({k: Sim3.identity() for k in ids}, dict.fromkeys(ids, ids[0]))
+    store.facts.gravity = "known"

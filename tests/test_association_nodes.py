@@ -163,19 +163,19 @@ def test_bends_are_kept_and_move_the_cameras(make_memory: Callable[..., Path]) -
 
 
 def _check_bend_of(store: Store) -> None:
-    chunk = store.chunks()[0].chunk_id
-    before = {f.frame_index: S for f, S in store.camera_poses() if f.chunk_id == chunk}
+    chunk = store.chunks.all()[0].chunk_id
+    before = {f.frame_index: S for f, S in store.trajectory.poses() if f.chunk_id == chunk}
     frames = sorted(before)
     shift = np.zeros((2, 7))
     shift[1, 0] = 0.5
     bend = Bend(np.array([frames[0], frames[-1]], float), shift)
     with store.transaction():
-        store.set_bends({chunk: bend})
-    assert np.array_equal(store.bends()[chunk].twists, shift)
-    after = {f.frame_index: S for f, S in store.camera_poses() if f.chunk_id == chunk}
+        store.bends.replace({chunk: bend})
+    assert np.array_equal(store.bends.all()[chunk].twists, shift)
+    after = {f.frame_index: S for f, S in store.trajectory.poses() if f.chunk_id == chunk}
     assert np.allclose(after[frames[0]].translation, before[frames[0]].translation)
     moved = np.linalg.norm(after[frames[-1]].translation - before[frames[-1]].translation)
-    assert moved == pytest.approx(0.5 * float(store.chunk(chunk).S_world_chunk.scale))
+    assert moved == pytest.approx(0.5 * float(store.chunks.get(chunk).S_world_chunk.scale))
     assert store.verify() == []
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from list3r.association.revisits.verification import verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
 from list3r.memory.store.derived import Derived
-from list3r.memory.store.tables.chunks import LocalNode
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.local import match, relative_pose
 from list3r.reconstruction.features.settings import FeatureSettings
@@ -36,37 +36,31 @@ class Chunks:
     ) -> None:
         self.done, self.scale_kind, self.known = done, scale_kind, known
         self.derived = Derived()
+        self.chunks = SimpleNamespace(
+            all=self._all,
+            checksums=lambda: {k: id(ks) for k, ks in enumerate(done)},
+            samples=lambda chunk_id: FrameSamples.empty(),
+            feature_space=lambda chunk_id: "test@1/4",
+        )
+        self.keyframes = SimpleNamespace(get=self._keyframe, descriptors=self._descriptors)
+        self.local_instances = SimpleNamespace(nodes=lambda chunk_ids: [])
+        self.edges = SimpleNamespace(all=lambda: list(known))
 
-    def chunks(self, session_id: int | None = None) -> list[ChunkRow]:
+    def _all(self, session_id: int | None = None) -> list[ChunkRow]:
         place = (1.0, 1.0, 0.0, 0.0)
         return [
             ChunkRow(k, 0, k, 0, 0, 0, Sim3.identity(), place, (240, 320), self.scale_kind)
             for k in range(len(self.done))
         ]
 
-    def chunk_checksums(self) -> dict[int, int]:
-        return {k: id(ks) for k, ks in enumerate(self.done)}
-
-    def keyframe(self, chunk_id: int, frame_index: int) -> Keyframe:
+    def _keyframe(self, chunk_id: int, frame_index: int) -> Keyframe:
         return next(k for k in self.done[chunk_id] if k.frame_index == frame_index)
 
-    def keyframe_descriptors(self, chunk_ids: Sequence[int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def _descriptors(self, chunk_ids: Sequence[int] | None = None) -> tuple[np.ndarray, np.ndarray]:
         wanted = range(len(self.done)) if chunk_ids is None else chunk_ids
         rows = [(c, k) for c in wanted for k in self.done[c]]
         keys = np.array([(c, k.frame_index) for c, k in rows], np.int64).reshape(-1, 2)
         return keys, np.array([k.descriptor for _, k in rows], np.float32)
-
-    def frame_samples(self, chunk_id: int) -> FrameSamples:
-        return FrameSamples.empty()
-
-    def local_nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]:
-        return []
-
-    def feature_space(self, chunk_id: int) -> str:
-        return "test@1/4"
-
-    def edges(self) -> list[Edge]:
-        return list(self.known)
 
 
 def keyframes_at(start: float, seed: int = 0, first: int = 0, gauge: np.ndarray | None = None) -> tuple[Keyframe, ...]:

@@ -136,12 +136,12 @@ def test_a_build_that_places_no_camera_leaves_no_memory_and_gives_the_old_one_ba
     assert list(tmp_path.glob("m.l3r*")) == []
     with Store.create(memory) as store, store.transaction():
         write_small_room(store)
-        before = [i.id for i in store.instances()]
+        before = [i.id for i in store.instances.all()]
     with pytest.raises(TrackingError):
         build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=1, force=True))
     assert [p.name for p in tmp_path.glob("m.l3r*")] == ["m.l3r"]
     with Store.open(memory) as store:
-        assert before and [i.id for i in store.instances()] == before
+        assert before and [i.id for i in store.instances.all()] == before
 
 
 def test_one_frame_is_refused_in_one_line_by_the_program(tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_what_is_said_of_the_camera_is_in_pixels_of_the_pictures_as_stored(tmp_p
     )
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
-            session = store.add_session("here", "", {}, 4)
+            session = store.sessions.add("here", "", {}, 4)
         plan = plan_session(store, session, job, Watch())
         assert "focal length of 192 px is a guess" in camera_notes(store, session)[0]
     assert plan.tasks[0].options.intrinsics == pytest.approx((192.0, 192.0, 79.5, 59.5))

@@ -52,15 +52,15 @@ def memory(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def content(path: Path) -> dict[str, Any]:
     """All that a user can see of a memory."""
     with Store.open(path) as store:
-        poses = store.camera_poses()
+        poses = store.trajectory.poses()
         return {
-            "frames": [(f.frame_index, f.state) for f in store.frames()],
+            "frames": [(f.frame_index, f.state) for f in store.frames.all()],
             "poses": np.stack([S.as_matrix() for _, S in poses]),
-            "instances": [(i.id, i.description, i.observations, i.structure, i.state) for i in store.instances()],
-            "boxes": np.array([[*i.center, *i.box.size, *i.aabb.ravel()] for i in store.instances()]),
-            "relations": [(r.subject, r.predicate, r.object) for r in store.relations()],
-            "aliases": store.aliases(),
-            "decisions": [(d.kind, d.a, d.b, d.reason) for d in store.decisions()],
+            "instances": [(i.id, i.description, i.observations, i.structure, i.state) for i in store.instances.all()],
+            "boxes": np.array([[*i.center, *i.box.size, *i.aabb.ravel()] for i in store.instances.all()]),
+            "relations": [(r.subject, r.predicate, r.object) for r in store.relations.all()],
+            "aliases": store.ids.aliases(),
+            "decisions": [(d.kind, d.a, d.b, d.reason) for d in store.merges.decisions()],
         }
 
 
@@ -77,7 +77,7 @@ def check_same(a: Path, b: Path) -> None:
 def finished_chunks(memory: Path) -> int:
     try:
         with Store.open(memory) as store:
-            return len(store.chunks())
+            return len(store.chunks.all())
     except list3r.List3rError:
         return 0
 
@@ -85,13 +85,13 @@ def finished_chunks(memory: Path) -> int:
 def test_the_camera_is_followed_and_things_are_found(walk: Path, memory: Path) -> None:
     with Store.open(memory) as store:
         assert store.verify() == []
-        assert store.sessions()[0].state == "complete"
-        poses = store.camera_poses()
+        assert store.sessions.all()[0].state == "complete"
+        poses = store.trajectory.poses()
         assert len(poses) == 120
         estimate = Trajectory(np.array([f.time_s for f, _ in poses]), np.stack([S.as_matrix() for _, S in poses]))
         assert evaluate_trajectory(read_tum(walk / "groundtruth.txt"), estimate).ate_se3_m.rmse < 0.03
-        assert len(store.instances(structure=False)) >= 4
-        assert store.get_value("gravity") == "estimated"
+        assert len(store.instances.all(structure=False)) >= 4
+        assert store.facts.gravity == "estimated"
 
 
 def test_a_killed_build_is_sound_and_resumes_to_the_same_memory(walk: Path, memory: Path, tmp_path: Path) -> None:
@@ -104,8 +104,8 @@ def test_a_killed_build_is_sound_and_resumes_to_the_same_memory(walk: Path, memo
     process.communicate()
     with Store.open(path) as store:
         assert store.verify() == []
-        assert 2 <= len(store.chunks()) < 4
-        assert store.sessions()[0].state == "building"
+        assert 2 <= len(store.chunks.all()) < 4
+        assert store.sessions.all()[0].state == "building"
     build(walk, path, "--poses", "estimate", "--workers", "1", "--resume")
     check_same(path, memory)
 
@@ -132,7 +132,7 @@ def test_the_number_of_workers_does_not_change_the_memory(walk: Path, memory: Pa
 def test_given_poses_are_kept(walk: Path, tmp_path: Path) -> None:
     settings = list3r.BuildSettings(poses="given", chunks=ChunkSettings(40, 12))
     with list3r.build(walk, tmp_path / "given.l3r", settings=settings) as memory:
-        poses = memory.store.camera_poses()
+        poses = memory.store.trajectory.poses()
         estimate = Trajectory(np.array([f.time_s for f, _ in poses]), np.stack([S.as_matrix() for _, S in poses]))
         assert evaluate_trajectory(read_tum(walk / "groundtruth.txt"), estimate).ate_se3_m.rmse < 1e-3
         assert memory.nearest((0.0, 0.0, 1.0), k=2)

@@ -61,18 +61,18 @@ LOW = Box((0.05, -0.15, 0.78), (0.24, 0.16, 0.08), ROOM["green"].rgb)
 
 def test_what_stays_is_seen_through_by_nobody(tmp_path: Path) -> None:
     with Store.open(_two(tmp_path / "a.l3r", dict(ROOM))) as store:
-        u, v = (chunk_summaries(store)[c.chunk_id].shapes for c in store.chunks())
+        u, v = (chunk_summaries(store)[c.chunk_id].shapes for c in store.chunks.all())
         pairs = pair_scores(u, v, Sim3.identity())
         shares = FreeSpaceCarving(store, S).shares(u, v, pairs, Sim3.identity())
         assert len(shares[0]) == len(shares[1]) == len(pairs.i) > 0
         assert max(shares[0].max(), shares[1].max()) < 0.02
-        assert [e.kind for e in store.events(2) if e.kind != "seen_again"] == []
+        assert [e.kind for e in store.events.all(2) if e.kind != "seen_again"] == []
 
 
 def test_a_thing_of_the_same_look_in_the_place_of_another_is_not_seen_again(tmp_path: Path) -> None:
     """Depth tells them apart, although colour does not."""
     with Store.open(_two(tmp_path / "a.l3r", {**_without("green"), "low": LOW})) as store:
-        again = [e.from_box.center for e in store.events(2) if e.kind == "seen_again" and e.from_box is not None]
+        again = [e.from_box.center for e in store.events.all(2) if e.kind == "seen_again" and e.from_box is not None]
         assert min(float(np.linalg.norm(c - ROOM["green"].center)) for c in again) > 0.1
 
 
@@ -84,8 +84,8 @@ def test_two_that_change_places_both_move(tmp_path: Path) -> None:
     after = {**before, "red": Box(place["blue"], shapes["red"], ROOM["red"].rgb)}
     after["blue"] = Box(place["red"], shapes["blue"], ROOM["blue"].rgb)
     with Store.open(_two(tmp_path / "a.l3r", after, before)) as store:
-        moved = [e for e in store.events(2) if e.kind == "moved"]
-        assert [e.kind for e in store.events(2) if e.kind not in ("seen_again", "moved")] == []
+        moved = [e for e in store.events.all(2) if e.kind == "moved"]
+        assert [e.kind for e in store.events.all(2) if e.kind not in ("seen_again", "moved")] == []
         assert len(moved) == 2
         for event in moved:
             assert event.from_box is not None

@@ -33,8 +33,8 @@ def _add(store: Store, room: dict[str, Box], start: float, overlooked: str | Non
             feature = object_feature(instance.support.points, instance.support.rgb, np.array([0.0, 0.0, 1.0]), 1.0)
             found.append(replace(instance, feature=feature))
     library = LocalLibrary(tuple(found), np.zeros((0, 2), np.int32), FEATURE_SPACE)
-    session = store.add_session("simulated", f"{len(store.sessions())}", {}, len(poses))
-    store.add_chunk(session, replace(result, library=library))
+    session = store.sessions.add("simulated", f"{len(store.sessions.all())}", {}, len(poses))
+    store.chunks.add(session, replace(result, library=library))
     place_together(store)
 
 
@@ -65,11 +65,11 @@ def test_a_thing_that_was_overlooked_shows_itself_as_it_goes(tmp_path: Path) -> 
     room = {k: b for k, b in ROOM.items() if k != "green"}
     assert _two(path, room, "green", None) == 1
     with Store.open(path) as store:
-        (event,) = [e for e in store.events(2) if e.kind != "seen_again"]
+        (event,) = [e for e in store.events.all(2) if e.kind != "seen_again"]
         assert event.kind == "removed"
         assert event.from_box is not None
         np.testing.assert_allclose(event.from_box.center, ROOM["green"].center, atol=0.05)
-        view = store.instance(event.instance_id).best_view
+        view = store.instances.get(event.instance_id).best_view
         assert view is not None
         assert view.session_id == 1
 
@@ -79,7 +79,7 @@ def test_and_one_overlooked_where_it_came_to(tmp_path: Path) -> None:
     room = {**{k: b for k, b in ROOM.items() if k != "green"}, "green": ELSEWHERE}
     assert _two(path, room, None, "green") == 1
     with Store.open(path) as store:
-        kinds = {e.kind: e for e in store.events(2) if e.kind != "seen_again"}
+        kinds = {e.kind: e for e in store.events.all(2) if e.kind != "seen_again"}
         place = (kinds.get("moved") or kinds["added"]).to_box
         assert place is not None
         np.testing.assert_allclose(place.center, ELSEWHERE.center, atol=0.05)

@@ -75,8 +75,8 @@ def test_events_come_back_as_they_were_written(tmp_path: Path) -> None:
     with Store.create(tmp_path / "a.l3r") as store:
         written = [_event(kind, 2, n) for n, kind in enumerate(("moved", "removed", "added", "seen_again"), 1)]
         with store.transaction():
-            store.replace_events(written)
-        read = store.events()
+            store.events.replace(written)
+        read = store.events.all()
         assert [e.kind for e in read] == ["moved", "removed", "added", "seen_again"]
         for a, b in zip(written, read, strict=True):
             assert (a.session_id, a.instance_id, a.frames, a.confidence, a.reason) == (
@@ -91,7 +91,7 @@ def test_events_come_back_as_they_were_written(tmp_path: Path) -> None:
                 if x is not None and y is not None:
                     np.testing.assert_array_equal(x.center, y.center)
                     np.testing.assert_array_equal(x.rotation, y.rotation)
-        assert store.events(1) == []
+        assert store.events.all(1) == []
 
 
 def test_unknown_sessions_and_kinds_are_refused(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_a_memory_of_one_session_has_no_events(tmp_path: Path) -> None:
     with Store.create(tmp_path / "a.l3r") as store:
         with store.transaction():
             consolidate(store)
-        assert _kinds(store.events()) == []
+        assert _kinds(store.events.all()) == []
 
 
 def _kinds(events: Iterable[ChangeEvent]) -> list[str]:

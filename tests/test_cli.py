@@ -145,7 +145,7 @@ def test_verify_ends_with_1_on_damage(room: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.l3r"
     damaged.write_bytes(room.read_bytes())
     with Store.open(damaged, writable=True) as store, store.transaction():
-        store._database.execute("UPDATE supports SET crc = crc + 1 WHERE local_id = 0")
+        store.connection._database.execute("UPDATE supports SET crc = crc + 1 WHERE local_id = 0")
     command = [sys.executable, "-m", "list3r", "verify", str(damaged)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 1

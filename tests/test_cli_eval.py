@@ -46,26 +46,26 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 def write_walk_memory(path: Path, parts: int = 1) -> None:
     """Five chunks of twelve frames, two of them shared; a camera on a circle; an accepted and a rejected loop."""
     with Store.create(path) as store, store.transaction():
-        session = store.add_session("walk", "abc", {}, 52)
+        session = store.sessions.add("walk", "abc", {}, 52)
         placed, components, covariances = {}, {}, {}
         for k in range(CHUNKS):
-            chunk = store.add_chunk(session, chunk_result(k, 10 * k, 12, ()))
+            chunk = store.chunks.add(session, chunk_result(k, 10 * k, 12, ()))
             angle = 2 * np.pi * k / CHUNKS
             placed[chunk] = Sim3.exp(np.array([np.cos(angle), np.sin(angle), 0, 0, 0, angle / 2, 0]))
             components[chunk] = 1 if parts == 1 or k < 3 else 4
             covariances[chunk] = np.eye(7) * (0.01 * k) ** 2
-        store.place_chunks(placed, components, covariances)
-        store.add_edges(
+        store.chunks.place(placed, components, covariances)
+        store.edges.add(
             Edge(k, k + 1, "adjacent", Sim3.identity(), 0.9, 0.5 + 0.1 * k, 300, 0.004, True, "shared frames agree")
             for k in range(1, CHUNKS)
         )
-        store.add_edges(
+        store.edges.add(
             Edge(u, v, "loop", Sim3.identity(), 0.8, 0.4, 900 * good, 0.012 * good, good, reason, scores, frames)
             for (u, v), frames, good, reason, scores in LOOPS
         )
-        for key, value in (("scale_kind", "metric"), ("gravity", "estimated"), ("scale_source", "sensor depth")):
-            store.set_value(key, value)
-        store.complete_session(session)
+        store.facts.scale_kind, store.facts.scale_source = "metric", "sensor depth"
+        store.facts.gravity = "estimated"
+        store.sessions.complete(session)
 
 
 @pytest.fixture(scope="module")
@@ -76,10 +76,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_small_room(store)
     write_walk_memory(root / "walk.l3r")
     with Store.open(root / "walk.l3r") as store:
-        poses = [(f.time_s, S.as_matrix()) for f, S in store.camera_poses()]
+        poses = [(f.time_s, S.as_matrix()) for f, S in store.trajectory.poses()]
     write_walk_memory(root / "parts.l3r", parts=2)
     with Store.create(root / "empty.l3r") as store, store.transaction():
-        store.complete_session(store.add_session("walk", "abc", {}, 0))
+        store.sessions.complete(store.sessions.add("walk", "abc", {}, 0))
     bent = np.stack([T for _, T in poses])
     bent[:, 0, 3] += 0.02 * np.sin(np.arange(52))
     write_tum(root / "walk.txt", Trajectory(np.array([t for t, _ in poses]), bent))
@@ -202,7 +202,7 @@ def test_trajectory_tells_errors_and_coverage_and_draws(place: Path, tmp_path: P
 
 def test_a_memory_in_two_parts_says_what_is_left_out(place: Path, tmp_path: Path) -> None:
     with Store.open(place / "parts.l3r") as store:
-        poses = [(f.time_s, S.as_matrix()) for f, S in store.camera_poses()]
+        poses = [(f.time_s, S.as_matrix()) for f, S in store.trajectory.poses()]
     write_tum(tmp_path / "truth.txt", Trajectory(np.array([t for t, _ in poses]), np.stack([T for _, T in poses])))
     result = run("eval", "trajectory", tmp_path / "truth.txt", place / "parts.l3r")
     assert result.returncode == 0, result.stderr
@@ -264,10 +264,10 @@ def test_revisits_of_stored_loops(place: Path, tmp_path: Path) -> None:
 
 def test_revisits_measured_on_the_frames_of_a_source(place: Path, tmp_path: Path) -> None:
     with Store.create(tmp_path / "tiny.l3r") as store, store.transaction():
-        session = store.add_session("good", "abc", {}, 4)
+        session = store.sessions.add("good", "abc", {}, 4)
         result = chunk_result(0, 0, 4, ())
-        chunk = store.add_chunk(session, type(result)(**{**vars(result), "times_s": np.arange(4) * 0.1}))
-        store.place_chunks({chunk: Sim3.identity()}, {chunk: chunk})
+        chunk = store.chunks.add(session, type(result)(**{**vars(result), "times_s": np.arange(4) * 0.1}))
+        store.chunks.place({chunk: Sim3.identity()}, {chunk: chunk})
     scores = ask("eval", "revisits", place / "good", tmp_path / "tiny.l3r", "--save", tmp_path / "c.npz")
     assert scores["covisible_frames"] == 4
     with np.load(tmp_path / "c.npz") as arrays:

@@ -58,16 +58,16 @@ def chunk(index: int, pieces: list[Piece] | None = None, drift: float = 0.015, s
 def create(path: Path) -> Store:
     store = Store.create(path)
     with store.transaction():
-        store.set_value("scale_kind", "metric")
-        store.set_value("gravity", "estimated")
-        store.add_session("walk", "abc", {}, 200)
+        store.facts.scale_kind = "metric"
+        store.facts.gravity = "estimated"
+        store.sessions.add("walk", "abc", {}, 200)
     return store
 
 
 def add(store: Store, result: ChunkResult, placed: Sim3 | None = None, component: int = 1) -> ConsolidationReport:
     with store.transaction():
-        chunk_id = store.add_chunk(1, result)
-        store.place_chunks({chunk_id: placed or Sim3.identity()}, {chunk_id: component})
+        chunk_id = store.chunks.add(1, result)
+        store.chunks.place({chunk_id: placed or Sim3.identity()}, {chunk_id: component})
         return consolidate(store, chunk_id)
 
 
@@ -76,14 +76,14 @@ def content(store: Store) -> list[object]:
     return [
         [
             (i.id, i.description, i.confidence, i.observations, i.center.tolist(), i.box.size.tolist())
-            for i in store.instances()
+            for i in store.instances.all()
         ],
-        [(i.best_view, i.structure, i.first_seen_s, i.last_seen_s) for i in store.instances()],
-        store.observations(),
-        store.relations(),
-        store.decisions(),
-        store.aliases(),
-        store.embeddings("test@1/16")[1].tolist(),
+        [(i.best_view, i.structure, i.first_seen_s, i.last_seen_s) for i in store.instances.all()],
+        store.observations.all(),
+        store.relations.all(),
+        store.merges.decisions(),
+        store.ids.aliases(),
+        store.embeddings.all("test@1/16")[1].tolist(),
     ]
 
 
@@ -91,7 +91,7 @@ def named(store: Store) -> dict[str, int]:
     """Ids by the true name: the thing whose box has the true centre within 10 cm."""
     out = {}
     for piece in THINGS:
-        near = [i.id for i in store.instances() if np.linalg.norm(i.center - piece.center) < 0.1]
+        near = [i.id for i in store.instances.all() if np.linalg.norm(i.center - piece.center) < 0.1]
         assert len(near) == 1, f"{piece.name}: {near}"
         out[piece.name] = near[0]
     return out
@@ -104,15 +104,15 @@ def test_a_walk_becomes_one_instance_for_each_thing(tmp_path: Path) -> None:
         assert all(not r.new and not r.merged for r in reports[1:])
         assert reports[-1].instances == len(THINGS) - 1 and reports[-1].structure == 1
         ids = named(store)
-        mug = store.instance(ids["mug"])
+        mug = store.instances.get(ids["mug"])
         assert np.abs(mug.box.size - [0.08, 0.08, 0.1]).max() < 0.04
         assert mug.color_name == "white" and mug.description.startswith("small white") and "cm" in mug.description
         assert mug.observations == 3 * 14 + FRAMES
         assert mug.first_seen_s == 0.0 and np.isclose(mug.last_seen_s, (3 * 14 + FRAMES - 1) / 30)
         assert mug.best_view is not None and mug.state == "present"
-        assert store.instance(ids["floor"]).structure == "floor"
-        assert store.instance(ids["table"]).structure is None
-        on = {(r.subject, r.object) for r in store.relations(predicate="on")}
+        assert store.instances.get(ids["floor"]).structure == "floor"
+        assert store.instances.get(ids["table"]).structure is None
+        on = {(r.subject, r.object) for r in store.relations.all(predicate="on")}
         assert {(ids[n], ids["table"]) for n in ("mug", "twin mug", "box", "magazine")} <= on
         assert store.verify() == []
 
@@ -120,10 +120,10 @@ def test_a_walk_becomes_one_instance_for_each_thing(tmp_path: Path) -> None:
 def test_confidence_grows_with_evidence(tmp_path: Path) -> None:
     with create(tmp_path / "a.l3r") as store:
         add(store, chunk(0))
-        before = {i.id: i.confidence for i in store.instances()}
+        before = {i.id: i.confidence for i in store.instances.all()}
         add(store, chunk(1))
-        assert all(i.confidence > before[i.id] for i in store.instances())
-        assert all(0.0 <= i.confidence <= 1.0 for i in store.instances())
+        assert all(i.confidence > before[i.id] for i in store.instances.all())
+        assert all(0.0 <= i.confidence <= 1.0 for i in store.instances.all())
 
 
 def test_consolidating_again_changes_nothing_and_logs_nothing(tmp_path: Path) -> None:
@@ -153,8 +153,8 @@ def test_a_chunk_that_was_rolled_back_leaves_no_trace(tmp_path: Path) -> None:
         for s in (store, other):
             add(s, chunk(0))
         with pytest.raises(RuntimeError), store.transaction():
-            chunk_id = store.add_chunk(1, chunk(1, [MUG, CHAIR], drift=0.3))
-            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            chunk_id = store.chunks.add(1, chunk(1, [MUG, CHAIR], drift=0.3))
+            store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
             consolidate(store, chunk_id)
             raise RuntimeError
         for s in (store, other):
@@ -179,7 +179,10 @@ def test_the_order_of_local_ids_does_not_change_the_partition(tmp_path: Path) ->
                     ),
                 )
             sets.append(
-                {frozenset((o.chunk_id, o.local_id) for o in store.observations(i.id)) for i in store.instances()}
+                {
+                    frozenset((o.chunk_id, o.local_id) for o in store.observations.of(i.id))
+                    for i in store.instances.all()
+                }
             )
     assert sets[0] == sets[1]
 
@@ -189,34 +192,34 @@ def test_when_two_instances_prove_one_the_older_id_stays_and_the_other_resolves_
     with create(tmp_path / "a.l3r") as store:
         add(store, chunk(0, [CHAIR]))
         add(store, chunk(1, [CHAIR], step=500), placed=Sim3.exp([1.5, 0, 0, 0, 0, 0, 0]))
-        assert [i.id for i in store.instances()] == [1, 2]
+        assert [i.id for i in store.instances.all()] == [1, 2]
         with store.transaction():
-            store.place_chunks({2: Sim3.identity()}, {2: 1})
+            store.chunks.place({2: Sim3.identity()}, {2: 1})
             report = consolidate(store, 2)
         assert report.merged == ((2, 1),)
-        assert [i.id for i in store.instances()] == [1]
-        assert store.instance(2).id == 1 and store.aliases() == {2: 1}
-        assert [d.kind for d in store.decisions()] == ["merge", "alias"]
+        assert [i.id for i in store.instances.all()] == [1]
+        assert store.instances.get(2).id == 1 and store.ids.aliases() == {2: 1}
+        assert [d.kind for d in store.merges.decisions()] == ["merge", "alias"]
         with store.transaction():
-            store.place_chunks({2: Sim3.exp([1.5, 0, 0, 0, 0, 0, 0])}, {2: 1})
+            store.chunks.place({2: Sim3.exp([1.5, 0, 0, 0, 0, 0, 0])}, {2: 1})
             report = consolidate(store, 2)
         assert report.new == (3,), "a split gives a new id to the part that leaves; 2 is not used again"
-        assert sorted(i.id for i in store.instances()) == [1, 3]
-        assert store.decisions()[-1].kind == "split"
+        assert sorted(i.id for i in store.instances.all()) == [1, 3]
+        assert store.merges.decisions()[-1].kind == "split"
         with pytest.raises(UnknownIdError):
-            store.instance(99)
+            store.instances.get(99)
 
 
 def test_what_others_see_as_part_of_a_thing_is_not_shown_and_its_id_resolves_to_the_thing(tmp_path: Path) -> None:
     patch = Piece("patch", (0.45, 0.2, 0.72), (0.2, 0.15, 0.004), (150, 110, 70), points=300)
     with create(tmp_path / "a.l3r") as store:
         add(store, chunk(0, [TABLE, patch]))
-        assert len(store.instances()) == 2
+        assert len(store.instances.all()) == 2
         for k in range(1, 4):
             add(store, chunk(k, [TABLE]))
-        assert len(store.instances()) == 1
-        table = store.instances()[0].id
-        assert store.resolve(3 - table) == table
+        assert len(store.instances.all()) == 1
+        table = store.instances.all()[0].id
+        assert store.ids.resolve(3 - table) == table
 
 
 def computed(result: ChunkResult, things: int) -> ChunkResult:
@@ -245,17 +248,17 @@ def test_what_the_next_chunk_misses_in_the_same_frames_was_never_there(tmp_path:
     with create(tmp_path / "a.l3r") as store:
         made = computed if kind == "relative" else (lambda result, _: result)
         add(store, made(chunk(0, [TABLE, MUG, phantom]), 8))
-        before = {i.id for i in store.instances()}
+        before = {i.id for i in store.instances.all()}
         assert len(before) == 3
         report = add(store, made(chunk(1, [TABLE, MUG], step=6), 8))
-        after = {i.id for i in store.instances()}
+        after = {i.id for i in store.instances.all()}
         if kind == "metric":
             assert after == before
             return
         assert after < before and report.hidden == 1
         (gone,) = before - after
         with pytest.raises(UnknownIdError):
-            store.instance(gone)
+            store.instances.get(gone)
         again = add(store, made(chunk(2, [TABLE, MUG, phantom], step=6), 8))
         assert len(again.new) == 1 and gone not in again.new
 
@@ -265,7 +268,7 @@ def test_where_the_next_chunk_has_no_depth_it_misses_nothing(tmp_path: Path) -> 
     with create(tmp_path / "a.l3r") as store:
         add(store, computed(chunk(0, [TABLE, MUG, phantom]), 8))
         add(store, computed(chunk(1, [TABLE, MUG], step=6), 7))
-        assert len(store.instances()) == 3
+        assert len(store.instances.all()) == 3
 
 
 def test_relations_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None:
@@ -273,7 +276,7 @@ def test_relations_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None
     with create(tmp_path / "a.l3r") as store:
         assert settings_of(store, given) == given
         with store.transaction():
-            store.set_value("scale_kind", "relative")
+            store.facts.scale_kind = "relative"
         found = settings_of(store, given)
         assert found.relations == RelationSettings(contact_m=0.05, noise_m=RelationSettings().computed_noise_m)
         assert found.structure.floor_band_m == found.structure.computed_floor_band_m > given.structure.floor_band_m
@@ -284,7 +287,7 @@ def test_what_bounds_the_room_is_not_missed(tmp_path: Path) -> None:
     with create(tmp_path / "a.l3r") as store:
         add(store, computed(chunk(0, [TABLE, FLOOR]), 8))
         add(store, computed(chunk(1, [TABLE], step=6), 8))
-        assert len(store.instances()) == 2
+        assert len(store.instances.all()) == 2
 
 
 def test_too_few_frames_are_not_shown(tmp_path: Path) -> None:
@@ -313,10 +316,10 @@ def test_parts_of_the_walk_that_could_not_be_joined_stay_apart(tmp_path: Path) -
     with create(tmp_path / "a.l3r") as store:
         add(store, chunk(0, [MUG, TABLE]))
         add(store, chunk(1, [MUG, TABLE], step=500), component=2)
-        assert sorted(i.component for i in store.instances()) == [1, 1, 2, 2]
-        homes = {i.id: i.component for i in store.instances()}
-        assert all(homes[r.subject] == homes[r.object] for r in store.relations())
-        assert not [r for r in store.relations(predicate="on") if homes[r.subject] == 2], (
+        assert sorted(i.component for i in store.instances.all()) == [1, 1, 2, 2]
+        homes = {i.id: i.component for i in store.instances.all()}
+        assert all(homes[r.subject] == homes[r.object] for r in store.relations.all())
+        assert not [r for r in store.relations.all(predicate="on") if homes[r.subject] == 2], (
             "up is known in the first part only"
         )
 
@@ -324,20 +327,20 @@ def test_parts_of_the_walk_that_could_not_be_joined_stay_apart(tmp_path: Path) -
 def test_without_gravity_there_are_no_vertical_relations_and_boxes_are_free(tmp_path: Path) -> None:
     with create(tmp_path / "a.l3r") as store:
         with store.transaction():
-            store.set_value("gravity", "unknown")
+            store.facts.gravity = "unknown"
         for k in range(2):
             add(store, chunk(k))
-        assert {r.predicate for r in store.relations()} <= {"near", "next_to"}
-        floor = next(i for i in store.instances() if i.structure)
+        assert {r.predicate for r in store.relations.all()} <= {"near", "next_to"}
+        floor = next(i for i in store.instances.all() if i.structure)
         assert floor.structure == "plane"
 
 
 def test_a_relative_memory_tells_no_centimetres(tmp_path: Path) -> None:
     with create(tmp_path / "a.l3r") as store:
         with store.transaction():
-            store.set_value("scale_kind", "relative")
+            store.facts.scale_kind = "relative"
         add(store, dataclasses.replace(chunk(0), scale_kind="relative"))
-        assert all("cm" not in i.description and " m" not in i.description for i in store.instances())
+        assert all("cm" not in i.description and " m" not in i.description for i in store.instances.all())
 
 
 def test_an_empty_memory_and_an_empty_chunk_are_no_trouble(tmp_path: Path) -> None:
@@ -355,12 +358,12 @@ def test_graphs_say_what_the_store_says(tmp_path: Path) -> None:
         for k in range(3):
             add(store, chunk(k))
         relations = relation_graph(store)
-        assert set(relations.nodes) == {i.id for i in store.instances()}
-        assert relations.number_of_edges() == len(store.relations())
+        assert set(relations.nodes) == {i.id for i in store.instances.all()}
+        assert relations.number_of_edges() == len(store.relations.all())
         merges = merge_graph(store)
-        assert merges.number_of_nodes() == len(store.observations())
+        assert merges.number_of_nodes() == len(store.observations.all())
         parts = {frozenset(merges.nodes[n]["instance"] for n in part) for part in networkx.connected_components(merges)}
-        assert parts == {frozenset([i.id]) for i in store.instances()}
+        assert parts == {frozenset([i.id]) for i in store.instances.all()}
 
 
 def test_ids_go_to_the_largest_part_and_are_never_used_again() -> None:

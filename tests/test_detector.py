@@ -17,17 +17,9 @@ from hypothesis import strategies as st
 from list3r.cli.app import run
 from list3r.memory.errors import OptionError
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.labels import (
-    LabelSettings,
-    Votes,
-    apply_labels,
-    decide,
-    detected_labels,
-    put_votes,
-    votes_of,
-    votes_of_names,
-)
+from list3r.memory.library.labels import LabelSettings, apply_labels, decide, put_votes, votes_of_names
 from list3r.memory.maintenance import edits
+from list3r.memory.records import Votes
 from list3r.memory.store.store import Store
 from list3r.semantics.coco import COCO_80, SIZES_M, plausible
 from list3r.semantics.detection import detect
@@ -235,7 +227,7 @@ def memory(tmp_path: Path) -> Path:
     """A room of boxes seen in two sessions, one chunk each."""
     path = tmp_path / "m.l3r"
     with Store.create(path) as store, store.transaction():
-        store.set_value("scale_kind", "metric")
+        store.facts.scale_kind = "metric"
         for start in (0.4, 1.0):
             add_session(store, ROOM, cameras((0.0, 0.0, 0.75), start))
             place_together(store)
@@ -248,7 +240,7 @@ CHAIR = Votes(0.5, {"chair": (4.0, 14.0)})
 
 
 def named(store: Store, rgb: tuple[int, int, int]) -> int:
-    return min(store.instances(), key=lambda i: float(np.abs(np.subtract(i.color_rgb, rgb)).sum())).id
+    return min(store.instances.all(), key=lambda i: float(np.abs(np.subtract(i.color_rgb, rgb)).sum())).id
 
 
 def say(
@@ -261,9 +253,9 @@ def say(
 ) -> None:
     """A detector saw an instance so, in one chunk or in all."""
     with store.transaction():
-        for c in store.chunks():
-            kept = votes_of(store, c.chunk_id).get(source, {})
-            for o in store.observations(instance_id):
+        for c in store.chunks.all():
+            kept = store.votes.of(c.chunk_id).get(source, {})
+            for o in store.observations.of(instance_id):
                 if o.chunk_id == c.chunk_id and chunk in (None, c.chunk_id):
                     kept[o.local_id] = votes
             put_votes(store, c.chunk_id, source, kept, classes)
@@ -274,10 +266,12 @@ def test_votes_are_kept_and_name_things(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         red, blue = named(store, ROOM["red"].rgb), named(store, ROOM["blue"].rgb)
         say(store, red, CUP)
-        assert store.instance(red).label == "cup" and store.instance(blue).label is None
-        told = detected_labels(store)[red]
+        assert store.instances.get(red).label == "cup" and store.instances.get(blue).label is None
+        told = store.detected_labels.all()[red]
         assert told.detector == "test-net" and 0.9 < told.confidence <= 0.97
-        assert votes_of(store, 1) == {"test-net": {o.local_id: CUP for o in store.observations(red) if o.chunk_id == 1}}
+        assert store.votes.of(1) == {
+            "test-net": {o.local_id: CUP for o in store.observations.of(red) if o.chunk_id == 1}
+        }
         assert not store.verify()
 
 
@@ -285,12 +279,14 @@ def test_a_source_that_looks_again_replaces_its_own_votes_only(memory: Path) -> 
     with Store.open(memory, writable=True) as store:
         red = named(store, ROOM["red"].rgb)
         say(store, red, votes_of_names([("mug", 0.9)] * 6), source="segmenter")
-        assert store.instance(red).label == "mug"
+        assert store.instances.get(red).label == "mug"
         say(store, red, Votes(0.5, {"cup": (9.0, 40.0)}), source="one")
-        assert detected_labels(store)[red].label == "cup" and detected_labels(store)[red].detector == "one"
+        assert store.detected_labels.all()[red].label == "cup" and store.detected_labels.all()[red].detector == "one"
         say(store, red, Votes(1.0, {}), source="one")
-        assert detected_labels(store)[red].label == "mug" and detected_labels(store)[red].detector == "segmenter"
-        assert set(votes_of(store, 1)) == {"segmenter", "one"}
+        assert (
+            store.detected_labels.all()[red].label == "mug" and store.detected_labels.all()[red].detector == "segmenter"
+        )
+        assert set(store.votes.of(1)) == {"segmenter", "one"}
 
 
 def test_what_two_detectors_see_adds_up(memory: Path) -> None:
@@ -298,9 +294,11 @@ def test_what_two_detectors_see_adds_up(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         red = named(store, ROOM["red"].rgb)
         say(store, red, weak, source="one")
-        assert store.instance(red).label is None
+        assert store.instances.get(red).label is None
         say(store, red, weak, source="two")
-        assert detected_labels(store)[red].label == "cup" and detected_labels(store)[red].detector == "one, two"
+        assert (
+            store.detected_labels.all()[red].label == "cup" and store.detected_labels.all()[red].detector == "one, two"
+        )
 
 
 def test_a_detector_says_nothing_against_what_it_does_not_know(memory: Path) -> None:
@@ -308,20 +306,20 @@ def test_a_detector_says_nothing_against_what_it_does_not_know(memory: Path) -> 
         red = named(store, ROOM["red"].rgb)
         say(store, red, votes_of_names([("flower pot", 0.9)] * 6), source="segmenter")
         say(store, red, Votes(30.0, {}), source="one", classes=("cup", "bowl"))
-        assert store.instance(red).label == "flower pot"
+        assert store.instances.get(red).label == "flower pot"
         say(store, red, Votes(30.0, {}), source="one", classes=("cup", "flower pot"))
-        assert store.instance(red).label is None
+        assert store.instances.get(red).label is None
 
 
 def test_votes_of_an_older_memory_have_the_name_of_their_detector(tmp_path: Path) -> None:
     path = Path(shutil.copy(Path(__file__).parent / "fixtures" / "schema6.l3r", tmp_path / "old.l3r"))
     with Store.open(path, writable=True) as store:
         assert store.verify() == []
-        (votes,) = votes_of(store, 1).values()
-        assert set(votes_of(store, 1)) == {"old-net"} and set(votes) and votes[1].classes["cup"] == (4.0, 16.0)
-        (red,) = detected_labels(store)
+        (votes,) = store.votes.of(1).values()
+        assert set(store.votes.of(1)) == {"old-net"} and set(votes) and votes[1].classes["cup"] == (4.0, 16.0)
+        (red,) = store.detected_labels.all()
         say(store, red, Votes(0.5, {"bowl": (8.0, 40.0)}), source="new-net", classes=COCO_80)
-        assert detected_labels(store)[red].label == "bowl" and set(votes_of(store, 1)) == {"old-net", "new-net"}
+        assert store.detected_labels.all()[red].label == "bowl" and set(store.votes.of(1)) == {"old-net", "new-net"}
 
 
 def test_an_operator_has_the_last_word(memory: Path) -> None:
@@ -330,14 +328,14 @@ def test_an_operator_has_the_last_word(memory: Path) -> None:
         edits.label(store, red, "ann's mug", "ann")
         say(store, red, CUP)
         say(store, blue, CUP)
-        assert store.instance(red).label == "ann's mug" and red not in detected_labels(store)
+        assert store.instances.get(red).label == "ann's mug" and red not in store.detected_labels.all()
         edits.label(store, blue, None, "ann")
         with store.transaction():
             consolidate(store)
             apply_labels(store)
-        assert store.instance(blue).label is None
+        assert store.instances.get(blue).label is None
         edits.undo(store)
-        assert store.instance(blue).label == "cup"
+        assert store.instances.get(blue).label == "cup"
 
 
 def test_labels_follow_merges_splits_and_undo(memory: Path) -> None:
@@ -345,14 +343,14 @@ def test_labels_follow_merges_splits_and_undo(memory: Path) -> None:
         red, blue = named(store, ROOM["red"].rgb), named(store, ROOM["blue"].rgb)
         say(store, red, CUP)
         edits.merge(store, red, blue, "ann")
-        assert store.instance(store.resolve(red)).label == "cup"
+        assert store.instances.get(store.ids.resolve(red)).label == "cup"
         edits.undo(store)
-        assert store.instance(red).label == "cup" and store.instance(blue).label is None
+        assert store.instances.get(red).label == "cup" and store.instances.get(blue).label is None
         green = named(store, ROOM["green"].rgb)
         say(store, green, CHAIR, chunk=2)
-        assert store.instance(green).label == "chair"
-        report = edits.split(store, green, [(o.chunk_id, o.local_id) for o in store.observations(green)][1:], "ann")
-        labels = {n: store.instance(n).label for n in report.ids}
+        assert store.instances.get(green).label == "chair"
+        report = edits.split(store, green, [(o.chunk_id, o.local_id) for o in store.observations.of(green)][1:], "ann")
+        labels = {n: store.instances.get(n).label for n in report.ids}
         assert set(labels.values()) == {None, "chair"}
 
 
@@ -363,16 +361,16 @@ def test_labels_survive_deriving_the_library_anew_and_go_with_their_votes(memory
         with store.transaction():
             consolidate(store)
             assert apply_labels(store).keys() == {red}
-        assert store.instance(red).label == "cup"
+        assert store.instances.get(red).label == "cup"
         say(store, red, Votes(3.0, {}))
-        assert store.instance(red).label is None and not detected_labels(store)
+        assert store.instances.get(red).label is None and not store.detected_labels.all()
 
 
 def test_structure_is_never_named(make_memory: Callable[..., Path]) -> None:
     with Store.open(make_memory(), writable=True) as store, store.transaction():
         put_votes(store, 1, "test-net", dict.fromkeys(range(6), CHAIR))
         apply_labels(store)
-        for i in store.instances():
+        for i in store.instances.all():
             assert i.label == (None if i.structure else "chair")
 
 
@@ -409,4 +407,4 @@ def test_a_memory_without_pictures_says_what_is_needed(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         with pytest.raises(OptionError, match="--source"):
             detect(store, Everything())
-        assert votes_of(store, 1) == {}
+        assert store.votes.of(1) == {}

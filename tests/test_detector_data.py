@@ -27,8 +27,8 @@ pytestmark = [
 def shown_at(store: Store, frame: int, x: int, y: int) -> int:
     """The instance with the smallest box around a pixel."""
     areas: dict[int, float] = {}
-    for o in store.observations():
-        track = store.mask_track(o.chunk_id, o.local_id)
+    for o in store.observations.all():
+        track = store.local_instances.mask_track(o.chunk_id, o.local_id)
         for box in track.boxes_xyxy[track.frames == frame]:
             if box[0] <= x <= box[2] and box[1] <= y <= box[3]:
                 areas[o.instance_id] = float(np.prod(box[2:] - box[:2]))
@@ -50,9 +50,9 @@ def test_mugs_chairs_and_the_table_get_their_names(table: Path) -> None:
     with Store.open(table) as store:
         for name, pixels in TRUTH.items():
             ids = {shown_at(store, 300, *p) for p in pixels}
-            assert len(ids) == len(pixels) and {store.instance(i).label for i in ids} == {name}
-        assert all(i.label is None for i in store.instances(structure=True))
-        named = [i.label for i in store.instances()]
+            assert len(ids) == len(pixels) and {store.instances.get(i).label for i in ids} == {name}
+        assert all(i.label is None for i in store.instances.all(structure=True))
+        named = [i.label for i in store.instances.all()]
         assert named.count("cup") == 2 and named.count("dining table") == 1
 
 
@@ -68,8 +68,8 @@ def test_a_detector_that_looks_again_at_other_frames_keeps_the_names(table: Path
     path = tmp_path / "again.l3r"
     path.write_bytes(table.read_bytes())
     with Store.open(path) as store:
-        before = {i.id: i.label for i in store.instances()}
+        before = {i.id: i.label for i in store.instances.all()}
     assert run(["detect", str(path), "--detector", str(WEIGHTS / "nanodet-m-416.param")]) == 0
     with Store.open(path) as store:
         cups = {shown_at(store, 300, *p) for p in TRUTH["cup"]}
-        assert all(before[i] == store.instance(i).label == "cup" for i in cups)
+        assert all(before[i] == store.instances.get(i).label == "cup" for i in cups)

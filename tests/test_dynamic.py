@@ -89,39 +89,39 @@ def chunk(index: int, movers: list[LocalInstance], first: int | None = None) -> 
 def memory(path: Path, chunks: list[object], flags: dict[int, dict[int, MotionTrack | None]] | None = None) -> Store:
     store = Store.create(path)
     with store.transaction():
-        store.set_value("scale_kind", "metric")
-        store.set_value("gravity", "estimated")
-        store.add_session("walk", "abc", {}, 200)
+        store.facts.scale_kind = "metric"
+        store.facts.gravity = "estimated"
+        store.sessions.add("walk", "abc", {}, 200)
     for result in chunks:
         with store.transaction():
-            chunk_id = store.add_chunk(1, result)  # type: ignore[arg-type]
-            store.place_chunks(
-                {c.chunk_id: c.S_world_chunk for c in store.chunks()},
-                dict.fromkeys([c.chunk_id for c in store.chunks()], 1),
+            chunk_id = store.chunks.add(1, result)  # type: ignore[arg-type]
+            store.chunks.place(
+                {c.chunk_id: c.S_world_chunk for c in store.chunks.all()},
+                dict.fromkeys([c.chunk_id for c in store.chunks.all()], 1),
             )
             consolidate(store, chunk_id)
             if flags and chunk_id in flags:
-                store.flag_dynamic(chunk_id, flags[chunk_id])
+                store.local_instances.flag_dynamic(chunk_id, flags[chunk_id])
                 consolidate(store, chunk_id)
     return store
 
 
 def moving(store: Store) -> list[Instance]:
-    return [i for i in store.instances() if i.dynamic]
+    return [i for i in store.instances.all() if i.dynamic]
 
 
 def test_a_walk_over_several_chunks_is_one_thing_with_one_track(tmp_path: Path) -> None:
     store = memory(tmp_path / "m.l3r", [chunk(k, [walker(2, STEP * k, across, seed=k)]) for k in range(4)])
     (person,) = moving(store)
-    times_s, places = store.track(person.id)
+    times_s, places = store.tracks.of(person.id)
     frames = np.arange(3 * STEP + FRAMES)
     assert np.allclose(times_s, frames / 30)
     assert np.abs(places - [across(k) for k in frames]).max() < 0.01
     assert np.linalg.norm(person.center - across(int(frames[-1]))) < 0.1
-    assert len(store.observations(person.id)) == 4
-    assert not store.relations(subject=person.id) and not store.relations(object=person.id)
+    assert len(store.observations.of(person.id)) == 4
+    assert not store.relations.all(subject=person.id) and not store.relations.all(object=person.id)
     assert "moving" in person.description
-    support = store.support(person.id)
+    support = store.surfaces.of(person.id)
     assert np.ptp(support.points[:, 1]) < 0.6
 
 
@@ -130,13 +130,13 @@ def test_the_order_of_merging_and_streaming_do_not_matter(tmp_path: Path) -> Non
     streamed = memory(tmp_path / "a.l3r", chunks)
     whole = Store.create(tmp_path / "b.l3r")
     with whole.transaction():
-        whole.set_value("scale_kind", "metric")
-        whole.set_value("gravity", "estimated")
-        whole.add_session("walk", "abc", {}, 200)
-        ids = [whole.add_chunk(1, c) for c in chunks]  # type: ignore[arg-type]
-        whole.place_chunks({c.chunk_id: c.S_world_chunk for c in whole.chunks()}, dict.fromkeys(ids, 1))
+        whole.facts.scale_kind = "metric"
+        whole.facts.gravity = "estimated"
+        whole.sessions.add("walk", "abc", {}, 200)
+        ids = [whole.chunks.add(1, c) for c in chunks]  # type: ignore[arg-type]
+        whole.chunks.place({c.chunk_id: c.S_world_chunk for c in whole.chunks.all()}, dict.fromkeys(ids, 1))
         consolidate(whole)
-    parts = [{(o.chunk_id, o.local_id) for o in s.observations(moving(s)[0].id)} for s in (streamed, whole)]
+    parts = [{(o.chunk_id, o.local_id) for o in s.observations.of(moving(s)[0].id)} for s in (streamed, whole)]
     assert parts[0] == parts[1]
 
 
@@ -146,7 +146,7 @@ def test_what_comes_back_looking_the_same_is_the_same(tmp_path: Path) -> None:
 
     store = memory(tmp_path / "m.l3r", [chunk(0, [walker(2, 0, across)]), chunk(4, [walker(2, 56, later, seed=1)])])
     assert len(moving(store)) == 1
-    assert len(store.track(moving(store)[0].id)[0]) == 2 * FRAMES
+    assert len(store.tracks.of(moving(store)[0].id)[0]) == 2 * FRAMES
 
 
 def test_another_colour_is_another_thing(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_two_seen_side_by_side_stay_two(tmp_path: Path) -> None:
     pair = [chunk(k, [walker(2, STEP * k, across), walker(3, STEP * k, behind, seed=9)]) for k in range(2)]
     store = memory(tmp_path / "m.l3r", pair)
     assert len(moving(store)) == 2
-    assert all(len(store.observations(i.id)) == 2 for i in moving(store))
+    assert all(len(store.observations.of(i.id)) == 2 for i in moving(store))
 
 
 def test_it_is_never_one_with_what_it_passed(tmp_path: Path) -> None:
@@ -172,9 +172,9 @@ def test_it_is_never_one_with_what_it_passed(tmp_path: Path) -> None:
     size = (1.0, 0.7, 0.72)
     store = memory(tmp_path / "m.l3r", [chunk(k, [walker(2, STEP * k, through, size=size)]) for k in range(2)])
     (mover,) = moving(store)
-    tables = [i for i in store.instances() if np.linalg.norm(i.center - TABLE[0]) < 0.1 and not i.dynamic]
+    tables = [i for i in store.instances.all() if np.linalg.norm(i.center - TABLE[0]) < 0.1 and not i.dynamic]
     assert len(tables) == 1 and not tables[0].dynamic
-    assert {o.local_id for o in store.observations(mover.id)} == {2}
+    assert {o.local_id for o in store.observations.of(mover.id)} == {2}
 
 
 def put_down(k: int) -> tuple[float, float, float]:
@@ -195,10 +195,10 @@ def test_what_is_put_down_has_its_place_and_relations_there(tmp_path: Path) -> N
     (thing,) = moving(store)
     assert np.linalg.norm(thing.center - rest) < 0.03
     assert np.abs(thing.box.size - 0.3).max() < 0.05
-    assert any(r.predicate == "on" for r in store.relations(subject=thing.id))
+    assert any(r.predicate == "on" for r in store.relations.all(subject=thing.id))
     assert "moving" not in thing.description
-    assert len(store.observations(thing.id)) == 4
-    times_s, places = store.track(thing.id)
+    assert len(store.observations.of(thing.id)) == 4
+    times_s, places = store.tracks.of(thing.id)
     assert len(times_s) == 42 + FRAMES and np.linalg.norm(places[-1] - rest) < 0.03
 
 
@@ -207,9 +207,9 @@ def test_what_other_chunks_found_to_move_is_respected(tmp_path: Path) -> None:
     flags: dict[int, dict[int, MotionTrack | None]] = {2: {2: None}}
     store = memory(tmp_path / "m.l3r", chunks, flags)
     (thing,) = moving(store)
-    times_s, places = store.track(thing.id)
+    times_s, places = store.tracks.of(thing.id)
     assert len(times_s) == FRAMES + STEP and np.isfinite(places).all()
-    assert not store.relations(subject=thing.id)
+    assert not store.relations.all(subject=thing.id)
 
 
 def test_what_bounds_the_room_never_moves(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_what_bounds_the_room_never_moves(tmp_path: Path) -> None:
 def test_without_movers_nothing_changes_and_tracks_are_empty(tmp_path: Path) -> None:
     store = memory(tmp_path / "m.l3r", [chunk(0, []), chunk(1, [])])
     assert not moving(store)
-    times_s, places = store.track(store.instances()[0].id)
+    times_s, places = store.tracks.of(store.instances.all()[0].id)
     assert times_s.shape == (0,) and places.shape == (0, 3)
 
 
@@ -269,15 +269,15 @@ def test_a_memory_of_schema_1_opens_and_is_upgraded(tmp_path: Path) -> None:
     shutil.copy(SCHEMA_1, path)
     with Store.open(path, writable=True) as store:
         assert store.verify() == []
-        assert len(store.instances()) == 6 and not moving(store)
-        assert all(i.position_sigma_m is None for i in store.instances())
-        (chunk_row,) = store.chunks()
+        assert len(store.instances.all()) == 6 and not moving(store)
+        assert all(i.position_sigma_m is None for i in store.instances.all())
+        (chunk_row,) = store.chunks.all()
         assert chunk_row.covariance is None
-        samples = store.frame_samples(chunk_row.chunk_id)
+        samples = store.chunks.samples(chunk_row.chunk_id)
         assert len(samples.points) and (samples.instance == -1).all()
-        assert store.motion_track(chunk_row.chunk_id, 0) is None
+        assert store.local_instances.motion_track(chunk_row.chunk_id, 0) is None
         with store.transaction():
             consolidate(store)
         assert store.verify() == []
     with Store.open(path) as store:
-        assert store._database.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
+        assert store.connection._database.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION

@@ -33,17 +33,17 @@ def built(path: Path, chunks: int = 3) -> Store:
 def at(store: Store, piece: object) -> int:
     """The id of a thing, by the local instance that is it in the first chunk."""
     return min(
-        store.instances(),
+        store.instances.all(),
         key=lambda i: float(sum((i.center - piece.center) ** 2)),  # type: ignore[attr-defined]
     ).id
 
 
 def members(store: Store, instance_id: int) -> set[Key]:
-    return {(o.chunk_id, o.local_id) for o in store.observations(instance_id)}
+    return {(o.chunk_id, o.local_id) for o in store.observations.of(instance_id)}
 
 
 def partition(store: Store) -> dict[int, set[Key]]:
-    return {i.id: members(store, i.id) for i in store.instances()}
+    return {i.id: members(store, i.id) for i in store.instances.all()}
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +67,12 @@ def test_a_merge_keeps_the_older_id_and_holds_when_both_are_seen_again(path: Pat
         both = members(store, mug) | members(store, twin)
         report = edits.merge(store, twin, mug, author="ann")
         assert (report.ids, report.aliases) == ((older,), ((newer, older),))
-        assert members(store, older) == both and store.resolve(newer) == older
+        assert members(store, older) == both and store.ids.resolve(newer) == older
     with Store.open(path, writable=True) as store:
         add(store, chunk(3, PIECES))
-        assert len(store.instances()) == len(PIECES) - 1
-        assert store.resolve(newer) == older and len(members(store, older)) == len(both) + 2
-        assert store.edits()[0].author == "ann" and store.verify() == []
+        assert len(store.instances.all()) == len(PIECES) - 1
+        assert store.ids.resolve(newer) == older and len(members(store, older)) == len(both) + 2
+        assert store.edits.all()[0].author == "ann" and store.verify() == []
 
 
 def test_undoing_a_merge_brings_the_retired_id_back(path: Path) -> None:
@@ -82,9 +82,9 @@ def test_undoing_a_merge_brings_the_retired_id_back(path: Path) -> None:
         edits.merge(store, mug, twin)
         report = edits.undo(store)
         assert report.restored == (max(mug, twin),)
-        assert partition(store) == before and store.aliases() == {}
+        assert partition(store) == before and store.ids.aliases() == {}
         edits.undo(store, report.entry)
-        assert store.resolve(max(mug, twin)) == min(mug, twin), "undoing the undo brings the merge back"
+        assert store.ids.resolve(max(mug, twin)) == min(mug, twin), "undoing the undo brings the merge back"
 
 
 def test_a_split_gives_a_new_id_to_the_smaller_part_and_holds(path: Path) -> None:
@@ -112,7 +112,7 @@ def test_a_split_without_parts_finds_the_two_things_that_were_merged(path: Path)
         report = edits.split(store, mug)
         assert {frozenset(members(store, n)) for n in report.ids} == parts
         edits.merge(store, *report.ids)
-        assert len(store.instances()) == len(PIECES) - 1, "the last word wins"
+        assert len(store.instances.all()) == len(PIECES) - 1, "the last word wins"
 
 
 def test_labels_follow_what_they_were_given_to(path: Path) -> None:
@@ -120,17 +120,17 @@ def test_labels_follow_what_they_were_given_to(path: Path) -> None:
         mug, twin = at(store, MUG), at(store, TWIN)
         edits.label(store, mug, "ann's mug")
         edits.label(store, twin, "  bob's\n mug ")
-        assert store.instance(twin).label == "bob's mug"
+        assert store.instances.get(twin).label == "bob's mug"
         edits.merge(store, mug, twin)
-        assert store.instance(mug).label == "bob's mug", "the last word wins"
+        assert store.instances.get(mug).label == "bob's mug", "the last word wins"
         add(store, chunk(3, PIECES))
-        assert store.instance(mug).label == "bob's mug"
+        assert store.instances.get(mug).label == "bob's mug"
         edits.undo(store)
-        assert (store.instance(mug).label, store.instance(twin).label) == ("ann's mug", "bob's mug")
+        assert (store.instances.get(mug).label, store.instances.get(twin).label) == ("ann's mug", "bob's mug")
         edits.undo(store)
-        assert (store.instance(mug).label, store.instance(twin).label) == ("ann's mug", None)
+        assert (store.instances.get(mug).label, store.instances.get(twin).label) == ("ann's mug", None)
         edits.label(store, mug, "")
-        assert store.instance(mug).label is None
+        assert store.instances.get(mug).label is None
         for bad in ("x" * 201, "a\x07b"):
             with pytest.raises(OptionError):
                 edits.label(store, mug, bad)
@@ -143,7 +143,7 @@ def test_what_was_deleted_stays_away_and_comes_back_under_its_id(path: Path) -> 
         entry = edits.delete(store, mug).entry
         assert mug not in partition(store)
         add(store, chunk(3, PIECES))
-        assert len(store.instances()) == len(PIECES) - 1
+        assert len(store.instances.all()) == len(PIECES) - 1
         assert all(members(store, n) >= m for n, m in others.items())
         with pytest.raises(UnknownIdError, match=f"was deleted.*undo .*{entry}"):
             edits.label(store, mug, "mug")
@@ -193,26 +193,26 @@ def test_edits_do_not_change_what_they_do_not_speak_of(path: Path) -> None:
 )
 def test_edits_that_make_no_sense_change_nothing(path: Path, verb: object) -> None:
     with Store.open(path, writable=True) as store:
-        before = (content(store), store.edits(), store.log_entries())
+        before = (content(store), store.edits.all(), store.merges.all())
         with pytest.raises(List3rError) as error:
             verb(store)  # type: ignore[operator]
         assert "\n" not in str(error.value)
-        assert (content(store), store.edits(), store.log_entries()) == before
+        assert (content(store), store.edits.all(), store.merges.all()) == before
 
 
 def test_things_that_no_chunk_of_the_file_shows_can_be_named_but_not_regrouped(tmp_path: Path) -> None:
     with create(tmp_path / "a.l3r") as store:
         with store.transaction():
-            store.put_instances(
+            store.instances.put(
                 [instance(1, (0, 0, 0), (1, 1, 1), (9, 9, 9)), instance(2, (3, 0, 0), (1, 1, 1), (9, 9, 9))]
             )
         edits.label(store, 1, "cube")
-        assert store.instance(1).label == "cube"
+        assert store.instances.get(1).label == "cube"
         for verb in (lambda: edits.merge(store, 1, 2), lambda: edits.split(store, 1), lambda: edits.delete(store, 1)):
             with pytest.raises(OptionError):
                 verb()
         edits.undo(store)
-        assert store.instance(1).label is None and len(store.instances()) == 2
+        assert store.instances.get(1).label is None and len(store.instances.all()) == 2
 
 
 def test_things_of_parts_that_were_never_joined_are_not_merged(tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_the_face_for_python_edits_only_what_is_open_for_writing(path: Path) -> 
         memory.split(1)
         memory.undo()
         memory.delete(1)
-        assert [e.kind for e in memory.store.edits()] == ["label", "merge", "split", "undo", "delete"]
+        assert [e.kind for e in memory.store.edits.all()] == ["label", "merge", "split", "undo", "delete"]
 
 
 def test_the_commands(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -281,4 +281,4 @@ def test_a_damaged_edit_is_named(path: Path) -> None:
             database.execute("UPDATE edits SET arguments = ?", (damage,))
         database.close()
         with Store.open(path) as store, pytest.raises(MemoryFileError, match=r"damaged \(edits .*repair"):
-            store.edits()
+            store.edits.all()

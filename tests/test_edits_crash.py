@@ -51,7 +51,7 @@ def test_kill_9_during_edits_loses_nothing_that_was_committed(tmp_path: Path) ->
             told += [int(line) for line in editor.stdout if line.endswith("\n")]
         with Store.open(path) as store:
             assert store.verify() == []
-            assert set(told) <= {e.entry for e in store.edits()}
+            assert set(told) <= {e.entry for e in store.edits.all()}
         with Store.open(path, writable=True) as store:
             before = content(store)
             with store.transaction():

@@ -35,8 +35,8 @@ View = dict[int, tuple[str | None, frozenset[Key]]]
 def view(store: Store) -> View:
     """All that a reader sees of who is who: labels and local instances by id."""
     return {
-        i.id: (i.label, frozenset((o.chunk_id, o.local_id) for o in store.observations(i.id)))
-        for i in store.instances()
+        i.id: (i.label, frozenset((o.chunk_id, o.local_id) for o in store.observations.of(i.id)))
+        for i in store.instances.all()
     }
 
 
@@ -100,7 +100,7 @@ class StoreAgainstModel(RuleBasedStateMachine):
             return
         a, b = data.draw(st.lists(st.sampled_from(sorted(before)), min_size=2, max_size=2, unique=True))
         report = edits.merge(self.store, a, b)
-        assert report.ids == (min(a, b),) and self.store.resolve(max(a, b)) == min(a, b)
+        assert report.ids == (min(a, b),) and self.store.ids.resolve(max(a, b)) == min(a, b)
         self._said(report.entry, Said("merge", (before[a][1], before[b][1])), before)
 
     @rule(data=st.data())
@@ -171,10 +171,15 @@ class StoreAgainstModel(RuleBasedStateMachine):
 
     @rule()
     def reopen(self) -> None:
-        before = (view(self.store), self.store.aliases(), self.store.edits(), self.store.relations())
+        before = (view(self.store), self.store.ids.aliases(), self.store.edits.all(), self.store.relations.all())
         self.store.close()
         self.store = Store.open(self.path, writable=True)
-        assert (view(self.store), self.store.aliases(), self.store.edits(), self.store.relations()) == before
+        assert (
+            view(self.store),
+            self.store.ids.aliases(),
+            self.store.edits.all(),
+            self.store.relations.all(),
+        ) == before
 
     def _said(self, entry: int, what: Said, before: View) -> None:
         self.said[entry] = what
@@ -204,7 +209,7 @@ class StoreAgainstModel(RuleBasedStateMachine):
                 owners = {home.get(k) for k in s.keys}
                 rivals = [t for e, t in self.said.items() if t.kind == "label" and t is not s]
                 if len(owners) == 1 and not any({home.get(k) for k in t.keys} & owners for t in rivals):
-                    assert self.store.instance(owners.pop() or 0).label == s.text
+                    assert self.store.instances.get(owners.pop() or 0).label == s.text
             if s.kind != "label":
                 spoken |= s.keys
 
@@ -227,11 +232,11 @@ class StoreAgainstModel(RuleBasedStateMachine):
         now = view(self.store)
         for n, (_, keys) in now.items():
             self.held[n] = keys
-        assert not self.store.aliases().keys() & now.keys(), "what names an instance is no alias"
+        assert not self.store.ids.aliases().keys() & now.keys(), "what names an instance is no alias"
         seen = {k for _, keys in now.values() for k in keys}
         for n, keys in self.held.items():
             try:
-                assert self.store.resolve(n) in now
+                assert self.store.ids.resolve(n) in now
             except UnknownIdError as error:
                 assert "was deleted" in str(error)
                 assert any(s.kind == "delete" for s in self.said.values())

@@ -35,26 +35,26 @@ def tilted_instance(id: int, rotation: np.ndarray, component: int, **more: objec
 def write_split_memory(path: Path) -> Path:
     """Relative, no gravity; two components, the second has more frames; a thing without points, a lost frame each."""
     with Store.create(path) as store, store.transaction():
-        session = store.add_session("walk", "abc", {}, 40)
+        session = store.sessions.add("walk", "abc", {}, 40)
         for index, count in ((0, 8), (1, 20)):
             points = box_points((1.0, 2.0, 0.5), (0.6, 0.4, 0.2), 300, index)
             local = local_instance(0, points, (200, 80, 40), np.arange(20 * index, 20 * index + 5))
             result = chunk_result(index, 20 * index, count, (local,))
             posed = np.ones(count, bool)
             posed[3] = False
-            chunk = store.add_chunk(session, replace(result, posed=posed, scale_kind="relative"))
-            store.place_chunks({chunk: TILTED if index else Sim3.identity()}, {chunk: chunk})
-        store.set_value("scale_kind", "relative")
-        store.set_value("gravity", "unknown")
-        store.put_instances(
+            chunk = store.chunks.add(session, replace(result, posed=posed, scale_kind="relative"))
+            store.chunks.place({chunk: TILTED if index else Sim3.identity()}, {chunk: chunk})
+        store.facts.scale_kind = "relative"
+        store.facts.gravity = "unknown"
+        store.instances.put(
             [
                 tilted_instance(1, TILTED.rotation, 1),
                 tilted_instance(2, TILTED.rotation, 2, label="écran plat"),
                 tilted_instance(3, np.eye(3), 2, description="no points"),
             ]
         )
-        store.set_observations([Observation(1, 1, 0), Observation(2, 2, 0)])
-        store.replace_relations(None, [Relation(3, "next to!", 2, 0.5, 0.1), Relation(3, "near", 2, 0.5, 0.2)])
+        store.observations.set([Observation(1, 1, 0), Observation(2, 2, 0)])
+        store.relations.replace(None, [Relation(3, "next to!", 2, 0.5, 0.1), Relation(3, "near", 2, 0.5, 0.2)])
     return path
 
 

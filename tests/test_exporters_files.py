@@ -39,7 +39,7 @@ def test_ply_points_know_their_instance(room: Store, tmp_path: Path) -> None:
     assert len(cloud.vertices) == 6 * 400
     for id in range(1, 7):
         own = raw["instance"].ravel() == id
-        assert np.allclose(np.asarray(cloud.vertices)[own], room.support(id).points, atol=1e-6)
+        assert np.allclose(np.asarray(cloud.vertices)[own], room.surfaces.of(id).points, atol=1e-6)
     mug = np.flatnonzero(raw["instance"].ravel() == 3)[0]
     assert tuple(cloud.colors[mug][:3]) == instance_color(3)
 
@@ -64,10 +64,10 @@ def test_ply_says_its_unit_and_component(tmp_path: Path) -> None:
 def test_tum_is_the_trajectory_of_the_store(make_memory: Callable[..., Path], tmp_path: Path) -> None:
     room = Store.open(make_memory(), writable=True)
     with room.transaction():  # turned, so that no two numbers of a quaternion are alike
-        room.place_chunks({1: Sim3.exp([0.3, -0.2, 0.1, 0.4, -0.3, 0.8, 0.0])}, {1: 1})
+        room.chunks.place({1: Sim3.exp([0.3, -0.2, 0.1, 0.4, -0.3, 0.8, 0.0])}, {1: 1})
     write_tum(room, tmp_path / "out.txt")
     rows = np.loadtxt(tmp_path / "out.txt")
-    poses = room.camera_poses()
+    poses = room.trajectory.poses()
     assert rows.shape == (20, 8)
     assert np.allclose(rows[:, 0], [f.time_s for f, _ in poses], atol=1e-6)
     assert np.allclose(rows[:, 1:4], [S.translation for _, S in poses])
@@ -77,7 +77,7 @@ def test_tum_is_the_trajectory_of_the_store(make_memory: Callable[..., Path], tm
 def test_tum_gives_rigid_poses_of_posed_frames_by_component(tmp_path: Path) -> None:
     with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
         written = write_tum(store, tmp_path / "out.txt")
-        poses = store.camera_poses()
+        poses = store.trajectory.poses()
     rows = [np.loadtxt(p) for p in written]
     assert [len(r) for r in rows] == [19, 7]
     assert np.all(np.diff(rows[0][:, 0]) > 0)
@@ -90,7 +90,7 @@ def test_tum_is_read_by_evo(room: Store, tmp_path: Path) -> None:
     write_tum(room, tmp_path / "out.txt")
     trajectory = file_interface.read_tum_trajectory_file(str(tmp_path / "out.txt"))
     assert trajectory.num_poses == 20
-    assert np.allclose(trajectory.poses_se3[3][:3, :3], room.camera_poses()[3][1].rotation, atol=1e-8)
+    assert np.allclose(trajectory.poses_se3[3][:3, :3], room.trajectory.poses()[3][1].rotation, atol=1e-8)
 
 
 def read_gltf(path: Path) -> dict[str, object]:
@@ -111,8 +111,8 @@ def test_glb_holds_named_points_and_boxes_y_up(room: Store, tmp_path: Path) -> N
     points = trimesh.transform_points(scene.geometry[name].vertices, T_scene_node)
     assert len(points) == 100
     world = points @ T_GLTF_WORLD[:3, :3]
-    assert np.all(world >= room.instance(3).aabb[0] - 1e-4)
-    assert np.all(world <= room.instance(3).aabb[1] + 1e-4)
+    assert np.all(world >= room.instances.get(3).aabb[0] - 1e-4)
+    assert np.all(world <= room.instances.get(3).aabb[1] + 1e-4)
     assert points[:, 1].min() > 0.7
 
 
@@ -127,7 +127,7 @@ def test_glb_boxes_are_twelve_edges_with_facts(room: Store, tmp_path: Path) -> N
     (primitive,) = box["primitives"]
     position = accessors[primitive["attributes"]["POSITION"]]  # type: ignore[index]
     assert (primitive["mode"], position["count"]) == (1, 24)
-    assert np.allclose(position["max"], room.instance(5).aabb[1])
+    assert np.allclose(position["max"], room.instances.get(5).aabb[1])
 
 
 def expected_cell(value: object) -> str:

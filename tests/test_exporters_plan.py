@@ -58,7 +58,7 @@ def test_the_page_is_seen_from_above(make_memory: Callable[..., Path]) -> None:
 def test_without_gravity_the_camera_path_gives_the_page(tmp_path: Path) -> None:
     with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
         component = read_components(store)[0]
-        rotation, note = choose_rotation(component, store.get_value("gravity"))
+        rotation, note = choose_rotation(component, store.facts.gravity)
     camera_up = -component.poses[0][1].rotation[:, 1]
     assert rotation[2] @ camera_up > 0.99
     assert "gravity unknown" in note

@@ -140,7 +140,7 @@ def test_what_is_not_known_is_null(tmp_path: Path) -> None:
 def test_a_box_can_be_rebuilt(tmp_path: Path) -> None:
     with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
         entry = scene_dict(store)["instances"][1]
-        corners = store.instance(2).box.corners()
+        corners = store.instances.get(2).box.corners()
     rotation = rotation_from_quat_wxyz(np.array(entry["box"]["quat_wxyz"]))
     rebuilt = OrientedBox(np.array(entry["box"]["center"]), np.array(entry["box"]["size"]), rotation)
     assert np.allclose(rebuilt.corners(), corners, atol=1e-4)
@@ -150,6 +150,6 @@ def test_a_box_can_be_rebuilt(tmp_path: Path) -> None:
 def test_geometry_that_is_not_finite_is_damage_and_not_exported(make_memory: Callable[..., Path]) -> None:
     path = make_memory()
     with Store.open(path, writable=True) as store, store.transaction():
-        store.put_instances([instance(7, (np.inf, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 2, 3), component=1)])
+        store.instances.put([instance(7, (np.inf, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 2, 3), component=1)])
     with Store.open(path) as store, pytest.raises(MemoryFileError, match="instances 7: geometry is not a finite box"):
         scene_dict(store)

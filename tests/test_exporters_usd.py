@@ -70,10 +70,10 @@ def test_usdas_are_text(room: Store, tmp_path: Path) -> None:
 
 
 def test_points_lie_where_the_store_has_them(stage: Usd.Stage, room: Store) -> None:
-    for thing in room.instances():
+    for thing in room.instances.all():
         group = "Structure" if thing.structure else "Instances"
         prim = stage.GetPrimAtPath(f"/World/{group}/instance_{thing.id}/points")
-        support = room.support(thing.id)
+        support = room.surfaces.of(thing.id)
         assert np.allclose(world_points(prim), support.points, atol=1e-5)
         colors = np.array(UsdGeom.Points(prim).GetDisplayColorAttr().Get())
         assert np.allclose(colors, linear_from_srgb(support.rgb), atol=1e-6)
@@ -81,7 +81,7 @@ def test_points_lie_where_the_store_has_them(stage: Usd.Stage, room: Store) -> N
 
 def test_turned_and_scaled_points_and_boxes(tmp_path: Path) -> None:
     with Store.open(write_split_memory(tmp_path / "split.l3r")) as store:
-        stage, box, support = usd_stage(store), store.instance(2).box, store.support(2)
+        stage, box, support = usd_stage(store), store.instances.get(2).box, store.surfaces.of(2)
     prim = stage.GetPrimAtPath("/World/Instances/instance_2")
     assert np.allclose(world_points(prim.GetChild("points")), support.points, atol=1e-5)
     unit = np.array([[i, j, k, 1.0] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
@@ -96,10 +96,10 @@ def test_extents_hold_the_points(stage: Usd.Stage, room: Store) -> None:
         assert prim.GetChild("points").GetAttribute("extent").HasAuthoredValue()
         width = UsdGeom.Points(prim.GetChild("points")).GetWidthsAttr().Get()[0]
         bound = cache.ComputeWorldBound(prim).ComputeAlignedRange()
-        points = room.support(id).points
+        points = room.surfaces.of(id).points
         assert np.allclose(bound.GetMin(), points.min(axis=0) - width / 2, atol=1e-5)
         assert np.allclose(bound.GetMax(), points.max(axis=0) + width / 2, atol=1e-5)
-        assert 0.1 < width / np.sqrt(_surface(room.instance(id).box.size) / len(points)) < 3.0
+        assert 0.1 < width / np.sqrt(_surface(room.instances.get(id).box.size) / len(points)) < 3.0
 
 
 def _surface(size: np.ndarray) -> float:
@@ -161,7 +161,7 @@ def test_class_token(label: str | None, description: str, structure: str | None,
 
 def test_the_camera_goes_where_the_frames_went(stage: Usd.Stage, room: Store) -> None:
     prim = stage.GetPrimAtPath("/World/Camera")
-    for frame, S_world_cam in room.camera_poses():
+    for frame, S_world_cam in room.trajectory.poses():
         T_world_usdcam = S_world_cam.as_matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
         assert np.allclose(local_to_world(prim, frame.frame_index), T_world_usdcam, atol=1e-9)
         assert prim.GetAttribute("list3r:time").Get(frame.frame_index) == pytest.approx(frame.time_s)
@@ -172,7 +172,7 @@ def test_the_camera_goes_where_the_frames_went(stage: Usd.Stage, room: Store) ->
 def test_the_lens_sees_what_the_pinhole_sees(make_memory: Callable[..., Path]) -> None:
     with Store.open(make_memory()) as store:
         stage = usd_stage(store)
-        (chunk,) = store.chunks()
+        (chunk,) = store.chunks.all()
     fx, fy, cx, cy = chunk.intrinsics
     height, width = chunk.image_size
     frustum = UsdGeom.Camera.Get(stage, "/World/Camera").GetCamera(Usd.TimeCode(0)).frustum

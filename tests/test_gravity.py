@@ -128,8 +128,8 @@ def test_gravity_of_a_store_follows_its_planes_and_cameras(tmp_path: Path) -> No
     table = dataclasses.replace(table, plane=np.array([0, 0, 1, 0.6]))
     with Store.create(tmp_path / "a.l3r") as store, store.transaction():
         assert estimate_gravity(store).status == "unknown"
-        session = store.add_session("walk", "abc", {}, 20)
-        store.add_chunk(session, chunk_result(0, 0, 20, (table,)))
+        session = store.sessions.add("walk", "abc", {}, 20)
+        store.chunks.add(session, chunk_result(0, 0, 20, (table,)))
         gravity = estimate_gravity(store)
         assert gravity.status == "estimated" and error_deg(gravity, np.array([0, 0, 1.0])) < 1.0
 

@@ -14,11 +14,11 @@ import pytest
 from list3r.memory.geometry import Sim3
 from list3r.memory.library import instances as library_things
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.labels import Votes, apply_labels, detected_labels, put_votes
-from list3r.memory.library.rules import ConsolidationSettings
+from list3r.memory.library.labels import apply_labels, put_votes
+from list3r.memory.library.rules import WORLD, ConsolidationSettings
 from list3r.memory.maintenance import edits
 from list3r.memory.overlap import summaries
-from list3r.memory.records import ChunkResult, FrameSamples
+from list3r.memory.records import ChunkResult, FrameSamples, Votes
 from list3r.memory.store.store import Store
 
 GROW = ConsolidationSettings(whole_chunks=0)
@@ -68,15 +68,15 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def begin(store: Store) -> None:
     with store.transaction():
-        store.set_value("scale_kind", "metric")
-        store.set_value("gravity", "estimated")
-        store.add_session("walk", "made up", {}, 999)
+        store.facts.scale_kind = "metric"
+        store.facts.gravity = "estimated"
+        store.sessions.add("walk", "made up", {}, 999)
 
 
 def add(store: Store, result: ChunkResult, pose: Sim3 | None = None, component: int = 1) -> int:
     with store.transaction():
-        chunk_id = store.add_chunk(1, result)
-        store.place_chunks({chunk_id: pose or Sim3.identity()}, {chunk_id: component})
+        chunk_id = store.chunks.add(1, result)
+        store.chunks.place({chunk_id: pose or Sim3.identity()}, {chunk_id: component})
         consolidate(store, chunk_id, GROW)
     return chunk_id
 
@@ -87,8 +87,8 @@ def test_labels_that_grow_are_those_of_all_votes(store: Store, walks: ModuleType
     for index, place in enumerate(order):
         made = visit(walks, index, place)
         with store.transaction():
-            chunk_id = store.add_chunk(1, made)
-            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            chunk_id = store.chunks.add(1, made)
+            store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
             told = {
                 n.local_id: Votes(1.0, {names[(place + n.local_id) % 3]: (8.0, 40.0)}, 8.0)
                 for n in made.library.instances
@@ -98,10 +98,10 @@ def test_labels_that_grow_are_those_of_all_votes(store: Store, walks: ModuleType
             report = consolidate(store, chunk_id, GROW)
             local += report.written is not None
             apply_labels(store, written=report.written)
-        grown = {i.id: i.label for i in store.instances()}, detected_labels(store)
+        grown = {i.id: i.label for i in store.instances.all()}, store.detected_labels.all()
         with store.transaction():
             assert apply_labels(store).keys() == grown[1].keys()
-        assert ({i.id: i.label for i in store.instances()}, detected_labels(store)) == grown
+        assert ({i.id: i.label for i in store.instances.all()}, store.detected_labels.all()) == grown
     assert local >= 3 and set(grown[0].values()) == {None, "book", "chair"}
 
 
@@ -109,14 +109,14 @@ def tables(store: Store) -> dict[str, list[tuple[object, ...]]]:
     """All that consolidation writes, but for words on colours, whose light may lag behind a little."""
     columns = "id, label, confidence, observations, first_seen_s, last_seen_s, state, structure, component, view_frame"
     return {
-        "instances": store._rows(f"SELECT {columns} FROM instances ORDER BY id"),
-        "members": store._rows("SELECT * FROM members ORDER BY chunk_id, local_id"),
-        "observations": store._rows("SELECT * FROM observations ORDER BY chunk_id, local_id"),
-        "relations": store._rows("SELECT * FROM relations ORDER BY subject, predicate, object"),
-        "embeddings": store._rows("SELECT * FROM embeddings ORDER BY instance"),
-        "dropped": store._rows("SELECT chunk_id, dropped FROM settled ORDER BY chunk_id"),
-        "overlaps": store._rows("SELECT * FROM overlaps ORDER BY u, v"),
-        "aliases": store._rows("SELECT * FROM aliases ORDER BY id"),
+        "instances": store.connection.rows(f"SELECT {columns} FROM instances ORDER BY id"),
+        "members": store.connection.rows("SELECT * FROM members ORDER BY chunk_id, local_id"),
+        "observations": store.connection.rows("SELECT * FROM observations ORDER BY chunk_id, local_id"),
+        "relations": store.connection.rows("SELECT * FROM relations ORDER BY subject, predicate, object"),
+        "embeddings": store.connection.rows("SELECT * FROM embeddings ORDER BY instance"),
+        "dropped": store.connection.rows("SELECT chunk_id, dropped FROM settled ORDER BY chunk_id"),
+        "overlaps": store.connection.rows("SELECT * FROM overlaps ORDER BY u, v"),
+        "aliases": store.connection.rows("SELECT * FROM aliases ORDER BY id"),
     }
 
 
@@ -126,11 +126,11 @@ class _Undone(Exception):
 
 def check(store: Store, *names: str) -> None:
     """What has grown is what is derived as a whole, ids and all; only some tables where they are named."""
-    grown, boxes = tables(store), [i.aabb for i in store.instances()]
+    grown, boxes = tables(store), [i.aabb for i in store.instances.all()]
     with pytest.raises(_Undone), store.transaction():
-        store.forget_library()
+        store.library.forget()
         report = consolidate(store, settings=GROW)
-        whole, others = tables(store), [i.aabb for i in store.instances()]
+        whole, others = tables(store), [i.aabb for i in store.instances.all()]
         raise _Undone
     assert report.new == () and report.merged == ()
     for name, rows in whole.items():
@@ -148,7 +148,7 @@ def test_a_grown_library_is_the_one_derived_as_a_whole(walks: ModuleType, store:
 
 def test_what_neighbours_of_computed_depth_miss_grows_alike(walks: ModuleType, store: Store) -> None:
     with store.transaction():
-        store.set_value("scale_kind", "relative")
+        store.facts.scale_kind = "relative"
     hidden = 0
     for index in range(7):
         made = visit(walks, index, index % 2)
@@ -177,7 +177,7 @@ def test_what_neighbours_of_computed_depth_miss_grows_alike(walks: ModuleType, s
         made = dataclasses.replace(made, frame_indices=frames, library=library, samples=samples)
         add(store, dataclasses.replace(made, scale_kind="relative"))
         check(store, "instances", "members", "observations")
-        hidden = max(hidden, store.hidden_groups())
+        hidden = max(hidden, store.library.members.hidden_groups())
     assert hidden > 0
 
 
@@ -185,7 +185,7 @@ def test_one_floor_goes_on_under_another_id_after_a_while(walks: ModuleType, sto
     for index in range(8):
         add(store, visit(walks, index, index, "corridor"))
     check(store)
-    floors = store.instances(structure=True)
+    floors = store.instances.all(structure=True)
     assert len(floors) > 1
     assert all(np.ptp(i.aabb, axis=0).max() <= 20.0 for i in floors)
 
@@ -195,7 +195,7 @@ def test_chunks_that_a_loop_closure_moves_are_followed(walks: ModuleType, store:
         add(store, visit(walks, index, place))
     for off in (0.03, 0.4, 0.0):
         with store.transaction():
-            store.place_chunks({4: Sim3.exp(np.array([off, off, 0, 0, 0, 0.1 * off, 0]))}, {4: 1})
+            store.chunks.place({4: Sim3.exp(np.array([off, off, 0, 0, 0, 0.1 * off, 0]))}, {4: 1})
             consolidate(store, settings=GROW)
         check(store)
 
@@ -205,7 +205,7 @@ def test_overlaps_are_measured_anew_when_most_chunks_move(walks: ModuleType, sto
         add(store, visit(walks, index, place))
     with store.transaction():
         for k in range(2, 8):
-            store.place_chunks({k: Sim3.exp(np.array([0.01 * k, 0.0, 0.02, 0, 0, 0.002 * k, 0]))}, {k: 1})
+            store.chunks.place({k: Sim3.exp(np.array([0.01 * k, 0.0, 0.02, 0, 0, 0.002 * k, 0]))}, {k: 1})
         assert consolidate(store, settings=GROW).written is None
     check(store)
 
@@ -215,14 +215,14 @@ def test_things_of_chunks_that_trembled_lie_where_the_chunks_lie_when_a_session_
 ) -> None:
     for index in range(5):
         add(store, visit(walks, index, index))
-    before = {i.id: i.aabb for i in store.instances()}
-    own = {n for n, a in store.anchors().items() if a.chunk_id == 2}
+    before = {i.id: i.aabb for i in store.instances.all()}
+    own = {n for n, a in store.library.anchors.all().items() if a.chunk_id == 2}
     off = np.array([0.001, 0.0015, 0.0])
     with store.transaction():
-        store.place_chunks({2: Sim3.exp(np.array([*off, 0, 0, 0, 0]))}, {2: 1})
+        store.chunks.place({2: Sim3.exp(np.array([*off, 0, 0, 0, 0]))}, {2: 1})
         consolidate(store, 2, GROW)
         assert consolidate(store, settings=GROW).new == ()
-    for i in store.instances():
+    for i in store.instances.all():
         assert np.allclose(i.aabb, before[i.id] + (off if i.id in own else 0.0), atol=1e-9)
     assert own and store.verify() == []
 
@@ -233,18 +233,18 @@ def test_a_part_that_is_joined_to_another_is_merged_with_it(walks: ModuleType, s
         add(store, visit(walks, index, place))
     add(store, visit(walks, 4, 1), far, component=5)
     check(store)
-    assert {i.component for i in store.instances()} == {1, 5}
+    assert {i.component for i in store.instances.all()} == {1, 5}
     with store.transaction():
-        store.place_chunks({5: Sim3.identity()}, {5: 1})
+        store.chunks.place({5: Sim3.identity()}, {5: 1})
         consolidate(store, settings=GROW)
     check(store)
-    assert {i.component for i in store.instances()} == {1} and len(store.aliases()) >= 12
+    assert {i.component for i in store.instances.all()} == {1} and len(store.ids.aliases()) >= 12
 
 
 def test_the_word_of_operators_holds_while_the_library_grows(walks: ModuleType, store: Store) -> None:
     for index, place in enumerate((0, 1, 2)):
         add(store, visit(walks, index, place))
-    things = [i.id for i in store.instances(structure=False) if len(store.observations(i.id)) > 1]
+    things = [i.id for i in store.instances.all(structure=False) if len(store.observations.of(i.id)) > 1]
     edits.merge(store, things[0], things[1], "somebody")
     entry = edits.split(store, things[2], author="somebody").entry
     edits.label(store, things[3], "cup", "somebody")
@@ -253,7 +253,7 @@ def test_the_word_of_operators_holds_while_the_library_grows(walks: ModuleType, 
     for index, place in enumerate((1, 0, 3), start=3):
         add(store, visit(walks, index, place))
         check(store)
-    assert store.instance(things[3]).label == "cup" and store.resolve(things[1]) == things[0]
+    assert store.instances.get(things[3]).label == "cup" and store.ids.resolve(things[1]) == things[0]
     edits.undo(store, entry, "somebody")
     add(store, visit(walks, 6, 1))
     check(store)
@@ -291,8 +291,8 @@ def test_a_chunk_that_was_taken_back_leaves_no_trace(walks: ModuleType, store: S
         add(store, visit(walks, index, index))
     before = tables(store)
     with pytest.raises(_Undone), store.transaction():
-        chunk_id = store.add_chunk(1, visit(walks, 4, 1))
-        store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+        chunk_id = store.chunks.add(1, visit(walks, 4, 1))
+        store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
         consolidate(store, chunk_id, GROW)
         raise _Undone
     assert tables(store) == before
@@ -303,33 +303,37 @@ def test_a_chunk_that_was_taken_back_leaves_no_trace(walks: ModuleType, store: S
 def rows_of(store: Store, keep: Callable[[int], bool]) -> dict[str, list[tuple[object, ...]]]:
     """Whole rows of some instances and of what hangs on them."""
     return {
-        "instances": [r for r in store._rows("SELECT * FROM instances ORDER BY id") if keep(r[0])],
-        "boxes": [r for r in store._rows("SELECT * FROM instance_boxes ORDER BY id") if keep(r[0])],
-        "relations": [r for r in store._rows("SELECT * FROM relations ORDER BY 1, 2, 3") if keep(r[0]) and keep(r[2])],
-        "embeddings": [r for r in store._rows("SELECT * FROM embeddings ORDER BY instance") if keep(r[0])],
+        "instances": [r for r in store.connection.rows("SELECT * FROM instances ORDER BY id") if keep(r[0])],
+        "boxes": [r for r in store.connection.rows("SELECT * FROM instance_boxes ORDER BY id") if keep(r[0])],
+        "relations": [
+            r for r in store.connection.rows("SELECT * FROM relations ORDER BY 1, 2, 3") if keep(r[0]) and keep(r[2])
+        ],
+        "embeddings": [r for r in store.connection.rows("SELECT * FROM embeddings ORDER BY instance") if keep(r[0])],
     }
 
 
 def test_a_chunk_changes_no_row_of_what_is_far_away(walks: ModuleType, store: Store) -> None:
     for index in range(9):
         add(store, visit(walks, index, index))
-    reach = float(min(i.aabb[0, 0] for i in store.instances() if {o.chunk_id for o in store.observations(i.id)} & {9}))
-    far = {i.id for i in store.instances() if i.aabb[1, 0] < reach - 6.0}
+    reach = float(
+        min(i.aabb[0, 0] for i in store.instances.all() if {o.chunk_id for o in store.observations.of(i.id)} & {9})
+    )
+    far = {i.id for i in store.instances.all() if i.aabb[1, 0] < reach - 6.0}
     assert len(far) > 20
     before = rows_of(store, far.__contains__)
-    sums = dict(store._rows("SELECT part, crcs FROM sums WHERE name = 'instances'"))
+    sums = dict(store.connection.rows("SELECT part, crcs FROM sums WHERE name = 'instances'"))
     add(store, visit(walks, 9, 9))
     assert rows_of(store, far.__contains__) == before
-    now = dict(store._rows("SELECT part, crcs FROM sums WHERE name = 'instances'"))
+    now = dict(store.connection.rows("SELECT part, crcs FROM sums WHERE name = 'instances'"))
     assert all(now[part] == sums[part] for part in sums if all(n in far for n in range(16 * part, 16 * part + 16)))
 
 
 def test_as_much_is_written_for_a_late_chunk_as_for_an_early_one(walks: ModuleType, store: Store) -> None:
     counts = []
     for index in range(16):
-        before, rows = len(store.vectors_touched), store._database.total_changes
+        before, rows = len(store.embeddings.touched), store.connection._database.total_changes
         add(store, visit(walks, index, index))
-        counts.append((len(store.vectors_touched) - before, store._database.total_changes - rows))
+        counts.append((len(store.embeddings.touched) - before, store.connection._database.total_changes - rows))
     assert {c for c, _ in counts[6:]} <= {counts[6][0], counts[7][0]}
     assert max(r for _, r in counts[12:]) <= 1.3 * max(r for _, r in counts[6:8])
 
@@ -339,7 +343,7 @@ def test_a_chunk_with_another_feature_space_makes_all_be_derived_anew(walks: Mod
         add(store, visit(walks, index, index))
     other = visit(walks, 3, 1)
     add(store, dataclasses.replace(other, library=dataclasses.replace(other.library, feature_space="other@1/64")))
-    assert store.get_value("library")["space"] == ""
+    assert store.facts[WORLD].space == ""
     add(store, visit(walks, 4, 2))
     check(store)
 
@@ -355,13 +359,13 @@ def test_what_moves_is_followed_while_the_library_grows(tmp_path: Path) -> None:
     store = memory(tmp_path / "m.l3r", steps[:2])
     for k, result in enumerate(steps[2:], start=2):
         with store.transaction():
-            chunk_id = store.add_chunk(1, result)  # type: ignore[arg-type]
-            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            chunk_id = store.chunks.add(1, result)  # type: ignore[arg-type]
+            store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
             consolidate(store, chunk_id, GROW)
         check(store)
-        assert any(i.dynamic for i in store.instances()) and FRAMES > 0, k
+        assert any(i.dynamic for i in store.instances.all()) and FRAMES > 0, k
     with store.transaction():
-        store.flag_dynamic(3, {0: None})
+        store.local_instances.flag_dynamic(3, {0: None})
         consolidate(store, settings=GROW)
     check(store)
     store.close()

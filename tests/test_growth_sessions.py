@@ -47,33 +47,37 @@ def moved(name: str, dx: float, dy: float) -> Box:
 def store(tmp_path: Path) -> Iterator[Store]:
     with Store.create(tmp_path / "house.l3r") as opened:
         with opened.transaction():
-            opened.set_value("scale_kind", "metric")
-            opened.set_value("gravity", "known")
+            opened.facts.scale_kind = "metric"
+            opened.facts.gravity = "known"
         yield opened
 
 
 def film(store: Store, room: Mapping[str, Box], visits: list[tuple[int, float]], *, checked: bool = False) -> None:
     """One session: a chunk for each (table, angle), each taken in by itself, then its end."""
     with store.transaction():
-        session = store.add_session("simulated", f"{len(store.sessions())}", {}, FRAMES * len(visits))
+        session = store.sessions.add("simulated", f"{len(store.sessions.all())}", {}, FRAMES * len(visits))
     for index, (table, angle) in enumerate(visits):
         poses = cameras((APART_M * table, 0.0, 0.75), angle)
         with store.transaction():
-            chunk_id = store.add_chunk(session, simulated_chunk(room, poses, index))
-            store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            chunk_id = store.chunks.add(session, simulated_chunk(room, poses, index))
+            store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
             consolidate(store, chunk_id, GROW)
         if checked:
             check(store, chunk_id)
     with store.transaction():
         consolidate(store, settings=GROW)
-        store.complete_session(session)
+        store.sessions.complete(session)
     check(store, None)
 
 
 def everything(store: Store) -> dict[str, object]:
     """All that consolidation writes, and what has changed between sessions."""
-    events = store._rows("SELECT * FROM events ORDER BY session_id, instance")
-    return {**tables(store), "events": events, "tale": store.get_value("tale")}
+    events = store.connection.rows("SELECT * FROM events ORDER BY session_id, instance")
+    return {
+        **tables(store),
+        "events": events,
+        "tale": store.connection.rows("SELECT value FROM memory WHERE key = 'change_ledger'"),
+    }
 
 
 class _Undone(Exception):
@@ -82,11 +86,11 @@ class _Undone(Exception):
 
 def check(store: Store, chunk_id: int | None) -> None:
     """What has grown is what is derived as a whole, while a session comes in or after its end."""
-    grown, boxes = everything(store), [i.aabb for i in store.instances()]
+    grown, boxes = everything(store), [i.aabb for i in store.instances.all()]
     with pytest.raises(_Undone), store.transaction():
-        store.forget_library()
+        store.library.forget()
         consolidate(store, chunk_id, GROW)
-        whole, others = everything(store), [i.aabb for i in store.instances()]
+        whole, others = everything(store), [i.aabb for i in store.instances.all()]
         raise _Undone
     for name, rows in whole.items():
         assert grown[name] == rows, name
@@ -120,26 +124,26 @@ LATER = {
 def test_three_sessions_grow_to_what_is_derived_as_a_whole(store: Store) -> None:
     film(store, house(), FIRST)
     film(store, house(LATER), [(1, 0.9), (1, 2.2), (2, 0.8)], checked=True)
-    kinds = [e.kind for e in store.events(2)]
+    kinds = [e.kind for e in store.events.all(2)]
     assert {"seen_again", "moved", "removed", "added"} == set(kinds)
-    states = {i.state for i in store.instances()}
+    states = {i.state for i in store.instances.all()}
     assert states == {"present", "moved", "removed", "added", "unseen"}
     back = {"thing 11": house()["thing 11"], "thing 32": None, "thing 10": LATER["thing 10"]}
     film(store, house(back), [(1, 1.4), (3, 0.7), (3, 2.1), (1, 0.2)], checked=True)
-    assert {e.kind for e in store.events(3)} == {"seen_again", "removed"}
+    assert {e.kind for e in store.events.all(3)} == {"seen_again", "removed"}
 
 
 def test_a_chunk_of_a_later_session_is_not_derived_as_a_whole(store: Store, whole_runs: list[int]) -> None:
     film(store, house(), FIRST)
     del whole_runs[:]
     with store.transaction():
-        session = store.add_session("simulated", "later", {}, 1)
-        chunk_id = store.add_chunk(session, simulated_chunk(house(LATER), cameras((APART_M, 0.0, 0.75), 0.9), 0))
-        store.place_chunks({chunk_id: Sim3.identity()}, {chunk_id: 1})
+        session = store.sessions.add("simulated", "later", {}, 1)
+        chunk_id = store.chunks.add(session, simulated_chunk(house(LATER), cameras((APART_M, 0.0, 0.75), 0.9), 0))
+        store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
         consolidate(store, chunk_id, GROW)
-        assert store.events() == []
+        assert store.events.all() == []
         consolidate(store, settings=GROW)
-    assert {"moved", "removed", "added"} < {e.kind for e in store.events(session)}
+    assert {"moved", "removed", "added"} < {e.kind for e in store.events.all(session)}
     assert whole_runs == []
 
 
@@ -148,14 +152,14 @@ def test_an_edit_in_a_memory_of_two_sessions_tells_the_changes_again(store: Stor
     film(store, house(LATER), [(1, 0.9), (1, 2.2)])
     with store.transaction():
         consolidate(store)
-    gone = next(e.instance_id for e in store.events(2) if e.kind == "moved")
+    gone = next(e.instance_id for e in store.events.all(2) if e.kind == "moved")
     before = everything(store)
     del whole_runs[:]
     entry = edits.split(store, gone, author="somebody").entry
-    assert gone not in [e.instance_id for e in store.events(2) if e.kind == "moved"]
+    assert gone not in [e.instance_id for e in store.events.all(2) if e.kind == "moved"]
     edits.undo(store, entry, "somebody")
     assert everything(store)["events"] == before["events"]
     edits.delete(store, gone, "somebody")
-    assert not [e for e in store.events() if e.instance_id == gone]
+    assert not [e for e in store.events.all() if e.instance_id == gone]
     assert whole_runs == []
     check(store, None)

@@ -104,7 +104,7 @@ def test_the_past_takes_in_what_is_written_meanwhile_whole(make_memory: Make) ->
             edits.label(writer, 2, "plate")
         with scene.store.snapshot():
             found = {i.id: i.label for i in scene.instances()}
-            ids = {o.instance_id for o in scene.store.observations()}
+            ids = {o.instance_id for o in scene.store.observations.all()}
         assert {2, 4} <= set(before) and before[2] is None
         assert found.keys() & {2, 4} == {2} and found[2] == "plate"
         assert ids & {2, 4} == {2}

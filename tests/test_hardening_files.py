@@ -145,7 +145,7 @@ def test_no_edit_makes_a_damaged_memory_verify_as_sound(
     with Store.open(path) as store:
         assert store.verify() != []
         if refused:
-            assert len(store._database.execute("SELECT * FROM edits").fetchall()) == 1
+            assert len(store.connection._database.execute("SELECT * FROM edits").fetchall()) == 1
 
 
 @pytest.mark.parametrize("damage", ["a place of a chunk", "a surface"])
@@ -167,7 +167,7 @@ def test_a_damaged_memory_of_an_older_schema_is_not_signed_anew(tmp_path: Path) 
     report = repair(path)
     assert report.rebuilt and report.damage and report.lost == {}
     with Store.open(path) as store:
-        assert store.verify() == [] and store.instance(2).confidence != 0.123
+        assert store.verify() == [] and store.instances.get(2).confidence != 0.123
 
 
 # ------------------------------------------------------------------------------------------- replacing and the log
@@ -192,7 +192,7 @@ def test_what_a_reader_kept_in_the_log_is_told_and_folded_in(
     path, copy = make_memory(), tmp_path / "copy" / "room.l3r"
     writer = Store.open(path, writable=True)
     with Store.open(path) as reader, reader.snapshot():
-        reader.instances()
+        reader.instances.all()
         edits.label(writer, 2, "mug")
         writer.close()
     copy.parent.mkdir()
@@ -203,4 +203,4 @@ def test_what_a_reader_kept_in_the_log_is_told_and_folded_in(
     assert run(["repair", str(path)]) == 0
     assert not Path(f"{path}-wal").exists()
     with Store.open(path) as store:
-        assert store.instance(2).label == "mug" and store.beside() is None
+        assert store.instances.get(2).label == "mug" and store.beside() is None

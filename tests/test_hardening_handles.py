@@ -13,7 +13,6 @@ import pytest
 import list3r
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.maintenance import edits
-from list3r.memory.store.connection import Connection
 from list3r.memory.store.lock import lock_path
 from list3r.memory.store.store import Store
 from tests.test_safety import program
@@ -23,7 +22,7 @@ Make = Callable[..., Path]
 
 def test_a_writer_that_is_dropped_lets_go(make_memory: Make, tmp_path: Path) -> None:
     path = make_memory()
-    store: Connection | None = Store.open(path, writable=True)
+    store: Store | None = Store.open(path, writable=True)
     assert store is not None and lock_path(path).exists()
     del store
     gc.collect()
@@ -38,7 +37,7 @@ def test_a_forked_child_neither_uses_nor_ends_what_it_inherits(make_memory: Make
         child = os.fork()
         if child == 0:
             refused = 0
-            for use in (lambda: store.instances(), lambda: edits.label(store, 3, "plate")):
+            for use in (lambda: store.instances.all(), lambda: edits.label(store, 3, "plate")):
                 try:
                     use()
                 except MemoryFileError:
@@ -50,7 +49,7 @@ def test_a_forked_child_neither_uses_nor_ends_what_it_inherits(make_memory: Make
             Store.open(path, writable=True)
         edits.label(store, 4, "cup")
     with Store.open(path) as store:
-        assert (store.instance(2).label, store.instance(4).label, store.verify()) == ("mug", "cup", [])
+        assert (store.instances.get(2).label, store.instances.get(4).label, store.verify()) == ("mug", "cup", [])
 
 
 def test_what_is_closed_says_so(make_memory: Make) -> None:
@@ -58,7 +57,13 @@ def test_what_is_closed_says_so(make_memory: Make) -> None:
         with list3r.open(make_memory(f"{writable}.l3r"), writable=writable) as scene:
             store = scene.store
         store.close()
-        for use in (scene.instances, store.verify, lambda: scene.label(2, "mug"), store.sessions, scene.store.next_id):
+        for use in (
+            scene.instances,
+            store.verify,
+            lambda: scene.label(2, "mug"),
+            store.sessions.all,
+            scene.store.ids.next,
+        ):
             with pytest.raises(MemoryFileError, match=r"closed|for reading"):
                 use()
 
@@ -67,7 +72,7 @@ def test_a_reader_that_is_stopped_is_named(make_memory: Make, monkeypatch: pytes
     monkeypatch.setattr("list3r.memory.store.file._READERS_WAIT_S", 0.2)
     path = make_memory()
     text = f"from list3r.memory.store.store import Store; store = Store.open({str(path)!r})"
-    reader = program(text + "; held = store.snapshot(); held.__enter__(); store.instances()")
+    reader = program(text + "; held = store.snapshot(); held.__enter__(); store.instances.all()")
     os.kill(reader.pid, signal.SIGSTOP)
     with pytest.raises(MemoryFileError, match=rf"being read by process {reader.pid} \(is it stopped"):
         Store.open(path, writable=True)

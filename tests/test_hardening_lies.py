@@ -46,7 +46,7 @@ def rich(tmp_path: Path) -> Path:
     with Store.create(path) as store:
         with store.transaction():
             write_small_room(store)
-            store.add_edges(
+            store.edges.add(
                 [Edge(1, 1, "loop", Sim3.identity(), 0.5, 0.5, 9, 0.01, True, "seen again", {"s_det": 0.5}, (0, 3))]
             )
         edits.label(store, 2, "mug")
@@ -82,13 +82,13 @@ def test_a_lie_is_one_line_that_names_table_and_row(
     assert run(["verify", str(rich)]) == 1
     assert told in capsys.readouterr().out
     with pytest.raises(MemoryFileError, match="repair"), Store.open(rich) as store:
-        store.instances()
-        store.relations()
-        store.chunks()
-        store.frames()
-        store.aliases()
-        store.get_value("gravity")
-        store.edges()
+        store.instances.all()
+        store.relations.all()
+        store.chunks.all()
+        store.frames.all()
+        store.ids.aliases()
+        assert store.facts.gravity
+        store.edges.all()
 
 
 def test_a_label_that_is_no_text_is_mended(lies: ModuleType, rich: Path) -> None:
@@ -97,7 +97,7 @@ def test_a_label_that_is_no_text_is_mended(lies: ModuleType, rich: Path) -> None
         lies._sign(database)
     assert repair(rich).rebuilt
     with Store.open(rich) as store:
-        assert store.verify() == [] and 2 in {i.id for i in store.instances()}
+        assert store.verify() == [] and 2 in {i.id for i in store.instances.all()}
 
 
 def test_there_is_a_rule_for_every_column_of_what_questions_read(rich: Path) -> None:
@@ -113,6 +113,6 @@ def test_there_is_a_rule_for_every_column_of_what_questions_read(rich: Path) -> 
 def test_many_aliases_are_followed_at_once(make_memory: Make) -> None:
     path = make_memory()
     with Store.open(path, writable=True) as store, store.transaction():
-        store.add_aliases({n: n + 1 for n in range(1000, 31_000)} | {31_000: 2})
+        store.ids.add_aliases({n: n + 1 for n in range(1000, 31_000)} | {31_000: 2})
     with Store.open(path) as store:
-        assert len(store.aliases_of(2)) == 30_001
+        assert len(store.ids.aliases_of(2)) == 30_001

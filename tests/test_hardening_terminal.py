@@ -41,11 +41,11 @@ COMMANDS = [
 def evil_memory(path: Path) -> Path:
     with Store.create(path) as store, store.transaction():
         write_small_room(store)
-        store._database.execute("UPDATE instances SET label = ?, description = ?", (EVIL, EVIL))
-        store._database.execute("UPDATE sessions SET source = ?", (EVIL,))
-        store._database.execute("UPDATE relations SET predicate = predicate || ? WHERE subject = 4", (EVIL,))
-        store.add_log_entry(1, MergeDecision("merge", EVIL, EVIL, {}, EVIL))
-        store.add_edges([Edge(1, 1, "loop", Sim3.identity(), 0.5, 0.0, 0, 0.0, False, EVIL, {}, None)])
+        store.connection._database.execute("UPDATE instances SET label = ?, description = ?", (EVIL, EVIL))
+        store.connection._database.execute("UPDATE sessions SET source = ?", (EVIL,))
+        store.connection._database.execute("UPDATE relations SET predicate = predicate || ? WHERE subject = 4", (EVIL,))
+        store.merges.add(1, MergeDecision("merge", EVIL, EVIL, {}, EVIL))
+        store.edges.add([Edge(1, 1, "loop", Sim3.identity(), 0.5, 0.0, 0, 0.0, False, EVIL, {}, None)])
     return path
 
 
@@ -116,7 +116,7 @@ def test_output_that_cannot_be_written_is_said_where_it_can(stream: str, state: 
     if told.returncode:
         assert "cannot be written" in told.stderr and "is done" in told.stderr
     with Store.open(path) as store:
-        assert store.instance(2).label == "mug"
+        assert store.instances.get(2).label == "mug"
 
 
 def test_links_that_lead_to_themselves_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,8 +54,8 @@ def store(tmp_path: Path) -> Store:
     made = Store.create(tmp_path / "many.l3r")
     rng = np.random.default_rng(5)
     with made.transaction():
-        made.put_instances(boxes(rng))
-        made.put_embeddings(SPACE, range(1, COUNT + 1), rng.normal(size=(COUNT, 32)).astype(np.float32))
+        made.instances.put(boxes(rng))
+        made.embeddings.put(SPACE, range(1, COUNT + 1), rng.normal(size=(COUNT, 32)).astype(np.float32))
     return made
 
 
@@ -76,7 +76,7 @@ def test_nearest_to_a_point_is_that_of_a_scan(store: Store, options: dict[str, o
     rng = np.random.default_rng(1)
     k, limit = int(options.get("k", 5)), options.get("max_distance")  # type: ignore[call-overload]
     filters = {n: v for n, v in options.items() if n not in ("k", "max_distance")}
-    everything = Filters(**filters).select(store.instances())  # type: ignore[arg-type]
+    everything = Filters(**filters).select(store.instances.all())  # type: ignore[arg-type]
     for point in rng.normal(size=(25, 3)) * [60, 6, 3]:
         scan = sorted((distance_to_point(store, i, point), i.id) for i in everything)
         scan = [s for s in scan if limit is None or s[0] <= limit][:k]  # type: ignore[operator]
@@ -85,8 +85,8 @@ def test_nearest_to_a_point_is_that_of_a_scan(store: Store, options: dict[str, o
 
 
 def test_nearest_to_an_instance_is_that_of_a_scan(store: Store) -> None:
-    things = [i for i in store.instances(structure=False) if i.state != "removed"]
-    for origin in store.instances()[::17]:
+    things = [i for i in store.instances.all(structure=False) if i.state != "removed"]
+    for origin in store.instances.all()[::17]:
         scan = sorted(
             (distance_between(store, i, origin), i.id)
             for i in things
@@ -100,13 +100,13 @@ def test_within_finds_what_a_scan_finds(store: Store) -> None:
     rng = np.random.default_rng(2)
     for center in rng.normal(size=(20, 3)) * [4, 4, 1]:
         found = {m.instance.id for m in within(store, center=center, radius=0.8)}
-        things = store.instances(structure=False)
+        things = store.instances.all(structure=False)
         inside = {i.id for i in things if (np.linalg.norm(surface_points(store, i)[0] - center, axis=1) <= 0.8).any()}
         assert found == inside
 
 
 def cosine(store: Store, query: np.ndarray) -> dict[int, float]:
-    ids, rows = store.embeddings(SPACE)
+    ids, rows = store.embeddings.all(SPACE)
     values = rows @ query / np.linalg.norm(rows, axis=1) / np.linalg.norm(query)
     return dict(zip(ids.tolist(), values.tolist(), strict=True))
 
@@ -132,15 +132,15 @@ def test_similar_follows_what_is_written(store: Store, exact: int, monkeypatch: 
     agrees()
     built = VectorIndex.of(store, SPACE)
     with store.transaction():
-        store.put_embeddings(SPACE, range(1, 40), rng.normal(size=(39, 32)).astype(np.float32))
-        store.put_instances(boxes(rng, 5, COUNT + 1))
-        store.put_embeddings(SPACE, range(COUNT + 1, COUNT + 6), asked[:5])
-        store.drop_instance(60, None)
+        store.embeddings.put(SPACE, range(1, 40), rng.normal(size=(39, 32)).astype(np.float32))
+        store.instances.put(boxes(rng, 5, COUNT + 1))
+        store.embeddings.put(SPACE, range(COUNT + 1, COUNT + 6), asked[:5])
+        store.instances.drop(60, None)
     agrees()
     assert VectorIndex.of(store, SPACE) is built, "a few changes do not build the index anew"
     assert similar(store, vector=asked[0], space=SPACE, k=1)[0].instance.id == COUNT + 1
     with pytest.raises(RuntimeError, match="no"), store.transaction():
-        store.put_embeddings(SPACE, [70], asked[:1] * 2)
+        store.embeddings.put(SPACE, [70], asked[:1] * 2)
         raise RuntimeError("no")
     agrees()
 
@@ -150,7 +150,7 @@ def test_a_reader_sees_what_another_process_wrote(store: Store) -> None:
         query = np.ones(32, np.float32)
         similar(reader, vector=query, space=SPACE, k=1)
         with store.transaction():
-            store.put_embeddings(SPACE, [9], query[None])
+            store.embeddings.put(SPACE, [9], query[None])
         assert similar(reader, vector=query, space=SPACE, k=1)[0].instance.id == 9
     store.close()
 
@@ -161,7 +161,7 @@ def test_filters_that_few_pass_are_served_in_full(store: Store, monkeypatch: pyt
     query = np.random.default_rng(4).normal(size=32)
     found = similar(store, vector=query, space=SPACE, k=6, state="removed", structure=True)
     known = cosine(store, query)
-    removed = [i.id for i in store.instances() if i.state == "removed"]
+    removed = [i.id for i in store.instances.all() if i.state == "removed"]
     assert [m.instance.id for m in found] == sorted(removed, key=lambda n: -known[n])[:6]
 
 
@@ -183,7 +183,7 @@ def test_cells_are_kept_and_followed_by_what_changes(
     assert answers() == brute(store, query, 9)
     assert kept.read_bytes() == first, "nothing new, nothing kept anew"
     with store.transaction():
-        store.put_embeddings(SPACE, [7, 8], np.stack([query, -query]))
+        store.embeddings.put(SPACE, [7, 8], np.stack([query, -query]))
     assert answers()[0] == 7 and answers() == brute(store, query, 9)
     for spoiled in (b"", first[:-100], first[: len(first) // 2] + bytes([1, 2, 3]) + first[len(first) // 2 + 3 :]):
         kept.write_bytes(spoiled)

@@ -21,12 +21,12 @@ def placed(
 ) -> list[Sim3]:
     with Store.create(path) as store:
         with store.transaction():
-            store.set_value("scale_kind", "relative")
-            session = store.add_session("simulation", "", {}, 400)
+            store.facts.scale_kind = "relative"
+            session = store.sessions.add("simulation", "", {}, 400)
         for chunk in chunks:
             mapping.add_chunk(store, session, chunk, model, settings, library=False)
         mapping.finish_session(store, session, settings, library=False)
-        rows = store.chunks()
+        rows = store.chunks.all()
         assert len({c.component for c in rows}) == 1
         assert all(c.covariance is not None for c in rows)
         return [c.S_world_chunk for c in rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +19,7 @@ from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.records import Session
+from list3r.memory.store.store import Store
 from list3r.models.device import Gpu
 from list3r.pipeline import choice
 from list3r.pipeline.choice import settings_asked
@@ -74,13 +75,13 @@ def test_pictures_become_a_memory(name: str, upstream: None, pictures: Path, tmp
     neural_scenes.weights(name, tmp_path / "weights", neural_scenes.film())
     assert run(arguments(tmp_path, name, "--chunk", "8", "--overlap", "4", "--json")) == 0
     with list3r.open(tmp_path / "m.l3r") as scene:
-        chunks = scene.store.chunks()
+        chunks = scene.store.chunks.all()
         assert len(chunks) == 2 and all(c.scale_kind == "relative" for c in chunks)
         assert len({c.component for c in chunks}) == 1
-        assert scene.store.get_value("scale_kind") == "relative"
-        said = scene.store.sessions()[0].settings
+        assert scene.store.facts.scale_kind == "relative"
+        said = scene.store.sessions.all()[0].settings
         assert said["weights"] == str((tmp_path / "weights").resolve())
-        assert len(scene.store.instances(structure=False)) >= 2
+        assert len(scene.store.instances.all(structure=False)) >= 2
     check_trajectory(tmp_path / "m.l3r")
 
 
@@ -110,7 +111,7 @@ def test_geometry_written_in_one_place_is_built_in_another(
     assert run([*build, "--weights", str(tmp_path / "files")]) == 0
     assert (tmp_path / "files" / "chunk-0000.npz").stat().st_mtime_ns == before
     with list3r.open(tmp_path / "m.l3r") as scene:
-        assert len(scene.store.chunks()) == 2, "cut as the files are"
+        assert len(scene.store.chunks.all()) == 2, "cut as the files are"
     assert run([*out[:-4], "--chunk", "6", "--overlap", "3"]) == 2
     assert "holds files of another model or other chunks" in capsys.readouterr().err
 
@@ -171,20 +172,20 @@ def test_windows_of_two_places_are_made_by_the_chunks_own_network(
     settings = BuildSettings(reconstruction="pi3", device="cpu", weights=str(weights))
     task = ChunkTask(str(pictures), SourceOptions(), ChunkSpan(0, 0, 12), settings)
 
-    class Sessions:
-        def __init__(self, source: Path) -> None:
-            self._source = source
+    def store_of(source: Path) -> Store:
+        opened = stack.enter_context(Store.create(tmp_path / f"{source.name}.l3r"))
+        with opened.transaction():
+            opened.sessions.add(str(source), "", {}, 12)
+        return opened
 
-        def sessions(self) -> list[Session]:
-            return [Session(1, str(self._source), "", {}, 12, "complete")]
-
-    joint = RgbdJointReconstructor(Sessions(pictures), {1: SourceOptions()}, joint_model(task))
+    joint = RgbdJointReconstructor({1: str(pictures)}, {1: SourceOptions()}, joint_model(task))
     made = joint(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
     assert made is not None and made.scale_kind == "relative"
-    with OrderedPool(process_parts, 1) as pool:
-        there = joint_windows(Sessions(pictures), 1, task, pool)(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
+    with contextlib.ExitStack() as stack:
+        pool = stack.enter_context(OrderedPool(process_parts, 1))
+        there = joint_windows(store_of(pictures), 1, task, pool)(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
         with pytest.raises(SourceError):
-            joint_windows(Sessions(tmp_path / "gone"), 1, task, pool)(1, [0, 1], 1, [8, 9])
+            joint_windows(store_of(tmp_path / "gone"), 1, task, pool)(1, [0, 1], 1, [8, 9])
     assert there is not None
     for one, other in ((made.u, there.u), (made.v, there.v)):
         np.testing.assert_array_equal(one.camera_frames, other.camera_frames)
@@ -218,6 +219,6 @@ def test_every_part_can_be_a_network(
     assert run(arguments(tmp_path, "da3", *options, "--json")) == 0
     assert json.loads(capsys.readouterr().out)["posed"] == 12
     with list3r.open(tmp_path / "m.l3r") as scene:
-        said = scene.store.sessions()[0].settings
+        said = scene.store.sessions.all()[0].settings
         assert [said[part] for part in parts] == list(parts.values())
         assert [name for name, _ in said["instance_weights"]] == ["discovery/eomt", "features/dinov2", "tracking/sam2"]  # type: ignore[attr-defined]

@@ -322,9 +322,9 @@ def test_names_of_a_discoverer_become_labels(tmp_path: Path) -> None:
     once = replace(once, names=(("vase", 0.35),))
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
-            store.set_value("scale_kind", "metric")
-            store.set_value("poses", "given")
-            session = store.add_session("walk", "", {"poses": "given"}, 40)
+            store.facts.scale_kind = "metric"
+            store.facts.poses = "given"
+            session = store.sessions.add("walk", "", {"poses": "given"}, 40)
         add_chunk(store, session, chunk_result(0, 0, 40, (mug, once)))
-        labels = {i.label for i in store.instances(structure=False)}
+        labels = {i.label for i in store.instances.all(structure=False)}
     assert "cup" in labels and "vase" not in labels

@@ -105,8 +105,8 @@ def test_a_build_says_it_and_goes_on_as_it_began(
     assert run([*words, "--chunk", "10", "--overlap", "4", "--workers", "1", "--depth-every", "2"]) == 0
     assert "as asked: depth and things are from every 2nd frame" in capsys.readouterr().out
     with Store.open(Path(memory)) as store:
-        assert len(store.chunks()) == 2 and sum(f.state == "posed" for f in store.frames(1)) == 30
-        assert store.sessions()[0].settings["depth_every"] == 2
+        assert len(store.chunks.all()) == 2 and sum(f.state == "posed" for f in store.frames.all(1)) == 30
+        assert store.sessions.all()[0].settings["depth_every"] == 2
     assert run([*words, "--chunk", "10", "--overlap", "4", "--resume", "--depth-every", "3"]) == 2
     assert "depth_every" in capsys.readouterr().err
 

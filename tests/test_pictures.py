@@ -49,9 +49,9 @@ def test_the_picture_of_an_instance_has_its_mask_and_box(room: Path) -> None:
 def test_what_was_followed_in_no_keyframe_is_projected(tmp_path: Path) -> None:
     path = tmp_path / "room.l3r"
     with Store.create(path) as store, store.transaction():
-        chunk = store.add_chunk(store.add_session("walk", "a", {}, 20), chunk_result(0, 0, 20, (), small_picture()))
-        store.place_chunks({chunk: Sim3.identity()}, {chunk: chunk})
-        store.put_instances([instance(7, (1.2, 0.3, 0.3), (0.2, 0.2, 0.2), (9, 9, 9))])
+        chunk = store.chunks.add(store.sessions.add("walk", "a", {}, 20), chunk_result(0, 0, 20, (), small_picture()))
+        store.chunks.place({chunk: Sim3.identity()}, {chunk: chunk})
+        store.instances.put([instance(7, (1.2, 0.3, 0.3), (0.2, 0.2, 0.2), (9, 9, 9))])
     with list3r.open(path) as memory:
         found = memory.picture(7)
         assert found.mask is None and found.frame_index == 0

@@ -39,10 +39,10 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneMemory]:
     """300 things on a grid of 20 columns, one metre apart, named in six ways."""
     path = tmp_path_factory.mktemp("prompt") / "many.l3r"
     with Store.create(path) as store, store.transaction():
-        store.set_value("scale_kind", "metric")
-        store.set_value("gravity", "known")
+        store.facts.scale_kind = "metric"
+        store.facts.gravity = "known"
         names = ("mug", "box", "chair", "lamp", "book", "tasse à café")
-        store.put_instances(
+        store.instances.put(
             instance(n, (n % 20, n // 20, 0.5), (0.2, 0.3, 0.4), (9, 9, 9), description=names[n % 6], confidence=0.4)
             for n in range(1, 301)
         )
@@ -119,8 +119,8 @@ def test_a_question_brings_what_it_names_to_the_front(many: SceneMemory) -> None
 
 def test_a_memory_without_scale_or_up_says_so(tmp_path: Path) -> None:
     with Store.create(tmp_path / "m.l3r") as store, store.transaction():
-        store.set_value("scale_kind", "relative")
-        store.put_instances(
+        store.facts.scale_kind = "relative"
+        store.instances.put(
             [
                 instance(1, (0.0, 0.0, 0.0), (1, 1, 1), (9, 9, 9)),
                 instance(2, (9.0, 0, 0), (1, 1, 1), (9, 9, 9), component=2),
@@ -229,7 +229,7 @@ def test_the_command_writes_it(memory: SceneMemory, tmp_path: Path, capsys: pyte
 def test_things_that_are_gone_are_left_out(tmp_path: Path) -> None:
     with Store.create(tmp_path / "m.l3r") as store, store.transaction():
         here = instance(1, (0.0, 0.0, 0.0), (1, 1, 1), (9, 9, 9))
-        store.put_instances([here, replace(here, id=2, state="removed"), replace(here, id=3, state="moved")])
+        store.instances.put([here, replace(here, id=2, state="removed"), replace(here, id=3, state="moved")])
     with list3r.open(tmp_path / "m.l3r") as opened:
         prompt = opened.prompt()
     assert set(prompt.listed) == {1, 3} and "| moved" in prompt.text

@@ -46,7 +46,8 @@ def test_nearest_agrees_with_brute_force(store: Store) -> None:
     rng = np.random.default_rng(0)
     for point in rng.uniform([0, -2, 0], [4, 2, 2], (20, 3)):
         brute = {
-            i.id: float(np.linalg.norm(store.support(i.id).points - point, axis=1).min()) for i in store.instances()
+            i.id: float(np.linalg.norm(store.surfaces.of(i.id).points - point, axis=1).min())
+            for i in store.instances.all()
         }
         found = nearest(store, point=point, k=6, structure=True)
         assert len(found) == 6
@@ -57,7 +58,7 @@ def test_nearest_agrees_with_brute_force(store: Store) -> None:
 def test_nearest_to_an_instance_leaves_itself_out_and_takes_aliases(store: Store) -> None:
     assert ids(nearest(store, instance_id=MUG, k=2)) == [TABLE, TWIN]
     with store.transaction():
-        store.drop_instance(TWIN, alias_of=MUG)
+        store.instances.drop(TWIN, alias_of=MUG)
     assert ids(nearest(store, instance_id=TWIN, k=1)) == [TABLE]
 
 
@@ -96,10 +97,10 @@ def test_more_words_found_beat_fewer(store: Store) -> None:
     import dataclasses
 
     with store.transaction():
-        store.put_instances(
+        store.instances.put(
             [
-                dataclasses.replace(store.instance(MUG), label="mug", description="small white cylinder, 9 cm"),
-                dataclasses.replace(store.instance(TWIN), description="small red cylinder, 9 cm"),
+                dataclasses.replace(store.instances.get(MUG), label="mug", description="small white cylinder, 9 cm"),
+                dataclasses.replace(store.instances.get(TWIN), description="small red cylinder, 9 cm"),
             ]
         )
     assert ids(nearest(store, words="white mug")) == [MUG]
@@ -181,8 +182,8 @@ def test_relations_are_filtered_and_checked(store: Store) -> None:
 
 
 def test_similar_is_the_exact_cosine_order(store: Store) -> None:
-    space = store.embedding_spaces()[0]
-    known, vectors = store.embeddings(space)
+    space = store.embeddings.spaces()[0]
+    known, vectors = store.embeddings.all(space)
     cosine = vectors @ vectors[list(known).index(MUG)]
     expected = [int(known[n]) for n in np.argsort(-cosine, kind="stable") if known[n] in (TABLE, TWIN, CHAIR)]
     found = similar(store, instance_id=MUG, k=3)
@@ -204,7 +205,7 @@ def test_spaces_do_not_mix(store: Store) -> None:
     with pytest.raises(OptionError):
         similar(store, vector=np.zeros(16), space="test@1/16")
     with store.transaction():
-        store.put_embeddings("clip@2/4", [MUG], np.ones((1, 4), np.float32))
+        store.embeddings.put("clip@2/4", [MUG], np.ones((1, 4), np.float32))
     with pytest.raises(OptionError, match="several"):
         VectorIndex.of(store)
 
@@ -246,6 +247,6 @@ def test_a_stretch_goes_on_while_its_breaks_are_short(store: Store) -> None:
 def test_what_lives_in_another_part_is_not_near_a_thing(make_memory: Callable[..., Path]) -> None:
     with Store.open(make_memory(), writable=True) as apart:
         with apart.transaction():
-            apart.put_instances([instance(20, (2.0, 0.0, 0.8), (0.1,) * 3, (1, 1, 1), description="mug", component=2)])
+            apart.instances.put([instance(20, (2.0, 0.0, 0.8), (0.1,) * 3, (1, 1, 1), description="mug", component=2)])
         assert {m.instance.id for m in nearest(apart, instance_id=TABLE, words="mug")} == {MUG, TWIN}
         assert {m.instance.id for m in nearest(apart, point=(2.0, 0.0, 0.8), words="mug")} == {MUG, TWIN, 20}

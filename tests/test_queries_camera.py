@@ -63,13 +63,13 @@ def screened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     frames = np.arange(4)
     local = tuple(local_instance(k, box_points(c, s, 3000, k), (9, 9, 9), frames) for k, (c, s) in enumerate(things))
     with Store.create(tmp_path_factory.mktemp("screen") / "screen.l3r") as opened, opened.transaction():
-        session = opened.add_session("walk", "abc", {}, 4)
-        chunk = opened.add_chunk(session, chunk_result(0, 0, 4, local))
-        opened.put_instances(
+        session = opened.sessions.add("walk", "abc", {}, 4)
+        chunk = opened.chunks.add(session, chunk_result(0, 0, 4, local))
+        opened.instances.put(
             instance(k + 1, c, s, (9, 9, 9), component=chunk, structure="wall" if k == 0 else None)
             for k, (c, s) in enumerate(things)
         )
-        opened.set_observations(Observation(k + 1, chunk, k) for k in range(3))
+        opened.observations.set(Observation(k + 1, chunk, k) for k in range(3))
         yield opened
 
 

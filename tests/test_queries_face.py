@@ -74,7 +74,7 @@ def test_eight_threads_ask_one_memory_and_get_what_one_thread_gets(room: Path) -
 
 def test_a_memory_that_is_read_refuses_to_be_written(memory: SceneMemory) -> None:
     with pytest.raises(MemoryFileError, match=r"read-only|reading"), memory.store.transaction():
-        memory.store.set_value("gravity", "known")
+        memory.store.facts.gravity = "known"
 
 
 def test_tables_are_flat_and_alike(memory: SceneMemory) -> None:
@@ -108,10 +108,10 @@ def test_every_filter_filters(memory: SceneMemory) -> None:
 def test_what_moves_is_near_where_it_was_last(tmp_path: Path) -> None:
     with Store.create(tmp_path / "moving.l3r") as store, store.transaction():
         write_small_room(store)
-        mug = store.instance(MUG)
+        mug = store.instances.get(MUG)
         gone = mug.aabb + np.array([0.0, 1.5, 0.0])
         box = dataclasses.replace(mug.box, center=mug.box.center + np.array([0.0, 1.5, 0.0]))
-        store.put_instances([dataclasses.replace(mug, dynamic=True, aabb=gone, box=box, center=gone.mean(axis=0))])
+        store.instances.put([dataclasses.replace(mug, dynamic=True, aabb=gone, box=box, center=gone.mean(axis=0))])
         memory = SceneMemory(store)
         found = memory.nearest((1.8, 1.6, 0.77), k=1, dynamic=True)
         assert [m.instance.id for m in found] == [MUG] and (found[0].distance_m or 0.0) < 0.1
@@ -133,12 +133,12 @@ def test_a_camera_has_one_name(memory: SceneMemory) -> None:
 def test_an_answer_sees_one_state_of_the_file(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = Path(shutil.copy(room, tmp_path / "both.l3r"))
     with Store.open(path, writable=True) as writer, list3r.open(path) as memory:
-        boxes_in_box = memory.store.boxes_in_box
+        boxes_in_box = memory.store.instances.boxes_in_box
 
         def and_then_a_writer(*corners: object, **filters: object) -> object:
             found = boxes_in_box(*corners, **filters)  # type: ignore[arg-type]
             with writer.transaction():
-                writer.drop_instance(TWIN, None)
+                writer.instances.drop(TWIN, None)
             return found
 
         with monkeypatch.context() as patch:

@@ -24,16 +24,18 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """The small room: a white and a red mug on a table, a brown chair with a cushion's box beside it."""
     with Store.create(tmp_path_factory.mktemp("find") / "room.l3r") as opened, opened.transaction():
         write_small_room(opened)
-        mug, twin = opened.instance(MUG), opened.instance(TWIN)
-        opened.put_instances(
+        mug, twin = opened.instances.get(MUG), opened.instances.get(TWIN)
+        opened.instances.put(
             [
                 dataclasses.replace(mug, label="mug", description="small white cylinder, 10 cm", color_name="white"),
                 dataclasses.replace(twin, description="small dark red cylinder, 10 cm", color_name="dark red"),
-                dataclasses.replace(opened.instance(TABLE), description="large brown table, 1.2 m", color_name="brown"),
-                dataclasses.replace(opened.instance(CHAIR), label="office chair", color_name="brown"),
+                dataclasses.replace(
+                    opened.instances.get(TABLE), description="large brown table, 1.2 m", color_name="brown"
+                ),
+                dataclasses.replace(opened.instances.get(CHAIR), label="office chair", color_name="brown"),
             ]
         )
-        opened.replace_relations(
+        opened.relations.replace(
             [CHAIR], [Relation(CHAIR, "next_to", TABLE, 0.8, 0.1), Relation(TABLE, "next_to", CHAIR, 0.8, 0.1)]
         )
         yield opened
@@ -77,7 +79,7 @@ def ids(found: Found) -> list[int]:
 def test_what_a_text_means(store: Store, text: str, expected: list[int]) -> None:
     with_inverses = {"table with a mug", "table next to the chair and with a mug"}
     if text in with_inverses:
-        store.replace_relations([], [Relation(TABLE, "supports", MUG, 0.95, 0.02)])
+        store.relations.replace([], [Relation(TABLE, "supports", MUG, 0.95, 0.02)])
     assert sorted(ids(find(store, text, 9))) == expected
 
 
@@ -131,16 +133,16 @@ def test_numbers_that_are_no_ids_are_told(store: Store) -> None:
 
 
 def test_vertical_relations_are_unknown_without_gravity(store: Store) -> None:
-    held = store.relations()
-    store.replace_relations(None, [r for r in held if r.predicate == "next_to"])
-    store.set_value("gravity", "unknown")
+    held = store.relations.all()
+    store.relations.replace(None, [r for r in held if r.predicate == "next_to"])
+    store.facts.gravity = "unknown"
     try:
         found = find(store, "mug on table")
         assert found == [] and any("unknown" in n for n in found.notes)
         assert ids(find(store, "chair next to table")) == [CHAIR]
     finally:
-        store.set_value("gravity", "estimated")
-        store.replace_relations(None, held)
+        store.facts.gravity = "estimated"
+        store.relations.replace(None, held)
 
 
 class Letters:
@@ -157,7 +159,7 @@ def test_a_text_encoder_stands_in_where_no_thing_bears_a_word(store: Store) -> N
     encoder = Letters()
     assert find(store, "elbat", encoder=encoder) == []
     vectors = np.stack([encoder.encode("table"), encoder.encode("xyz")])
-    store.put_embeddings(encoder.space, [TABLE, MUG], vectors)
+    store.embeddings.put(encoder.space, [TABLE, MUG], vectors)
     found = find(store, "elbat", encoder=encoder)
     assert ids(found) == [TABLE] and "cosine 1.00" in found[0].reason
     assert ids(find(store, "mug", encoder=encoder)) == [MUG]

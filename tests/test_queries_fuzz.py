@@ -134,7 +134,7 @@ def test_relations_that_make_sense_are_the_stored_ones(memory: SceneMemory, **as
     ends = [None if x is None else named.get(x, {x}) for x in (asked["subject"], asked["object"])]
     expected = {
         (r.subject, r.predicate, r.object)
-        for r in memory.store.relations()
+        for r in memory.store.relations.all()
         if (ends[0] is None or r.subject in ends[0]) and (ends[1] is None or r.object in ends[1])
     }
     found = answers(lambda: memory.relations(**asked))

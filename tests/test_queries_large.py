@@ -45,11 +45,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     rng = np.random.default_rng(0)
     with Store.create(tmp_path_factory.mktemp("large") / "large.l3r") as made:
         with made.transaction():
-            made.set_value("gravity", "known")
-            made.put_instances(things(rng))
+            made.facts.gravity = "known"
+            made.instances.put(things(rng))
             pairs = rng.integers(1, COUNT + 1, (900, 2)).tolist()
             kinds = ("near", "on", "next_to")
-            made.replace_relations(
+            made.relations.replace(
                 None, [Relation(a, kinds[k % 3], b, 0.5 + k / 2000, 0.1) for k, (a, b) in enumerate(pairs) if a != b]
             )
         yield made
@@ -130,7 +130,7 @@ def test_a_camera_sees_what_it_saw(store: Store, depth: float | None, monkeypatc
         camera = PosedCamera(pose, (300.0, 300.0, 159.5, 119.5), (240, 320), 1, 1)
         found = plain(visible(store, camera, min_visible=0.0, max_depth=depth))
         with monkeypatch.context() as patch:
-            patch.setattr("list3r.queries.seen.in_front", lambda store, *_: store.instances())
+            patch.setattr("list3r.queries.seen.in_front", lambda store, *_: store.instances.all())
             assert plain(visible(store, camera, min_visible=0.0, max_depth=depth)) == found
         with monkeypatch.context() as patch:
             patch.setattr(visibility, "_MANY", 0)

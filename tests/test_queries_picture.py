@@ -29,7 +29,7 @@ def path(make_memory: Make) -> Path:
     with Store.open(made, writable=True) as store, store.transaction():
         for n, color in COLORS.items():
             points = rng.random((300, 3)).astype(np.float32)
-            store.put_embeddings(FEATURE_SPACE, [n], object_feature(points, noisy(color, 300), up, 1.0)[None])
+            store.embeddings.put(FEATURE_SPACE, [n], object_feature(points, noisy(color, 300), up, 1.0)[None])
     return made
 
 

@@ -70,14 +70,14 @@ def test_sides_are_inverse_and_turn_with_the_world(places: list[float], sizes: l
 
 def test_between_two_things(store: Store) -> None:
     with_box = instance(20, (2.0, 0.0, 0.77), (0.06, 0.06, 0.1), (1, 1, 1))
-    store.put_instances([with_box])
+    store.instances.put([with_box])
     try:
         found = relations(store, None, "between", MUG, other=TWIN)
         assert triples(found) == [(20, "between", MUG)] and vars(found[0])["other"] == TWIN
         assert relations(store, TABLE, "between", MUG, other=TWIN) == [], "it is under both"
         assert triples(relations(store, 20, "between", TWIN, other=MUG)) == [(20, "between", TWIN)]
     finally:
-        store.drop_instance(20, None)
+        store.instances.drop(20, None)
 
 
 def test_words_stand_for_things(store: Store) -> None:
@@ -87,9 +87,9 @@ def test_words_stand_for_things(store: Store) -> None:
 
 
 def test_what_needs_gravity_is_unknown_without_it(store: Store) -> None:
-    held = store.relations()
-    store.set_value("gravity", "unknown")
-    store.replace_relations(None, [r for r in held if r.predicate == "next_to"])
+    held = store.relations.all()
+    store.facts.gravity = "unknown"
+    store.relations.replace(None, [r for r in held if r.predicate == "next_to"])
     try:
         found = relations(store, predicate="on")
         assert found == [] and found.state == "unknown" and "gravity" in found.reason
@@ -98,8 +98,8 @@ def test_what_needs_gravity_is_unknown_without_it(store: Store) -> None:
         assert relations(store, MUG, "left_of", TWIN, viewpoint=CHAIR).state == "unknown"
         assert triples(relations(store, MUG, "left_of", TWIN, viewpoint="camera")) == [(MUG, "left_of", TWIN)]
     finally:
-        store.set_value("gravity", "estimated")
-        store.replace_relations(None, held)
+        store.facts.gravity = "estimated"
+        store.relations.replace(None, held)
 
 
 def test_parts_that_are_not_joined_have_no_sides(store: Store) -> None:
@@ -142,13 +142,13 @@ def test_ways_are_the_shortest_and_then_the_surest(store: Store) -> None:
 
 
 def test_ways_need_not_lead_over_the_floor(store: Store) -> None:
-    held = store.relations()
-    store.replace_relations(None, [Relation(TABLE, "on", FLOOR, 0.9, 0.1), Relation(CHAIR, "on", FLOOR, 0.9, 0.1)])
+    held = store.relations.all()
+    store.relations.replace(None, [Relation(TABLE, "on", FLOOR, 0.9, 0.1), Relation(CHAIR, "on", FLOOR, 0.9, 0.1)])
     try:
         assert len(path(store, TABLE, CHAIR)) == 2
         assert path(store, TABLE, CHAIR, structure=False) == []
     finally:
-        store.replace_relations(None, held)
+        store.relations.replace(None, held)
 
 
 def test_a_side_must_be_clear_of_half_of_the_larger_of_the_two() -> None:
@@ -173,7 +173,7 @@ def test_what_is_between_is_so_by_its_distance_from_all_bounds() -> None:
 
 def test_of_ways_equally_long_the_surest_is_taken(tmp_path: Path) -> None:
     with Store.create(tmp_path / "ways.l3r") as made, made.transaction():
-        made.put_instances(instance(n, (n, 0, 0), (0.1, 0.1, 0.1), (1, 1, 1)) for n in range(1, 5))
+        made.instances.put(instance(n, (n, 0, 0), (0.1, 0.1, 0.1), (1, 1, 1)) for n in range(1, 5))
         sure = {(1, 2): 0.6, (2, 4): 0.6, (1, 3): 0.9, (3, 4): 0.9}
-        made.replace_relations(None, [Relation(s, "near", o, c, 0.1) for (s, o), c in sure.items()])
+        made.relations.replace(None, [Relation(s, "near", o, c, 0.1) for (s, o), c in sure.items()])
         assert [r.object for r in path(made, 1, 4)] == [3, 4]

@@ -70,8 +70,8 @@ def test_the_sessions_of_a_memory_say_how_they_were_made(tmp_path: Path) -> None
     path = tmp_path / "m.l3r"
     assert stored_sessions(path) == (None, None)
     with Store.create(path) as store, store.transaction():
-        store.complete_session(store.add_session("walk", "1", BEGUN.as_plain(), 100))
-        store.add_session("walk", "2", BuildSettings().as_plain(), 100)
+        store.sessions.complete(store.sessions.add("walk", "1", BEGUN.as_plain(), 100))
+        store.sessions.add("walk", "2", BuildSettings().as_plain(), 100)
     assert stored_sessions(path) == (BEGUN, BuildSettings())
 
 

@@ -56,7 +56,7 @@ def test_a_build_killed_before_its_first_chunk_can_be_opened_and_resumed(walk: P
     assert run("build", walk, "-m", memory, "--poses", "given", "--resume").returncode == 0
     assert [p.name for p in tmp_path.iterdir()] == ["killed.l3r"]
     with list3r.open(memory) as scene:
-        assert len(scene.store.camera_poses()) == 4
+        assert len(scene.store.trajectory.poses()) == 4
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])

@@ -25,7 +25,7 @@ from list3r.simulation.dataset import WalkSettings, write_walk
 
 Make = Callable[..., Path]
 FIXTURES = Path(__file__).parent / "fixtures"
-OLD = ["schema1.l3r", "schema2.l3r", "schema3.l3r", "schema6.l3r"]
+OLD = ["schema1.l3r", "schema2.l3r", "schema3.l3r", "schema6.l3r", "schema7.l3r"]
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +188,7 @@ def test_an_old_memory_is_migrated_where_it_lies_when_it_is_written(name: str, t
     path = tmp_path / name
     shutil.copy(FIXTURES / name, path)
     with Store.open(path, writable=True) as store:
-        assert store.verify() == [] and len(store.instances()) >= 3
+        assert store.verify() == [] and len(store.instances.all()) >= 3
     with sqlite3.connect(path) as database:
         assert database.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
     assert [p.name for p in tmp_path.iterdir()] == [name]
@@ -217,7 +217,7 @@ def test_the_lock_names_its_holder_and_ends_with_it(make_memory: Make, tmp_path:
     with pytest.raises(MemoryFileError, match=rf"process {holder.pid} on .*, since 20.*wait for it to end"):
         Store.open(path, writable=True)
     with Store.open(path) as reader:
-        assert len(reader.instances()) == 6
+        assert len(reader.instances.all()) == 6
     holder.kill()
     holder.communicate()
     with Store.open(path, writable=True) as store:
@@ -229,13 +229,13 @@ def test_a_reader_keeps_its_snapshot_when_the_same_process_opens_and_closes_the_
     path = make_memory()
     with Store.open(path, writable=True) as writer:
         with Store.open(path) as reader, reader.snapshot():
-            count = len(reader.instances())
+            count = len(reader.instances.all())
             Store.open(path).close()
             with writer.transaction():
-                writer.drop_instance(3, None)
-            assert len(reader.instances()) == count
-            assert 3 in {o.instance_id for o in reader.observations()}
-        assert len(writer.instances()) == count - 1
+                writer.instances.drop(3, None)
+            assert len(reader.instances.all()) == count
+            assert 3 in {o.instance_id for o in reader.observations.all()}
+        assert len(writer.instances.all()) == count - 1
 
 
 def test_a_memory_whose_writer_was_killed_amid_a_commit_is_read(make_memory: Make, tmp_path: Path) -> None:
@@ -252,4 +252,4 @@ def test_a_memory_whose_writer_was_killed_amid_a_commit_is_read(make_memory: Mak
         shutil.copy(f"{left}{end}", f"{killed}{end}")
     writer.close()
     with Store.open(killed) as store, Store.open(memory) as before:
-        assert store.verify() == [] and len(store.instances()) == len(before.instances())
+        assert store.verify() == [] and len(store.instances.all()) == len(before.instances.all())

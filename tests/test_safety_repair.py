@@ -71,9 +71,9 @@ def test_what_is_not_as_it_was_written_is_not_answered_with(
     monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 2**40 if whole else 0)
     monkeypatch.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
     for ask in (
-        lambda store: store.instances(),
-        lambda store: store.instance(3),
-        lambda store: store.instances_of([2, 3]),
+        lambda store: store.instances.all(),
+        lambda store: store.instances.get(3),
+        lambda store: store.instances.of([2, 3]),
     ):
         with Store.open(path) as store, pytest.raises(MemoryFileError, match=r"instances 3: .*repair"):
             ask(store)
@@ -88,26 +88,35 @@ def test_large_memories_check_the_relations_and_surfaces_that_they_read(
     monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
     monkeypatch.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
     with Store.open(path) as store:
-        assert len(store.relations(3)) == 1 and len(store.surface_points(5)) == len(store.support(5).points) == 400
+        assert (
+            len(store.relations.all(3)) == 1
+            and len(store.surfaces.points(5)) == len(store.surfaces.of(5).points) == 400
+        )
     spoil(path, "UPDATE relations SET margin = 0.5 WHERE subject = 3")
     spoil(path, "UPDATE supports SET points = zeroblob(length(points)) WHERE local_id = 4")
     with Store.open(path) as store, pytest.raises(MemoryFileError, match="relations 3: the row is not"):
-        store.relations(3)
-    for ask in (lambda store: store.surface_points(5), lambda store: store.support(5)):
+        store.relations.all(3)
+    for ask in (lambda store: store.surfaces.points(5), lambda store: store.surfaces.of(5)):
         with Store.open(path) as store, pytest.raises(MemoryFileError, match="supports 1:4: the checksum"):
             ask(store)
     with Store.open(path) as store:
-        assert len(store.relations(4)) == 1
+        assert len(store.relations.all(4)) == 1
 
 
 @pytest.mark.parametrize(
     ("statement", "ask"),
     [
-        ("UPDATE relations SET object = 5 WHERE subject = 3", lambda store: store.relations(3)),
-        ("UPDATE instance_boxes SET max_x = max_x + 1 WHERE id = 3", lambda store: store.ids_in_box([0] * 3, [1] * 3)),
-        ("UPDATE embeddings SET vector = zeroblob(64) WHERE instance = 2", lambda store: store.embedding_spaces()),
-        ("UPDATE memory SET value = '\"known\"' WHERE key = 'gravity'", lambda store: store.get_value("gravity")),
-        ("UPDATE supports SET points = zeroblob(length(points)) WHERE local_id = 4", lambda store: store.support(2)),
+        ("UPDATE relations SET object = 5 WHERE subject = 3", lambda store: store.relations.all(3)),
+        (
+            "UPDATE instance_boxes SET max_x = max_x + 1 WHERE id = 3",
+            lambda store: store.instances.ids_in_box([0] * 3, [1] * 3),
+        ),
+        ("UPDATE embeddings SET vector = zeroblob(64) WHERE instance = 2", lambda store: store.embeddings.spaces()),
+        ("UPDATE memory SET value = '\"known\"' WHERE key = 'gravity'", lambda store: store.facts.gravity),
+        (
+            "UPDATE supports SET points = zeroblob(length(points)) WHERE local_id = 4",
+            lambda store: store.surfaces.of(2),
+        ),
     ],
 )
 def test_no_table_is_believed_unseen(statement: str, ask: Callable[[Store], object], make_memory: Make) -> None:
@@ -137,7 +146,7 @@ def test_what_is_derived_is_derived_anew(make_memory: Make) -> None:
     assert report.rebuilt and report.lost == {} and len(report.damage) >= 2
     with Store.open(path) as store:
         assert store.verify() == []
-        mug: Instance = store.instance(3)
+        mug: Instance = store.instances.get(3)
         assert np.allclose(mug.center, SMALL_ROOM[2][1], atol=0.02)
     assert report.original.name == "room.l3r.damaged"
     with Store.open(report.original) as store:
@@ -157,8 +166,8 @@ def test_what_was_measured_and_is_damaged_is_named(make_memory: Make) -> None:
     assert report.lost["frames"] == ["1:7"] and report.lost["instances"] == ["5"]
     with Store.open(path) as store:
         assert store.verify() == []
-        assert {i.id for i in store.instances()} == {1, 2, 3, 4, 6}
-        assert len(store.frames()) == 19
+        assert {i.id for i in store.instances.all()} == {1, 2, 3, 4, 6}
+        assert len(store.frames.all()) == 19
 
 
 def test_a_lost_chunk_takes_along_what_hung_on_it(tmp_path: Path) -> None:
@@ -169,20 +178,20 @@ def test_a_lost_chunk_takes_along_what_hung_on_it(tmp_path: Path) -> None:
     report = repair(path, tmp_path / "sound.l3r")
     assert report.lost["chunks"] == ["2"] and report.lost["edges"] and report.chunks == 1
     with Store.open(tmp_path / "sound.l3r") as store:
-        assert store.verify() == [] and [c.chunk_id for c in store.chunks()] == [1]
+        assert store.verify() == [] and [c.chunk_id for c in store.chunks.all()] == [1]
 
 
 def test_a_chunk_whose_place_is_lost_is_placed_by_its_relations(tmp_path: Path) -> None:
     path = tmp_path / "old.l3r"
     shutil.copy(FIXTURES / "schema2.l3r", path)
     with Store.open(path, writable=True) as store:
-        (edge,) = [e for e in store.edges() if e.accepted]
+        (edge,) = [e for e in store.edges.all() if e.accepted]
     spoil(path, "UPDATE placements SET S_world_chunk = zeroblob(104) WHERE chunk_id = 2")
     report = repair(path, tmp_path / "sound.l3r")
     assert report.lost["placements"] == ["2"] and report.rebuilt and (edge.u, edge.v) == (1, 2)
     with Store.open(tmp_path / "sound.l3r") as store:
         assert store.verify() == []
-        S_v_u = store.chunk(2).S_world_chunk.inverse() @ store.chunk(1).S_world_chunk
+        S_v_u = store.chunks.get(2).S_world_chunk.inverse() @ store.chunks.get(1).S_world_chunk
         assert np.allclose(S_v_u.as_matrix(), edge.S_v_u.as_matrix())
 
 
@@ -204,7 +213,7 @@ def test_a_lost_session_is_stood_in_for(make_memory: Make) -> None:
     spoil(path, "UPDATE sessions SET source = 'elsewhere'")
     assert repair(path).lost == {"sessions": ["1"]}
     with Store.open(path) as store:
-        assert store.sessions()[0].source == "unknown" and len(store.instances()) == len(SMALL_ROOM)
+        assert store.sessions.all()[0].source == "unknown" and len(store.instances.all()) == len(SMALL_ROOM)
 
 
 def test_the_command_says_what_is_lost(make_memory: Make, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,4 +233,4 @@ def test_what_cannot_be_understood_is_said_to_be_damage(make_memory: Make) -> No
     path = make_memory()
     spoil(path, "UPDATE sessions SET settings = '{'")
     with pytest.raises(MemoryFileError, match="repair"), Store.open(path) as store:
-        store.sessions()
+        store.sessions.all()

@@ -19,7 +19,6 @@ from list3r.cli.app import run
 from list3r.exporters.scene_json import write_scene_json
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance import edits
 from list3r.memory.records import ChunkResult, Instance
 from list3r.memory.store.store import Store
@@ -40,7 +39,7 @@ def two(chunks: list[ChunkResult], tmp_path_factory: pytest.TempPathFactory) -> 
     path = tmp_path_factory.mktemp("scale") / "two.l3r"
     with Store.create(path) as store:
         with store.transaction():
-            session = store.add_session("simulation", "", {}, 240)
+            session = store.sessions.add("simulation", "", {}, 240)
         for chunk in chunks[:2]:
             mapping.add_chunk(store, session, chunk)
     return path
@@ -53,13 +52,13 @@ def memory(two: Path, tmp_path: Path) -> Path:
 
 def middling(store: Store) -> Instance:
     """A thing of the middle size, seen in both chunks."""
-    found = [i for i in store.instances(structure=False) if len(store.observations(i.id)) == 2]
+    found = [i for i in store.instances.all(structure=False) if len(store.observations.of(i.id)) == 2]
     return sorted(found, key=lambda i: float(i.box.size.max()))[len(found) // 2]
 
 
 def test_a_memory_without_scale_says_so(memory: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with open_scene(memory) as scene:
-        assert scene.units == "unit" and scene.store.get_value("scale_kind") == "relative"
+        assert scene.units == "unit" and scene.store.facts.scale_kind == "relative"
         assert not any("cm" in i.description for i in scene.instances())
     assert run(["scale", str(memory)]) == 0 and "relative" in capsys.readouterr().out
     assert run(["query", "nearest", str(memory), "--point", "0,0,0", "--json"]) == 0
@@ -70,9 +69,9 @@ def test_a_memory_without_scale_says_so(memory: Path, capsys: pytest.CaptureFixt
 def test_an_anchored_thing_has_the_size_that_was_said(memory: Path, tmp_path: Path) -> None:
     with Store.open(memory, writable=True) as store:
         chosen = middling(store)
-        before = {i.id: i for i in store.instances()}
+        before = {i.id: i for i in store.instances.all()}
         report = edits.scale(store, f"{chosen.id}=25cm", "ann")
-        after = {i.id: i for i in store.instances()}
+        after = {i.id: i for i in store.instances.all()}
         assert after[chosen.id].box.size.max() == pytest.approx(0.25, rel=0.02)
         factor = 0.25 / float(chosen.box.size.max())
         kept = [n for n in before if n in after]
@@ -80,8 +79,8 @@ def test_an_anchored_thing_has_the_size_that_was_said(memory: Path, tmp_path: Pa
         np.testing.assert_allclose(
             [after[n].center for n in kept], [factor * before[n].center for n in kept], atol=0.1 * factor
         )
-        assert (store.get_value("scale_kind"), report.kind) == ("anchored", "scale")
-        assert "ann" in str(store.get_value("scale_source")) and "25cm" in report.text
+        assert (store.facts.scale_kind, report.kind) == ("anchored", "scale")
+        assert "ann" in str(store.facts.scale_source) and "25cm" in report.text
         assert not store.verify()
         write_scene_json(store, tmp_path / "s.json")
     frame = json.loads((tmp_path / "s.json").read_text())["frame"]
@@ -94,41 +93,41 @@ def test_an_anchor_holds_when_later_chunks_come(memory: Path, chunks: list[Chunk
     with Store.open(memory, writable=True) as store:
         chosen = middling(store)
         edits.scale(store, f"{chosen.id}=0.25m", "ann")
-        scale = [float(c.S_world_chunk.scale) for c in store.chunks()]
+        scale = [float(c.S_world_chunk.scale) for c in store.chunks.all()]
         mapping.add_chunk(store, 1, chunks[2])
         mapping.finish_session(store, 1)
-        rows = store.chunks()
-        assert store.get_value("scale_kind") == "anchored" and len(rows) == 3
+        rows = store.chunks.all()
+        assert store.facts.scale_kind == "anchored" and len(rows) == 3
         assert float(rows[0].S_world_chunk.scale) == pytest.approx(scale[0], rel=1e-9)
-        assert store.instance(store.resolve(chosen.id)).box.size.max() == pytest.approx(0.25, rel=0.1)
+        assert store.instances.get(store.ids.resolve(chosen.id)).box.size.max() == pytest.approx(0.25, rel=0.1)
         assert not store.verify()
 
 
 def test_undo_takes_an_anchor_back_and_undo_again_brings_it(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         chosen = middling(store)
-        placed = [c.S_world_chunk for c in store.chunks()]
+        placed = [c.S_world_chunk for c in store.chunks.all()]
         first = edits.scale(store, f"{chosen.id}=0.25m", "ann")
         second = edits.scale(store, "0,0,0:1,0,0=3m", "bob")
-        assert store.instance(chosen.id).box.size.max() == pytest.approx(0.75, rel=0.02)
+        assert store.instances.get(chosen.id).box.size.max() == pytest.approx(0.75, rel=0.02)
         edits.undo(store, second.entry)
-        assert store.instance(chosen.id).box.size.max() == pytest.approx(0.25, rel=0.02)
+        assert store.instances.get(chosen.id).box.size.max() == pytest.approx(0.25, rel=0.02)
         taken = edits.undo(store, first.entry)
-        assert store.get_value("scale_kind") == "relative"
-        for before, now in zip(placed, store.chunks(), strict=True):
+        assert store.facts.scale_kind == "relative"
+        for before, now in zip(placed, store.chunks.all(), strict=True):
             np.testing.assert_allclose(now.S_world_chunk.as_matrix(), before.as_matrix(), atol=1e-9)
         edits.undo(store, taken.entry)
-        assert store.get_value("scale_kind") == "anchored"
-        assert store.instance(chosen.id).box.size.max() == pytest.approx(0.25, rel=0.02)
+        assert store.facts.scale_kind == "anchored"
+        assert store.instances.get(chosen.id).box.size.max() == pytest.approx(0.25, rel=0.02)
 
 
 def test_the_height_of_the_cameras(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         edits.scale(store, "camera_height=1.6m")
-        heights = [S.translation[2] for _, S in store.camera_poses()]
+        heights = [S.translation[2] for _, S in store.trajectory.poses()]
         assert np.median(heights) == pytest.approx(1.6, rel=1e-6)
         with store.transaction():
-            store.set_value("gravity", "unknown")
+            store.facts.gravity = "unknown"
         with pytest.raises(OptionError, match="floor"):
             edits.scale(store, "camera_height=1.6m")
         with pytest.raises(OptionError, match="up"):
@@ -146,11 +145,11 @@ def test_metric_memories_need_no_anchor(make_memory, capsys: pytest.CaptureFixtu
 def test_a_memory_that_gets_a_metric_chunk_is_metric(tmp_path: Path, chunks: list[ChunkResult]) -> None:
     with Store.create(tmp_path / "mixed.l3r") as store:
         with store.transaction():
-            session = store.add_session("simulation", "", {}, 240)
+            session = store.sessions.add("simulation", "", {}, 240)
         for chunk in (chunks[0], replace(chunks[1], scale_kind="metric")):
             mapping.add_chunk(store, session, chunk, library=False)
-        rows = store.chunks()
-        assert store.get_value("scale_kind") == "metric" and "1 of 2" in store.get_value("scale_source")
+        rows = store.chunks.all()
+        assert store.facts.scale_kind == "metric" and "1 of 2" in store.facts.scale_source
         assert float(rows[1].S_world_chunk.scale) == pytest.approx(1.0)
         assert float(rows[0].S_world_chunk.scale) != pytest.approx(1.0)
 
@@ -201,14 +200,14 @@ def test_anchors_that_cannot_be_measured(memory: Path) -> None:
         with pytest.raises(OptionError, match="no length"):
             edits.scale(store, "1,1,1:1,1,1=1m")
         with store.transaction():
-            rows = store.chunks()
-            store.place_chunks({c.chunk_id: c.S_world_chunk for c in rows}, {rows[0].chunk_id: 1, rows[1].chunk_id: 2})
-        assert store.get_value("scale_kind") == "relative" and not store.edits()
+            rows = store.chunks.all()
+            store.chunks.place({c.chunk_id: c.S_world_chunk for c in rows}, {rows[0].chunk_id: 1, rows[1].chunk_id: 2})
+        assert store.facts.scale_kind == "relative" and not store.edits.all()
 
 
 def test_python_face(memory: Path) -> None:
     with open_scene(memory, writable=True) as scene:
-        before = Sim3.from_matrix(scene.store.get_value("T_world_graph"))
+        before = scene.store.facts.S_world_graph
         scene.scale("0,0,0:0,0,2=1m", author="ann")
-        after = Sim3.from_matrix(scene.store.get_value("T_world_graph"))
+        after = scene.store.facts.S_world_graph
         assert float(after.scale) == pytest.approx(0.5 * float(before.scale))

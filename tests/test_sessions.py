@@ -11,11 +11,13 @@ import pytest
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import Instance
+from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
 
 TABLE = (0.0, 0.0, 0.75)
+IDS = Fact[dict[str, int]]("test ids", dict[str, int], {})
 
 
 def _changed() -> dict[str, Box]:
@@ -42,19 +44,19 @@ def memory(tmp_path: Path) -> Path:
             add_session(store, ROOM, poses)
             place_together(store)
             consolidate(store)
-        ids = {k: i.id for k, i in _named(store.instances()).items()}
+        ids = {k: i.id for k, i in _named(store.instances.all()).items()}
         with store.transaction():
             add_session(store, _changed(), cameras(TABLE, 1.0))
             place_together(store)
             consolidate(store)
-            store.set_value("test ids", ids)
+            store.facts[IDS] = ids
     return path
 
 
 def test_events_name_what_was_done(memory: Path) -> None:
     with Store.open(memory) as store:
-        ids, now = store.get_value("test ids"), _named(store.instances())
-        kinds = {e.instance_id: e.kind for e in store.events(2)}
+        ids, now = store.facts[IDS], _named(store.instances.all())
+        kinds = {e.instance_id: e.kind for e in store.events.all(2)}
         assert kinds[ids["red"]] == "seen_again"
         assert kinds[ids["table"]] == "seen_again"
         assert kinds[ids["blue"]] == "moved"
@@ -73,15 +75,15 @@ def test_events_name_what_was_done(memory: Path) -> None:
 
 def test_ids_are_kept_and_a_moved_thing_is_where_it_is_now(memory: Path) -> None:
     with Store.open(memory) as store:
-        ids, now = store.get_value("test ids"), _named(store.instances())
+        ids, now = store.facts[IDS], _named(store.instances.all())
         for name in ("table", "red", "blue", "green", "stool"):
             assert now[name].id == ids[name]
         np.testing.assert_allclose(now["blue"].center, [-0.1, 0.25, 0.80], atol=0.02)
         np.testing.assert_allclose(np.sort(now["blue"].box.size), [0.12, 0.12, 0.12], atol=0.03)
-        points = store.support(ids["blue"]).points
+        points = store.surfaces.of(ids["blue"]).points
         assert len(points)
         assert np.linalg.norm(points - now["blue"].center, axis=1).max() < 0.2
-        assert not [r for r in store.relations() if ids["green"] in (r.subject, r.object)]
+        assert not [r for r in store.relations.all() if ids["green"] in (r.subject, r.object)]
         assert store.verify() == []
 
 
@@ -92,7 +94,7 @@ def test_the_world_as_it_was(memory: Path) -> None:
         assert {i.state for i in then.values()} == {"present"}
         np.testing.assert_allclose(then["blue"].center, [0.5, 0.2, 0.80], atol=0.02)
         now = {i.id: i for i in world_at(store, 2)}
-        for instance in store.instances():
+        for instance in store.instances.all():
             assert now[instance.id].state == instance.state
             np.testing.assert_array_equal(now[instance.id].center, instance.center)
 
@@ -114,7 +116,7 @@ def test_the_same_room_again_shows_no_change(tmp_path: Path) -> None:
             add_session(store, ROOM, cameras(TABLE, 2.2))
             place_together(store)
             consolidate(store)
-        assert {e.kind for e in store.events()} == {"seen_again"}
+        assert {e.kind for e in store.events.all()} == {"seen_again"}
 
 
 def test_a_session_in_a_world_of_its_own_changes_nothing(tmp_path: Path) -> None:
@@ -123,22 +125,22 @@ def test_a_session_in_a_world_of_its_own_changes_nothing(tmp_path: Path) -> None
             add_session(store, ROOM, cameras(TABLE, 0.4))
             add_session(store, _changed(), cameras(TABLE, 2.2))
             consolidate(store)
-        assert store.events() == []
-        assert {i.state for i in store.instances()} == {"present"}
-        assert len({i.component for i in store.instances()}) == 2
+        assert store.events.all() == []
+        assert {i.state for i in store.instances.all()} == {"present"}
+        assert len({i.component for i in store.instances.all()}) == 2
 
 
 def test_what_came_back_is_seen_again_under_its_id(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
-        ids = store.get_value("test ids")
+        ids = store.facts[IDS]
         with store.transaction():
             add_session(store, ROOM, cameras(TABLE, 1.2))
             place_together(store)
             consolidate(store)
-        kinds = {e.instance_id: e.kind for e in store.events(3)}
+        kinds = {e.instance_id: e.kind for e in store.events.all(3)}
         assert kinds[ids["green"]] == "seen_again"
         assert kinds[ids["blue"]] == "moved"
-        now = _named(store.instances())
+        now = _named(store.instances.all())
         np.testing.assert_allclose(now["blue"].center, [0.5, 0.2, 0.80], atol=0.02)
         assert now["purple"].state == "removed"
         np.testing.assert_allclose(_named(world_at(store, 2))["blue"].center, [-0.1, 0.25, 0.80], atol=0.02)

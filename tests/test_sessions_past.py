@@ -38,7 +38,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
             with store.transaction():
                 add_session(store, room, cameras(TABLE, start))
                 place_together(store)
-                store.set_value("gravity", "known")
+                store.facts.gravity = "known"
                 consolidate(store)
     return path
 
@@ -49,7 +49,7 @@ def ids(memory: Path) -> dict[str, int]:
     with Store.open(memory) as store:
         return {
             min(rooms, key=lambda k: float(np.abs(np.subtract(rooms[k].rgb, i.color_rgb)).sum())): i.id
-            for i in store.instances()
+            for i in store.instances.all()
         }
 
 
@@ -77,26 +77,26 @@ def test_every_question_can_be_about_the_world_as_it_was(past: Store, ids: dict[
     assert first.instance.id == ids["blue"]
     assert first.distance_m is not None
     assert first.distance_m < 0.1
-    np.testing.assert_allclose(past.support(ids["blue"]).points.mean(axis=0), ROOM["blue"].center, atol=0.06)
-    assert [s.session_id for s in past.sessions()] == [1]
-    assert {o.chunk_id for o in past.observations()} == {1}
-    assert past.events() == []
-    assert past.world_bounds() is not None
+    np.testing.assert_allclose(past.surfaces.of(ids["blue"]).points.mean(axis=0), ROOM["blue"].center, atol=0.06)
+    assert [s.session_id for s in past.sessions.all()] == [1]
+    assert {o.chunk_id for o in past.observations.all()} == {1}
+    assert past.events.all() == []
+    assert past.instances.bounds() is not None
 
 
 def test_relations_then_are_those_of_then(memory: Path, past: Store, ids: dict[str, int]) -> None:
-    assert [r for r in past.relations(ids["green"], "on", ids["table"])]
-    assert [r for r in past.relations(ids["blue"], "on", ids["table"])]
-    assert not [r for r in past.relations() if ids["purple"] in (r.subject, r.object)]
+    assert [r for r in past.relations.all(ids["green"], "on", ids["table"])]
+    assert [r for r in past.relations.all(ids["blue"], "on", ids["table"])]
+    assert not [r for r in past.relations.all() if ids["purple"] in (r.subject, r.object)]
     with Store.open(memory) as store:
-        assert not [r for r in store.relations() if ids["green"] in (r.subject, r.object)]
+        assert not [r for r in store.relations.all() if ids["green"] in (r.subject, r.object)]
 
 
 def test_the_past_cannot_be_written_and_the_file_stays_as_it_is(memory: Path, ids: dict[str, int]) -> None:
     before = memory.read_bytes()
     with Store.open(memory) as store:
         with store_at(store, 1) as then, pytest.raises(Exception, match="read"), then.transaction():
-            then.set_value("x", 1)
+            then.facts.created_by = "x"
         assert store.verify() == []
         with pytest.raises(OptionError, match="no session 7"):
             store_at(store, 7)
@@ -107,9 +107,9 @@ def test_the_past_cannot_be_written_and_the_file_stays_as_it_is(memory: Path, id
 
 def test_the_last_session_is_the_world_of_today(memory: Path) -> None:
     with Store.open(memory) as store, store_at(store, 2) as now:
-        assert [i.id for i in now.instances()] == [i.id for i in store.instances()]
-        assert now.relations() == store.relations()
-        assert len(now.events()) == len(store.events())
+        assert [i.id for i in now.instances.all()] == [i.id for i in store.instances.all()]
+        assert now.relations.all() == store.relations.all()
+        assert len(now.events.all()) == len(store.events.all())
 
 
 @pytest.mark.parametrize(

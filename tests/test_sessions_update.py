@@ -67,20 +67,20 @@ def interrupt(path: Path, walk: Path) -> None:
 
 def test_the_second_session_lies_in_the_world_of_the_first(two: Path, one: Path) -> None:
     with Store.open(two) as store, Store.open(one) as before:
-        assert {c.component for c in store.chunks()} == {store.chunks()[0].component}
-        first, was = store.chunks()[0].S_world_chunk, before.chunks()[0].S_world_chunk
+        assert {c.component for c in store.chunks.all()} == {store.chunks.all()[0].component}
+        first, was = store.chunks.all()[0].S_world_chunk, before.chunks.all()[0].S_world_chunk
         np.testing.assert_allclose(first.as_matrix(), was.as_matrix(), atol=0.02)
         assert ties(store, 2)
-        assert [s.state for s in store.sessions()] == ["complete", "complete"]
+        assert [s.state for s in store.sessions.all()] == ["complete", "complete"]
         assert store.verify() == []
 
 
 def test_ids_of_the_first_session_live_on_and_nothing_is_said_to_have_changed(two: Path, one: Path) -> None:
     with Store.open(two) as store, Store.open(one) as before:
-        for instance in before.instances(structure=False):
-            store.resolve(instance.id)
-        assert [e for e in store.events(2) if e.kind in ("removed", "moved")] == []
-        assert any(e.kind == "seen_again" for e in store.events(2))
+        for instance in before.instances.all(structure=False):
+            store.ids.resolve(instance.id)
+        assert [e for e in store.events.all(2) if e.kind in ("removed", "moved")] == []
+        assert any(e.kind == "seen_again" for e in store.events.all(2))
 
 
 def test_a_video_that_is_in_the_memory_already_is_refused(two: Path, walks: tuple[Path, Path]) -> None:
@@ -93,7 +93,7 @@ def test_an_interrupted_build_or_update_is_finished_first(tmp_path: Path, walks:
     path = tmp_path / "begun.l3r"
     info = open_source(walks[0]).info
     with Store.create(path) as store, store.transaction():
-        store.add_session(str(walks[0]), info.fingerprint, {}, 44)
+        store.sessions.add(str(walks[0]), info.fingerprint, {}, 44)
     with pytest.raises(OptionError, match="holds no video yet"):
         update(path, walks[1], settings=SETTINGS)
 
@@ -117,8 +117,8 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
 
     interrupt(path, walks[1])
     with Store.open(path) as store, Store.open(one) as before:
-        assert [i.id for i in store.instances()] == [i.id for i in before.instances()]
-        assert store.events() == []
+        assert [i.id for i in store.instances.all()] == [i.id for i in before.instances.all()]
+        assert store.events.all() == []
     with pytest.raises(OptionError, match="--resume"):
         update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1))
     report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1, resume=True))
@@ -126,8 +126,10 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
     again = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1, resume=True))
     assert again.events == report.events and again.session == report.session
     with Store.open(path) as store, Store.open(two) as whole:
-        assert [(e.instance_id, e.kind) for e in store.events()] == [(e.instance_id, e.kind) for e in whole.events()]
-        assert [i.id for i in store.instances()] == [i.id for i in whole.instances()]
+        assert [(e.instance_id, e.kind) for e in store.events.all()] == [
+            (e.instance_id, e.kind) for e in whole.events.all()
+        ]
+        assert [i.id for i in store.instances.all()] == [i.id for i in whole.instances.all()]
         assert store.verify() == []
 
 
@@ -137,13 +139,13 @@ def test_an_interrupted_update_can_be_given_up(one: Path, walks: tuple[Path, Pat
 
     interrupt(path, walks[1])
     with Store.open(path) as store:
-        assert len(store.sessions()) == 2 and store.chunks(2)
+        assert len(store.sessions.all()) == 2 and store.chunks.all(2)
     with pytest.raises(OptionError, match="give it up with --force"):
         update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1))
     report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1, force=True))
     assert report.resumed_chunks == 0 and report.session == 2
     with Store.open(path) as store:
-        assert len(store.sessions()) == 2 and store.verify() == []
+        assert len(store.sessions.all()) == 2 and store.verify() == []
 
 
 def test_a_video_in_which_no_camera_is_placed_leaves_the_memory_as_it_was(one: Path, tmp_path: Path) -> None:
@@ -162,10 +164,12 @@ def test_a_video_in_which_no_camera_is_placed_leaves_the_memory_as_it_was(one: P
         )
     assert run(["update", str(path), str(black), "--intrinsics", "130,130,80,60"]) == 2
     with Store.open(path) as store, Store.open(one) as before:
-        assert [s.session_id for s in store.sessions()] == [1] and store.verify() == []
-        assert len(store.chunks()) == len(before.chunks()) and len(store.frames()) == len(before.frames())
-        assert [(i.id, i.center.tolist()) for i in store.instances()] == [
-            (i.id, i.center.tolist()) for i in before.instances()
+        assert [s.session_id for s in store.sessions.all()] == [1] and store.verify() == []
+        assert len(store.chunks.all()) == len(before.chunks.all()) and len(store.frames.all()) == len(
+            before.frames.all()
+        )
+        assert [(i.id, i.center.tolist()) for i in store.instances.all()] == [
+            (i.id, i.center.tolist()) for i in before.instances.all()
         ]
 
 
@@ -179,5 +183,5 @@ def test_a_session_whose_poses_are_given_is_placed_in_the_world_of_the_first(
     assert report.placed == report.chunks
     assert report.posed == report.frames
     with Store.open(path) as store:
-        assert {c.component for c in store.chunks()} == {store.chunks()[0].component}
-        assert [e for e in store.events(2) if e.kind in ("removed", "moved")] == []
+        assert {c.component for c in store.chunks.all()} == {store.chunks.all()[0].component}
+        assert [e for e in store.events.all(2) if e.kind in ("removed", "moved")] == []

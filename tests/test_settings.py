@@ -77,16 +77,16 @@ def test_a_memory_is_derived_by_the_settings_of_its_first_session(tmp_path: Path
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
             for number, settings in enumerate((first, BuildSettings())):
-                store.complete_session(store.add_session("walk", str(number), settings.as_plain(), 3))
+                store.sessions.complete(store.sessions.add("walk", str(number), settings.as_plain(), 3))
         assert settings_of(store, None).whole_chunks == 3
-        assert [session_settings(s) for s in store.sessions()] == [first, BuildSettings()]
+        assert [session_settings(s) for s in store.sessions.all()] == [first, BuildSettings()]
 
 
 def test_settings_that_cannot_be_read_are_one_line(tmp_path: Path) -> None:
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
-            store.add_session("walk", "", {"association": {"solved_whole": "all"}}, 3)
+            store.sessions.add("walk", "", {"association": {"solved_whole": "all"}}, 3)
         with pytest.raises(MemoryFileError, match="'all' is no int"):
             stored_settings(store, AssociationSettings, "association")
         with pytest.raises(MemoryFileError, match="session 1"):
-            session_settings(store.sessions()[0])
+            session_settings(store.sessions.all()[0])

@@ -22,15 +22,15 @@ def shift(x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Sim3:
 def place(store: Store, poses: dict[int, Sim3], T_world_graph: Sim3 | None = None) -> None:
     with store.transaction():
         if T_world_graph is not None:
-            store.set_value("T_world_graph", T_world_graph.as_matrix().tolist())
-        store.place_chunks(poses, {k: 1 for k in poses})
+            store.facts.S_world_graph = T_world_graph
+        store.chunks.place(poses, {k: 1 for k in poses})
         consolidate(store)
 
 
 def settled(store: Store) -> dict[int, Sim3]:
     with store.transaction():
         settle(store, chunk_summaries(store))
-        return {k: row.S_graph_chunk for k, row in store.settled().items()}
+        return {k: row.S_graph_chunk for k, row in store.library.settled.all().items()}
 
 
 @pytest.fixture
@@ -56,10 +56,10 @@ def test_many_small_moves_do_not_add_up(store: Store) -> None:
 
 
 def test_boxes_follow_the_chunks_to_the_last_digit(store: Store) -> None:
-    before = {i.id: i for i in store.instances()}
+    before = {i.id: i for i in store.instances.all()}
     place(store, {1: shift(0.002, 0.001), 2: shift(0.002, 0.001)})
-    assert {i.id for i in store.instances()} == set(before)
-    for i in store.instances():
+    assert {i.id for i in store.instances.all()} == set(before)
+    for i in store.instances.all():
         for now, then in ((i.center, before[i.id].center), (i.box.center, before[i.id].box.center)):
             assert np.allclose(now - then, [0.002, 0.001, 0.0], atol=1e-9)
         assert np.allclose(i.aabb - before[i.id].aabb, [0.002, 0.001, 0.0], atol=1e-9)

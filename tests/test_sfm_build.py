@@ -53,11 +53,11 @@ def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path)
     assert report.posed == COUNT and report.components == 1 and report.chunks == 2
     assert any("estimated from the pictures" in line for line in report.notes)
     with Store.open(memory) as store:
-        assert store.get_value("scale_kind") == "relative" and store.get_value("scale_source") == "none"
-        assert store.sessions()[0].settings["reconstruction"] == "sfm"
-        first, second = store.chunks()
+        assert store.facts.scale_kind == "relative" and store.facts.scale_source == "none"
+        assert store.sessions.all()[0].settings["reconstruction"] == "sfm"
+        first, second = store.chunks.all()
         assert first.intrinsics == second.intrinsics and abs(first.intrinsics[0] / CAMERA.fx - 1) < 0.1
-        found = np.stack([S.translation for _, S in store.camera_poses()])
+        found = np.stack([S.translation for _, S in store.trajectory.poses()])
     truth = np.stack([pose(k)[:3, 3] for k in range(COUNT)])
     S = umeyama(found, truth, with_scale=True)
     assert np.sqrt((np.linalg.norm(S.apply(found) - truth, axis=1) ** 2).mean()) < 0.02

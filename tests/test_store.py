@@ -21,15 +21,15 @@ Make = Callable[..., Path]
 
 def test_a_memory_reads_back_what_was_written(make_memory: Make) -> None:
     with Store.open(make_memory()) as store:
-        assert [i.description for i in store.instances()] == [row[0] for row in SMALL_ROOM]
-        assert [i.id for i in store.instances(structure=False)] == [2, 3, 4, 5]
-        mug = store.instance(3)
+        assert [i.description for i in store.instances.all()] == [row[0] for row in SMALL_ROOM]
+        assert [i.id for i in store.instances.all(structure=False)] == [2, 3, 4, 5]
+        mug = store.instances.get(3)
         assert np.allclose(mug.center, SMALL_ROOM[2][1])
         assert mug.color_rgb == (240, 240, 240)
         assert mug.best_view is not None and mug.best_view.box_xyxy == (10, 20, 30, 30)
-        assert store.sessions()[0].state == "complete"
-        assert store.get_value("gravity") == "estimated"
-        assert [(r.subject, r.object) for r in store.relations(predicate="on")] == [(2, 1), (3, 2), (4, 2)]
+        assert store.sessions.all()[0].state == "complete"
+        assert store.facts.gravity == "estimated"
+        assert [(r.subject, r.object) for r in store.relations.all(predicate="on")] == [(2, 1), (3, 2), (4, 2)]
 
 
 def test_one_file_is_left_after_closing(make_memory: Make, tmp_path: Path) -> None:
@@ -39,42 +39,42 @@ def test_one_file_is_left_after_closing(make_memory: Make, tmp_path: Path) -> No
 
 def test_supports_come_back_to_half_a_quantisation_step_and_move_with_their_chunk(make_memory: Make) -> None:
     with Store.open(make_memory(), writable=True) as store:
-        before = store.support(2)
+        before = store.surfaces.of(2)
         lower, upper = before.points.min(axis=0), before.points.max(axis=0)
         assert np.allclose((lower + upper) / 2, SMALL_ROOM[1][1], atol=0.02)
-        chunk = store.chunks()[0].chunk_id
+        chunk = store.chunks.all()[0].chunk_id
         moved = Sim3.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.0])
         with store.transaction():
-            store.place_chunks({chunk: moved}, {chunk: chunk})
-        assert np.allclose(store.support(2).points, moved.apply(before.points), atol=1e-5)
+            store.chunks.place({chunk: moved}, {chunk: chunk})
+        assert np.allclose(store.surfaces.of(2).points, moved.apply(before.points), atol=1e-5)
 
 
 def test_a_broken_transaction_leaves_nothing(make_memory: Make) -> None:
     path = make_memory()
     with Store.open(path, writable=True) as store:
         with pytest.raises(RuntimeError), store.transaction():
-            store.drop_instance(3, None)
+            store.instances.drop(3, None)
             raise RuntimeError
-        assert len(store.instances()) == len(SMALL_ROOM)
+        assert len(store.instances.all()) == len(SMALL_ROOM)
 
 
 def test_an_alias_resolves_for_ever(make_memory: Make) -> None:
     with Store.open(make_memory(), writable=True) as store:
         with store.transaction():
-            store.drop_instance(4, alias_of=3)
-            store.drop_instance(3, alias_of=2)
-        assert store.resolve(4) == 2
-        assert store.instance(4).id == 2
+            store.instances.drop(4, alias_of=3)
+            store.instances.drop(3, alias_of=2)
+        assert store.ids.resolve(4) == 2
+        assert store.instances.get(4).id == 2
         with pytest.raises(UnknownIdError, match="no instance 99"):
-            store.resolve(99)
-        assert store.next_id() == len(SMALL_ROOM) + 1
+            store.ids.resolve(99)
+        assert store.ids.next() == len(SMALL_ROOM) + 1
 
 
 def test_the_later_chunk_places_the_second_half_of_the_shared_frames(make_memory: Make) -> None:
     with Store.open(make_memory(), writable=True) as store:
         with store.transaction():
-            second = store.add_chunk(1, chunk_result(1, 10, 20, ()))
-        owners = {f.frame_index: f.chunk_id for f in store.frames()}
+            second = store.chunks.add(1, chunk_result(1, 10, 20, ()))
+        owners = {f.frame_index: f.chunk_id for f in store.frames.all()}
         assert [k for k, v in owners.items() if v == second] == list(range(15, 30))
 
 
@@ -83,8 +83,8 @@ def test_frames_that_one_chunk_lost_are_placed_by_the_other(make_memory: Make) -
     result.posed[:8] = False
     with Store.open(make_memory(), writable=True) as store:
         with store.transaction():
-            store.add_chunk(1, result)
-        frames = store.frames()
+            store.chunks.add(1, result)
+        frames = store.frames.all()
         assert all(f.state == "posed" for f in frames)
         assert frames[17].chunk_id == 1
 
@@ -95,30 +95,30 @@ def test_edges_decisions_links_and_vectors_round_trip(make_memory: Make) -> None
     )
     with Store.open(make_memory(), writable=True) as store:
         with store.transaction():
-            store.add_chunk(
+            store.chunks.add(
                 1, chunk_result(1, 10, 20, (local_instance(0, np.ones((5, 3), np.float32), (1, 2, 3), np.arange(3)),))
             )
-            store.add_edges([edge])
-            store.log_decisions(2, [MergeDecision("merge", "1:0", "2:0", {"iou": 0.5}, "overlap")])
-            store.set_observations([Observation(2, 2, 0)])
-        back = store.edges()[0]
+            store.edges.add([edge])
+            store.merges.add_all(2, [MergeDecision("merge", "1:0", "2:0", {"iou": 0.5}, "overlap")])
+            store.observations.set([Observation(2, 2, 0)])
+        back = store.edges.all()[0]
         assert np.array_equal(back.S_v_u.as_matrix(), edge.S_v_u.as_matrix())
         assert (back.reason, back.scores, back.frames, back.accepted) == (edge.reason, edge.scores, edge.frames, True)
-        assert store.decisions()[0].scores == {"iou": 0.5}
-        assert [(o.chunk_id, o.local_id) for o in store.observations(2)] == [(1, 1), (2, 0)]
-        keys, descriptors = store.keyframe_descriptors()
+        assert store.merges.decisions()[0].scores == {"iou": 0.5}
+        assert [(o.chunk_id, o.local_id) for o in store.observations.of(2)] == [(1, 1), (2, 0)]
+        keys, descriptors = store.keyframes.descriptors()
         assert keys.tolist() == [[1, 0], [2, 10]]
         assert descriptors.shape == (2, 8)
-        assert store.keyframes(1)[0].camera_small == (8.0, 8.0, 4.0, 3.0)
-        ids, vectors = store.embeddings("test@1/16")
+        assert store.keyframes.of(1)[0].camera_small == (8.0, 8.0, 4.0, 3.0)
+        ids, vectors = store.embeddings.all("test@1/16")
         assert len(ids) == len(vectors) == len(SMALL_ROOM)
-        assert store.mask_track(1, 0).image_size == (48, 64)
-        assert [n.local_id for n in store.local_nodes([1])] == list(range(len(SMALL_ROOM)))
+        assert store.local_instances.mask_track(1, 0).image_size == (48, 64)
+        assert [n.local_id for n in store.local_instances.nodes([1])] == list(range(len(SMALL_ROOM)))
 
 
 def test_the_rtree_finds_boxes(make_memory: Make) -> None:
     with Store.open(make_memory()) as store:
-        assert store.ids_in_box([1.7, 0.0, 0.7], [1.9, 0.2, 0.9]) == [2, 3]
+        assert store.instances.ids_in_box([1.7, 0.0, 0.7], [1.9, 0.2, 0.9]) == [2, 3]
 
 
 def test_verify_finds_a_flipped_byte_and_a_dangling_row(make_memory: Make) -> None:
@@ -165,9 +165,9 @@ def test_a_second_writer_is_refused_and_a_reader_sees_whole_transactions(make_me
             Store.open(path, writable=True)
         with Store.open(path) as reader:
             with writer.transaction():
-                writer.drop_instance(3, None)
-                assert len(reader.instances()) == len(SMALL_ROOM)
-            assert len(reader.instances()) == len(SMALL_ROOM) - 1
+                writer.instances.drop(3, None)
+                assert len(reader.instances.all()) == len(SMALL_ROOM)
+            assert len(reader.instances.all()) == len(SMALL_ROOM) - 1
 
 
 def test_the_index_of_words_follows_labels_and_descriptions(make_memory: Make) -> None:
@@ -178,18 +178,18 @@ def test_the_index_of_words_follows_labels_and_descriptions(make_memory: Make) -
             return {n for (n,) in database.execute("SELECT instance FROM words WHERE word = ?", (word,))}
 
     with Store.open(path, writable=True) as store:
-        first = store.instances()[2]
+        first = store.instances.all()[2]
         with store.transaction():
-            store.set_labels({first.id: "teapot"})
+            store.instances.set_labels({first.id: "teapot"})
         assert bearing("teapot") == {first.id}
         with store.transaction():
-            store.put_instances([replace(first, label="kettle", description="green sphere, 9 cm")])
+            store.instances.put([replace(first, label="kettle", description="green sphere, 9 cm")])
         assert (bearing("teapot"), bearing("kettle"), bearing("sphere")) == (set(), {first.id}, {first.id})
         with pytest.raises(RuntimeError), store.transaction():
-            store.set_labels({first.id: "teapot"})
+            store.instances.set_labels({first.id: "teapot"})
             raise RuntimeError
         with store.transaction():
-            store.drop_instance(first.id, None)
+            store.instances.drop(first.id, None)
         assert bearing("kettle") == bearing("sphere") == bearing("teapot") == set()
         assert not any("words" in text for text in store.verify())
     with sqlite3.connect(path) as database:

@@ -80,7 +80,7 @@ def test_embedding_a_memory_lets_free_words_find(memory: Path, weights: dict[str
     with Store.open(memory) as store:
         words = stored_words(store)
         assert words is not None and words.space == report.space
-        ids, vectors = store.embeddings(report.space)
+        ids, vectors = store.embeddings.all(report.space)
         assert len(ids) == report.instances
         np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=1e-4)
 

@@ -139,7 +139,7 @@ def test_known_geometry_becomes_a_memory(
     assert json.loads(printed.out)["posed"] == 12, "packages print; standard output is for results"
     assert "warn" not in printed.err.lower()
     with list3r.open(tmp_path / "m.l3r") as scene:
-        chunks = scene.store.chunks()
+        chunks = scene.store.chunks.all()
         assert len(chunks) == 2 and len({c.component for c in chunks}) == 1
         assert all(c.scale_kind == "relative" for c in chunks)
     check_trajectory(tmp_path / "m.l3r")

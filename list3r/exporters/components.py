@@ -34,10 +34,10 @@ class Component:
 
 def read_components(store: Store) -> list[Component]:
     """Return the components of a memory, the main one first; an empty memory has one empty component."""
-    chunks = store.chunks()
+    chunks = store.chunks.all()
     component_of = {c.chunk_id: c.component for c in chunks}
-    poses = store.camera_poses()
-    instances = store.instances()
+    poses = store.trajectory.poses()
+    instances = store.instances.all()
     counts = dict.fromkeys([*component_of.values(), *(i.component for i in instances)], 0)
     for frame, _ in poses:
         counts[component_of[frame.chunk_id]] += 1
@@ -56,7 +56,7 @@ def read_components(store: Store) -> list[Component]:
 
 def thinned_support(store: Store, instance: Instance, limit: int | None) -> Support:
     """Return the surface points in the world, at most `limit` of them, finite; the same ones every time."""
-    support = store.support(instance.id)
+    support = store.surfaces.of(instance.id)
     keep = np.flatnonzero(np.isfinite(support.points).all(axis=1))
     if limit is not None and len(keep) > limit:
         keep = np.sort(np.random.default_rng(instance.id).choice(keep, limit, replace=False))

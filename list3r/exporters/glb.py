@@ -109,7 +109,7 @@ def _facts(instance: Instance) -> dict[str, Any]:
 def _scene_facts(store: Store, component: Component) -> dict[str, Any]:
     return {
         "list3r_units": units(store),
-        "list3r_metric": store.get_value("scale_kind", "relative"),
-        "list3r_gravity": store.get_value("gravity", "unknown"),
+        "list3r_metric": (store.facts.scale_kind or "relative"),
+        "list3r_gravity": store.facts.gravity,
         "list3r_component": component.id,
     }

@@ -68,4 +68,4 @@ def part_path(path: Path, name: str) -> Path:
 
 def units(store: Store) -> str:
     """Return the unit of length: "m" for a metric or anchored memory, "unit" for a relative one (arbitrary scale)."""
-    return "m" if store.get_value("scale_kind", "relative") in ("metric", "anchored") else "unit"
+    return "m" if store.facts.scale_kind in ("metric", "anchored") else "unit"

@@ -83,7 +83,7 @@ def _vertices(store: Store, component: Component, settings: PlySettings) -> NDAr
 
 
 def _header(store: Store, component: Component, count: int) -> str:
-    scale, gravity = store.get_value("scale_kind", "relative"), store.get_value("gravity", "unknown")
+    scale, gravity = (store.facts.scale_kind or "relative"), store.facts.gravity
     lines = [
         "ply",
         "format binary_little_endian 1.0",

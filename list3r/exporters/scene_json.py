@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from list3r.exporters.components import Component, frames_per_second, has_box, read_components
 from list3r.exporters.output import replacing, units
 from list3r.memory.geometry import quat_wxyz_from_rotation
-from list3r.memory.library.labels import detected_labels, label_source
+from list3r.memory.library.labels import label_source
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store.store import Store
 
@@ -45,33 +45,33 @@ def scene_dict(store: Store) -> dict[str, Any]:
     instances of different `component` are not comparable.
     """
     components = read_components(store)
-    gravity = store.get_value("gravity", "unknown")
+    gravity = store.facts.gravity
     decimals = _length_decimals(store, components)
     instances = sorted((i for c in components for i in c.instances), key=lambda i: i.id)
     known = {i.id for i in instances}
-    detected = detected_labels(store)
-    relations = [r for r in store.relations() if r.subject in known and r.object in known]
+    detected = store.detected_labels.all()
+    relations = [r for r in store.relations.all() if r.subject in known and r.object in known]
     return {
         "format": FORMAT,
         "version": VERSION,
         "frame": {
             "up": None if gravity == "unknown" else [0, 0, 1],
             "units": units(store),
-            "metric": store.get_value("scale_kind", "relative"),
-            "metric_source": store.get_value("scale_source"),
+            "metric": (store.facts.scale_kind or "relative"),
+            "metric_source": store.facts.scale_source,
             "gravity": gravity,
         },
         "sessions": _sessions(store),
         "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
         "instances": [
             {
-                **instance_entry(i, decimals, store.track(i.id) if i.dynamic else None),
+                **instance_entry(i, decimals, store.tracks.of(i.id) if i.dynamic else None),
                 **label_source(i, detected.get(i.id)),
             }
             for i in instances
         ],
         "relations": [_relation(r, decimals) for r in relations],
-        "aliases": [{"id": k, "instance": v} for k, v in store.aliases().items()],
+        "aliases": [{"id": k, "instance": v} for k, v in store.ids.aliases().items()],
     }
 
 
@@ -163,10 +163,10 @@ def _component(component: Component, count: int) -> dict[str, Any]:
 
 def _sessions(store: Store) -> list[dict[str, Any]]:
     found = []
-    for session in store.sessions():
-        frames = store.frames(session.session_id)
+    for session in store.sessions.all():
+        frames = store.frames.all(session.session_id)
         states = [f.state for f in frames]
-        cameras = dict.fromkeys((*c.intrinsics, *c.image_size) for c in store.chunks(session.session_id))
+        cameras = dict.fromkeys((*c.intrinsics, *c.image_size) for c in store.chunks.all(session.session_id))
         rate = frames_per_second(frames)
         found.append(
             {

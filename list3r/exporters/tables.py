@@ -61,9 +61,9 @@ def records_of(store: Store, table: Table = "instances") -> list[dict[str, Value
 def rows_of(store: Store, table: Table) -> Iterator[Sequence[Value]]:
     """Yield the rows of a table as tuples in the order of `COLUMNS`."""
     if table == "instances":
-        return map(_instance, store.instances())
+        return map(_instance, store.instances.all())
     if table == "relations":
-        return ((r.subject, r.predicate, r.object, float(r.confidence), float(r.margin)) for r in store.relations())
+        return ((r.subject, r.predicate, r.object, float(r.confidence), float(r.margin)) for r in store.relations.all())
     return _frames(store)
 
 
@@ -96,8 +96,8 @@ def _instance(i: Instance) -> tuple[Value, ...]:
 
 
 def _frames(store: Store) -> Iterator[tuple[Value, ...]]:
-    poses = {(f.session_id, f.frame_index): S for f, S in store.camera_poses()}
-    for f in store.frames():
+    poses = {(f.session_id, f.frame_index): S for f, S in store.trajectory.poses()}
+    for f in store.frames.all():
         S = poses.get((f.session_id, f.frame_index))
         place = [None] * 3 if S is None else S.translation.tolist()
         turn = [None] * 4 if S is None else quat_wxyz_from_rotation(S.rotation).tolist()

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox, Sim3
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A note on an array's type hint: its lengths, -1 for one that is open."""
+
+    sizes: tuple[int, ...]
+
+
+Covariance = Annotated[NDArray[np.float64], Shape((7, 7))]
+Pose = Annotated[NDArray[np.float64], Shape((4, 4))]
+Plane = Annotated[NDArray[np.float64], Shape((4,))]
+Feature = Annotated[NDArray[np.float32], Shape((-1,))]
 
 # ---------------------------------------------------------------------------------------------- one chunk
 
@@ -61,13 +76,13 @@ class LocalInstance:
     local_id: int
     """Unique within the chunk, from 0."""
     track: MaskTrack
-    feature: NDArray[np.float32]
+    feature: Feature
     """Unit-length mean of the candidates' features (the paper's z). Shape (D,)."""
     support: Support
     """Chunk coordinates."""
     stability: float
     """Mean agreement of the propagated masks with the images, in [0, 1]."""
-    plane: NDArray[np.float64] | None = None
+    plane: Plane | None = None
     """Plane (n, d), n . p + d = 0 in chunk coordinates, n towards the cameras, if it is flat. Shape (4,)."""
     structure: bool = False
     """True for a large flat surface that bounds the room rather than standing in it, as far as the chunk can tell."""
@@ -97,7 +112,7 @@ class Keyframe:
     frame_index: int
     T_chunk_cam: NDArray[np.float64]
     """Pose of the colour camera. Shape (4, 4)."""
-    descriptor: NDArray[np.float32]
+    descriptor: Feature
     """Unit-length descriptor of the whole frame. Shape (D,)."""
     keypoints_xy: NDArray[np.float32]
     """Local features, px. Shape (N, 2)."""
@@ -197,6 +212,18 @@ class ChunkResult:
 
 
 @dataclass(frozen=True)
+class SessionCamera:
+    """The camera of a session whose source does not say all of it, as it was estimated."""
+
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy of pictures as stored, px."""
+    distortion: tuple[float, ...]
+    """OpenCV's coefficients."""
+    notes: tuple[str, ...] = ()
+    """What the user should know of it, one sentence each."""
+
+
+@dataclass(frozen=True)
 class Session:
     """One video that was added to the memory."""
 
@@ -207,6 +234,14 @@ class Session:
     frame_count: int
     state: str
     """building, complete."""
+    camera: SessionCamera | None = None
+    """As it was estimated; None where the source says it or nobody looked yet."""
+    cuts: tuple[int, ...] | None = None
+    """Positions before which the video jumps; None before anybody looked."""
+    depth_step: int | None = None
+    """From every how many frames depth is computed; None where that was not settled."""
+    lost_reasons: tuple[str, ...] = ()
+    """Why the camera could not be followed through chunks, one sentence each."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +259,7 @@ class ChunkRow:
     intrinsics: tuple[float, float, float, float]
     image_size: tuple[int, int]
     scale_kind: str
-    covariance: NDArray[np.float64] | None = None
+    covariance: Covariance | None = None
     """Of the tangent error x in S_true = S_world_chunk exp(x), x = (rho, omega, sigma), relative to the first chunk of
     the component; None where it is not known. Shape (7, 7)."""
 
@@ -253,7 +288,7 @@ class Edge:
     scores: dict[str, float] = field(default_factory=dict)
     frames: tuple[int, int] | None = None
     """Frame.index in u and in v of the pair that proposed a loop."""
-    covariance: NDArray[np.float64] | None = None
+    covariance: Covariance | None = None
     """Of the tangent error x in S_true = S_v_u exp(x), x = (rho, omega, sigma) in u's units; None where it is not
     known. Shape (7, 7)."""
 
@@ -269,8 +304,10 @@ class FrameRow:
     """The chunk whose geometry places it."""
     state: str
     """posed, lost (could not be followed), bad (could not be decoded)."""
-    T_chunk_cam: NDArray[np.float64]
+    T_chunk_cam: Pose
     """Shape (4, 4), NaN unless posed."""
+    note: str = ""
+    """Why it could not be decoded."""
 
 
 @dataclass(frozen=True)
@@ -360,6 +397,48 @@ class ChangeEvent:
     """In [0, 1]."""
     reason: str
     """Why, one sentence."""
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What was seen of a local instance, or of several together."""
+
+    missed: float
+    """Log odds that every class loses for all frames that looked; a class has them back for those that found it."""
+    classes: Mapping[str, tuple[float, float]]
+    """By class: in how many pictures it was found (weighted), and the log odds that they add up to."""
+    looks: float = 0.0
+    """In how many pictures it was looked at (weighted); 0 where nobody counted."""
+
+    def __add__(self, other: Votes) -> Votes:
+        zero, classes = (0.0, 0.0), {}
+        for name in sorted({*self.classes, *other.classes}):
+            (a, b), (c, d) = self.classes.get(name, zero), other.classes.get(name, zero)
+            classes[name] = (a + c, b + d)
+        return Votes(self.missed + other.missed, classes, self.looks + other.looks)
+
+
+@dataclass(frozen=True)
+class DetectedLabel:
+    """A label and where it comes from."""
+
+    label: str
+    confidence: float
+    """Probability of the class, in [0, 1]."""
+    found: float
+    """Independent pictures in which it was found, weighted."""
+    detector: str
+    """Who found it, by name, with commas between several."""
+
+
+@dataclass(frozen=True)
+class UpEstimate:
+    """Which way is up, in the frame of the pose graph."""
+
+    up: NDArray[np.float64]
+    """Unit vector. Shape (3,)."""
+    floor_height: float | None
+    """Of the floor along it; None where none was seen."""
 
 
 @dataclass(frozen=True)

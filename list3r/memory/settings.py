@@ -40,7 +40,7 @@ def stored_settings(store: Store, kind: type[T], *path: str) -> T:
 
     What is derived from all sessions goes by those of the first. Raises `MemoryFileError`.
     """
-    sessions = store.sessions()
+    sessions = store.sessions.all()
     plain: object = sessions[0].settings if sessions else {}
     for name in path:
         plain = plain.get(name, {}) if isinstance(plain, Mapping) else plain

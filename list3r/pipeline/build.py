@@ -65,17 +65,17 @@ def build(
 
 def _session(store: Store, job: Job) -> int:
     """The session to write to: a new one, or the one that a build before left unfinished."""
-    sessions = store.sessions()
+    sessions = store.sessions.all()
     if sessions:
         return sessions[0].session_id
     info, settings = job.info, job.settings
     with store.transaction():
-        store.set_value("created_by", f"list3r {__version__}")
-        store.set_value("scale_kind", _scale_kind(info, settings))
-        store.set_value("scale_source", _scale_source(info, settings))
-        store.set_value("gravity", "unknown")
-        store.set_value("poses", settings.poses)
-        return store.add_session(
+        store.facts.created_by = f"list3r {__version__}"
+        store.facts.scale_kind = _scale_kind(info, settings)
+        store.facts.scale_source = _scale_source(info, settings)
+        store.facts.gravity = "unknown"
+        store.facts.poses = settings.poses
+        return store.sessions.add(
             str(Path(info.path).resolve()), info.fingerprint, settings.as_plain(), info.frame_count
         )
 
@@ -97,7 +97,7 @@ def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:
 
 def _check_posed(store: Store, info: SourceInfo, plan: Plan) -> None:
     """Raise `TrackingError` where the camera is placed in no frame."""
-    frames = store.frames(plan.session)
+    frames = store.frames.all(plan.session)
     if any(f.state == "posed" for f in frames):
         return
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import Camera, SourceInfo
+from list3r.frames.base import SourceInfo
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
+from list3r.memory.records import SessionCamera
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
@@ -34,13 +34,13 @@ def with_camera(
 
     It is estimated once: an interrupted session goes on with the same.
     """
-    known = store.get_value(camera_key(session))
+    before = store.sessions.get(session)
+    known = before.camera or estimated_camera(source, options, settings, info, look)
     if known is None:
-        known = estimated_camera(source, options, settings, info, look)
-        if known is None:
-            return options
+        return options
+    if before.camera is None:
         with store.transaction():
-            store.set_value(camera_key(session), known)
+            store.sessions.put(replace(before, camera=known))
     return told_camera(options, known)
 
 
@@ -50,8 +50,8 @@ def estimated_camera(
     settings: BuildSettings,
     info: SourceInfo,
     look: Callable[[str, int, int], None] | None = None,
-) -> dict[str, Any] | None:
-    """`intrinsics` and `distortion` of pictures as stored, with `notes`; None where the source or the model says them.
+) -> SessionCamera | None:
+    """Return the camera of pictures as stored; None where the source or the model says it.
 
     `look` hears ("camera", windows of the video done, in all).
     """
@@ -65,18 +65,19 @@ def estimated_camera(
         opened, size = open_source(source, options), _stored_size(source, options)
         height, width = opened.info.image_size or size
         found = calibrate(opened, settings.models.sfm, progress, stored_px=max(size) / max(height, width))
-    return {"notes": list(found.notes), **_as_stored(found.camera, size)}
+    full = found.camera.resized(*size)
+    return SessionCamera((full.fx, full.fy, full.cx, full.cy), tuple(found.camera.distortion), tuple(found.notes))
 
 
-def told_camera(options: SourceOptions, known: dict[str, Any]) -> SourceOptions:
+def told_camera(options: SourceOptions, known: SessionCamera) -> SourceOptions:
     """The options with a camera that was estimated."""
-    return replace(options, intrinsics=tuple(known["intrinsics"]), distortion=tuple(known["distortion"]))
+    return replace(options, intrinsics=known.intrinsics, distortion=known.distortion)
 
 
 def camera_notes(store: Store, session: int) -> tuple[str, ...]:
     """What the user should know of the camera that was estimated."""
-    known: dict[str, Any] = store.get_value(camera_key(session), {})
-    return tuple(known.get("notes", ()))
+    known = store.sessions.get(session).camera
+    return () if known is None else known.notes
 
 
 def _stored_size(source: str | Path, options: SourceOptions) -> tuple[int, int]:
@@ -84,14 +85,3 @@ def _stored_size(source: str | Path, options: SourceOptions) -> tuple[int, int]:
     whole = open_source(source, replace(options, max_side=0)).info
     assert whole.image_size is not None
     return whole.image_size
-
-
-def _as_stored(camera: Camera, size: tuple[int, int]) -> dict[str, list[float]]:
-    """Intrinsics and distortion for pictures of that (height, width)."""
-    full = camera.resized(*size)
-    return {"intrinsics": [full.fx, full.fy, full.cx, full.cy], "distortion": list(camera.distortion)}
-
-
-def camera_key(session: int) -> str:
-    """Where the camera of a session is kept in the key-value table."""
-    return f"camera {session}"

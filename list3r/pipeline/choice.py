@@ -94,7 +94,7 @@ def stored_sessions(memory: Path) -> tuple[BuildSettings | None, BuildSettings |
     if not memory.is_file():
         return None, None
     with Store.open(memory) as store:
-        sessions = store.sessions()
+        sessions = store.sessions.all()
     begun = [s for s in sessions if s.state != "complete"]
     first = session_settings(sessions[0]) if sessions else None
     return first, session_settings(begun[-1]) if begun else None

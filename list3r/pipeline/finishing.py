@@ -79,7 +79,7 @@ def name_things(
     """
     with Store.open(memory, writable=True) as store:
         opened = None if source is None else open_sources(store, source, options)
-        chunks = None if opened is None else [c.chunk_id for c in store.chunks() if c.session_id in opened]
+        chunks = None if opened is None else [c.chunk_id for c in store.chunks.all() if c.session_id in opened]
         return detect(store, network, opened, chunks=chunks, progress=progress)
 
 

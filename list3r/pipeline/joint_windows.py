@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor, SessionStore
+from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
 from list3r.association.revisits.joint_window import JointReconstructor
-from list3r.memory.records import ChunkResult, JointWindow, Session
+from list3r.memory.records import ChunkResult, JointWindow
+from list3r.memory.store.store import Store
 from list3r.models.cards import find_card
 from list3r.pipeline.chunk import ChunkTask, joint_model
 from list3r.pipeline.workers import OrderedPool
@@ -35,13 +36,13 @@ class WindowTask:
     """The same of the other."""
 
 
-def joint_windows(store: SessionStore, session: int, chunk: ChunkTask, pool: Pool) -> JointReconstructor:
+def joint_windows(store: Store, session: int, chunk: ChunkTask, pool: Pool) -> JointReconstructor:
     """What makes joint windows for a session: here, or where its chunks are made if that takes a network."""
     if find_card(chunk.settings.reconstruction, "geometry") is None:
-        return RgbdJointReconstructor(store, {session: chunk.options}, joint_model(chunk))
+        return RgbdJointReconstructor(_paths(store), {session: chunk.options}, joint_model(chunk))
 
     def ask(u_session: int, u_frames: Sequence[int], v_session: int, v_frames: Sequence[int]) -> JointWindow | None:
-        sources = tuple((s.session_id, s.source) for s in store.sessions())
+        sources = tuple(_paths(store).items())
         places = (u_session, tuple(u_frames)), (v_session, tuple(v_frames))
         return pool.ask(make_window, WindowTask(chunk, session, sources, *places))
 
@@ -56,15 +57,9 @@ def make_window(task: WindowTask) -> JointWindow | None:
 
 @lru_cache(maxsize=1)
 def _reconstructor(chunk: ChunkTask, session: int, sources: tuple[tuple[int, str], ...]) -> RgbdJointReconstructor:
-    return RgbdJointReconstructor(_Sources(sources), {session: chunk.options}, joint_model(chunk))
+    return RgbdJointReconstructor(dict(sources), {session: chunk.options}, joint_model(chunk))
 
 
-class _Sources:
-    """The sessions of a memory that another process has open."""
-
-    def __init__(self, sources: Sequence[tuple[int, str]]) -> None:
-        self._sources = sources
-
-    def sessions(self) -> list[Session]:
-        """With their sources alone."""
-        return [Session(number, source, "", {}, 0, "") for number, source in self._sources]
+def _paths(store: Store) -> dict[int, str]:
+    """Where the sources of the sessions are."""
+    return {s.session_id: s.source for s in store.sessions.all()}

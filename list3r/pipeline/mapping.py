@@ -62,18 +62,18 @@ def add_chunk(
     """
     chosen = settings or AssociationSettings()
     with store.transaction():
-        chunk_id = store.add_chunk(session_id, result)
+        chunk_id = store.chunks.add(session_id, result)
         named = {i.local_id: votes_of_names(i.names) for i in result.library.instances if i.names}
         if named:
             put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named)
         given = _poses_given(store, session_id)
         if given:
-            store.add_edges(_edge_of_given_poses(store, session_id))
+            store.edges.add(_edge_of_given_poses(store, session_id))
         else:
-            store.add_edges(_adjacent_edge(store, session_id, chosen, debug_dir))
-        if not given or len(store.sessions()) > 1:
+            store.edges.add(_adjacent_edge(store, session_id, chosen, debug_dir))
+        if not given or len(store.sessions.all()) > 1:
             loops = find_loops(store, chunk_id, joint, chosen.revisits)
-            store.add_edges(_refined(store, e, chosen.reprojection) if e.accepted else e for e in loops)
+            store.edges.add(_refined(store, e, chosen.reprojection) if e.accepted else e for e in loops)
         place_chunks(store, chosen, chunk_id)
         if debug_dir is not None:
             _draw_loops(store, chunk_id, debug_dir)
@@ -84,9 +84,9 @@ def add_chunk(
 
 def _poses_given(store: Store, session_id: int) -> bool:
     """Whether the source of a session said where its camera was; each session has a world of its own for that."""
-    chosen = {s.session_id: session_settings(s).poses for s in store.sessions()}
+    chosen = {s.session_id: session_settings(s).poses for s in store.sessions.all()}
     first = min(chosen, default=session_id)
-    return (chosen.get(session_id) if session_id != first else store.get_value("poses")) == "given"
+    return (chosen.get(session_id) if session_id != first else store.facts.poses) == "given"
 
 
 def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debug_dir: Path | None) -> list[Edge]:
@@ -94,28 +94,28 @@ def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debu
 
     What moved between the two is flagged on the way.
     """
-    chunks = store.chunks(session_id)
+    chunks = store.chunks.all(session_id)
     if len(chunks) < 2:
         return []
     u, v = chunks[-2], chunks[-1]
     metric = u.scale_kind == v.scale_kind == "metric"
-    samples_u, samples_v = store.frame_samples(u.chunk_id), store.frame_samples(v.chunk_id)
+    samples_u, samples_v = store.chunks.samples(u.chunk_id), store.chunks.samples(v.chunk_id)
     by_cameras = None
     if not metric and _from_motion(store, session_id):
         by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id, how.cameras)
     try:
         ends = (
-            EdgeEnd(u.chunk_id, samples_u, store.dynamic_locals(u.chunk_id)),
-            EdgeEnd(v.chunk_id, samples_v, store.dynamic_locals(v.chunk_id)),
+            EdgeEnd(u.chunk_id, samples_u, store.local_instances.dynamic(u.chunk_id)),
+            EdgeEnd(v.chunk_id, samples_v, store.local_instances.dynamic(v.chunk_id)),
         )
         found = measure_edge(*ends, _camera(v), metric, how.edges)
     except DegenerateError:
         return [] if by_cameras is None else [by_cameras]
     if by_cameras is None:  # where points lie less well than cameras, what they disagree in has not moved
         for chunk, moving in ((u, found.moving_u), (v, found.moving_v)):
-            store.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
+            store.local_instances.flag_dynamic(chunk.chunk_id, dict.fromkeys(sorted(moving)))
     if debug_dir is not None:
-        pictures = [k for c in (u, v) for k in store.keyframes(c.chunk_id)]
+        pictures = [k for c in (u, v) for k in store.keyframes.of(c.chunk_id)]
         write_support(found, pictures, _camera(v), debug_dir)
     return [better_edge(found.edge, by_cameras) or found.edge]
 
@@ -124,29 +124,29 @@ def _refined(store: Store, edge: Edge, settings: ReprojectionSettings) -> Edge:
     """A loop between chunks of structure from motion, refined by where features are seen."""
     if edge.frames is None:
         return edge
-    owner = {c.chunk_id: c for c in store.chunks()}
+    owner = {c.chunk_id: c for c in store.chunks.all()}
     u, v = owner[edge.u], owner[edge.v]
     if "metric" in (u.scale_kind, v.scale_kind) or not all(_from_motion(store, c.session_id) for c in (u, v)):
         return edge
-    keyframes = store.keyframe(u.chunk_id, edge.frames[0]), store.keyframe(v.chunk_id, edge.frames[1])
+    keyframes = store.keyframes.get(u.chunk_id, edge.frames[0]), store.keyframes.get(v.chunk_id, edge.frames[1])
     return refine_loop(edge, *keyframes, _camera(u), _camera(v), settings)
 
 
 def _from_motion(store: Store, session_id: int) -> bool:
     """Whether a session's cameras are known better than its surfaces."""
-    models = {s.session_id: MODELS.get(session_settings(s).reconstruction) for s in store.sessions()}
+    models = {s.session_id: MODELS.get(session_settings(s).reconstruction) for s in store.sessions.all()}
     model = models.get(session_id)
     return model is not None and model.by_cameras
 
 
 def _draw_loops(store: Store, chunk_id: int, debug_dir: Path) -> None:
     """Pictures of the revisits of a chunk that geometry measured."""
-    rows = {c.chunk_id: c for c in store.chunks()}
-    for edge in store.edges():
+    rows = {c.chunk_id: c for c in store.chunks.all()}
+    for edge in store.edges.all():
         if edge.kind != "loop" or edge.v != chunk_id or edge.frames is None or not edge.S_v_u.translation.any():
             continue
         ends = [
-            (store.frame_samples(chunk), store.keyframe(chunk, frame), _camera(rows[chunk]))
+            (store.chunks.samples(chunk), store.keyframes.get(chunk, frame), _camera(rows[chunk]))
             for chunk, frame in zip((edge.u, edge.v), edge.frames, strict=True)
         ]
         write_loop(edge, ends[0], ends[1], debug_dir)
@@ -159,7 +159,7 @@ def _camera(chunk: ChunkRow) -> Camera:
 
 def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
     """With given poses all chunks have the source's own world as their frame."""
-    chunks = store.chunks(session_id)
+    chunks = store.chunks.all(session_id)
     if len(chunks) < 2:
         return []
     u, v = chunks[-2].chunk_id, chunks[-1].chunk_id
@@ -175,8 +175,8 @@ def place_chunks(
     With `bend` it is also found how each chunk bends.
     """
     how = settings or AssociationSettings()
-    chunks = store.chunks()
-    measured = store.edges()
+    chunks = store.chunks.all()
+    measured = store.edges.all()
     edges = hold_back(measured, {c.chunk_id: c.session_id for c in chunks}, _metre(chunks), how.ties)
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
@@ -185,29 +185,29 @@ def place_chunks(
         graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, how.graph)
     else:
         graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=how.graph)
-    store.add_edges(after for before, after in zip(measured, graph.edges, strict=True) if after is not before)
+    store.edges.add(after for before, after in zip(measured, graph.edges, strict=True) if after is not before)
     if bend:
         graph = _straightened(store, graph, chunks, metric, how)
-    known = {} if store.get_value("poses") == "given" else graph.covariances
-    settled = store.get_value("gravity") == "estimated" or len(chunks) % how.up_again
+    known = {} if store.facts.poses == "given" else graph.covariances
+    settled = store.facts.gravity == "estimated" or len(chunks) % how.up_again
     if fitted and len(chunks) > how.up_always and settled:
         _place_fitted(store, graph, known)
         return
     gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
     upright = world_from_graph(gravity)
-    rows = [replace(c, component=graph.components[c.chunk_id]) for c in store.chunks()]
+    rows = [replace(c, component=graph.components[c.chunk_id]) for c in store.chunks.all()]
     S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
-    store.set_value("T_world_graph", S_world_graph.as_matrix().tolist())
-    store.set_value("gravity", gravity.status)
-    store.place_chunks({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
+    store.facts.S_world_graph = S_world_graph
+    store.facts.gravity = gravity.status
+    store.chunks.place({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
 
 
 def _place_fitted(store: Store, graph: GraphResult, covariances: Mapping[int, NDArray[np.float64]]) -> None:
     """Write where the new chunk lies, and those that moved for it, in the world as it stands."""
-    S_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+    S_world_graph = store.facts.S_world_graph
     layers = graph.S_graph_chunk.maps if isinstance(graph.S_graph_chunk, ChainMap) else [graph.S_graph_chunk]
     moved = sorted({k for layer in layers if isinstance(layer, dict) for k in layer})
-    store.place_chunks({k: S_world_graph @ graph.S_graph_chunk[k] for k in moved}, graph.components, covariances)
+    store.chunks.place({k: S_world_graph @ graph.S_graph_chunk[k] for k in moved}, graph.components, covariances)
 
 
 def _straightened(
@@ -218,14 +218,14 @@ def _straightened(
     how: AssociationSettings,
 ) -> GraphResult:
     """The graph with the bending of chunks undone; chunks whose poses were given do not bend."""
-    given = {s.session_id for s in store.sessions() if _poses_given(store, s.session_id)}
+    given = {s.session_id for s in store.sessions.all() if _poses_given(store, s.session_id)}
     rigid = {c.chunk_id for c in chunks if c.session_id in given}
     bends: dict[int, Bend] = {}
     if len(rigid) < len(chunks):
-        graph, bends = bend_chunks(store.frame_samples, graph, rigid, metric, how.nodes, how.graph)
+        graph, bends = bend_chunks(store.chunks.samples, graph, rigid, metric, how.nodes, how.graph)
     if not metric and not rigid and all(_from_motion(store, k) for k in {c.session_id for c in chunks}):
-        graph, bends = place_by_surfaces(store.frame_samples, graph, bends, how.surfaces)
-    store.set_bends(bends)
+        graph, bends = place_by_surfaces(store.chunks.samples, graph, bends, how.surfaces)
+    store.bends.replace(bends)
     return graph
 
 
@@ -250,13 +250,13 @@ def finish_session(
             add_changed_places(store, session_id, carving)
             consolidate(store)
             apply_labels(store)
-        store.complete_session(session_id)
+        store.sessions.complete(session_id)
 
 
 def _placed(store: Store, chunks: Sequence[ChunkRow], edges: Sequence[Edge], new: int) -> GraphResult:
     """The graph as it was solved before the new chunk came, looked up where it is asked for."""
     rows = {c.chunk_id: c for c in chunks if c.chunk_id != new}
-    T_graph_world = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist())).inverse()
+    T_graph_world = store.facts.S_world_graph.inverse()
     return GraphResult(
         S_graph_chunk=_Of(rows, lambda c: T_graph_world @ c.S_world_chunk),
         components=_Of(rows, lambda c: c.component),
@@ -284,5 +284,5 @@ class _Of(Mapping[int, T]):
 
 def _graph_poses(store: Store) -> dict[int, Sim3]:
     """Where the chunks lay before, in the graph's frame."""
-    T_graph_world = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist())).inverse()
-    return {c.chunk_id: T_graph_world @ c.S_world_chunk for c in store.chunks()}
+    T_graph_world = store.facts.S_world_graph.inverse()
+    return {c.chunk_id: T_graph_world @ c.S_world_chunk for c in store.chunks.all()}

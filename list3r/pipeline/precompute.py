@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, astuple, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.records import SessionCamera
 from list3r.pipeline.calibration import estimated_camera, told_camera
 from list3r.pipeline.chunk import ChunkTask, reconstruct
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -75,7 +75,7 @@ def precompute(
     if force or not all(_file(out, span).exists() for span in spans):
         camera = estimated_camera(source, options, settings, info, watch.look)
         if camera is not None:
-            options, notes = told_camera(options, camera), [*camera["notes"], _said(camera)]
+            options, notes = told_camera(options, camera), [*camera.notes, _said(camera)]
     opened = open_source(source, options)
     posed: set[int] = set()
     bad: dict[int, str] = {}
@@ -118,9 +118,10 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
     write_manifest(out, manifest)
 
 
-def _said(camera: dict[str, Any]) -> str:
+def _said(camera: SessionCamera) -> str:
     """What the build that reads the files has to be told, so that its pictures are those that were looked at."""
-    words = [f"--{name} {','.join(f'{v:.5g}' for v in camera[name]) or 0}" for name in ("intrinsics", "distortion")]
+    values = (("intrinsics", camera.intrinsics), ("distortion", camera.distortion))
+    words = [f"--{name} {','.join(f'{v:.5g}' for v in numbers) or 0}" for name, numbers in values]
     return f"the camera was estimated; give the build the same: {' '.join(words)}"
 
 

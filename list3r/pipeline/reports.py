@@ -74,9 +74,9 @@ class UpdateReport:
 
 def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
     """Return what a build did that began at a time of `time.monotonic`."""
-    frames = store.frames(plan.session)
+    frames = store.frames.all(plan.session)
     seconds = time.monotonic() - started
-    components = len({c.component for c in store.chunks()})
+    components = len({c.component for c in store.chunks.all()})
     lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
     return BuildReport(
         frames=len(frames),
@@ -85,14 +85,14 @@ def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
         bad=bad,
         chunks=len(plan.spans),
         components=components,
-        loops=sum(e.kind == "loop" and e.accepted for e in store.edges()),
-        instances=len(store.instances(structure=False)),
-        structure=len(store.instances(structure=True)),
-        relations=len(store.relations()),
+        loops=sum(e.kind == "loop" and e.accepted for e in store.edges.all()),
+        instances=len(store.instances.all(structure=False)),
+        structure=len(store.instances.all(structure=True)),
+        relations=len(store.relations.all()),
         seconds=round(seconds, 2),
         frames_per_second=round(plan.fresh_frames() / seconds, 2),
         resumed_chunks=len(plan.done),
-        stage_seconds={k: round(v, 2) for k, v in store.stage_seconds().items()},
+        stage_seconds={k: round(v, 2) for k, v in store.chunks.stage_seconds().items()},
         notes=_build_notes(store, plan.session, lost, bad, components),
     )
 
@@ -100,13 +100,13 @@ def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
 def update_report(store: Store, plan: Plan, started: float) -> UpdateReport:
     """Return what an update did that began at a time of `time.monotonic`."""
     session = plan.session
-    frames = store.frames(session)
-    rows = store.chunks()
+    frames = store.frames.all(session)
+    rows = store.chunks.all()
     own = [c for c in rows if c.session_id == session]
     known = {c.component for c in rows if c.session_id < session}
     placed = sum(c.component in known for c in own)
     lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
-    events = [e.kind for e in store.events(session)]
+    events = [e.kind for e in store.events.all(session)]
     seconds = time.monotonic() - started
     tied = ties(store, session)
     return UpdateReport(
@@ -119,7 +119,7 @@ def update_report(store: Store, plan: Plan, started: float) -> UpdateReport:
         placed=placed,
         ties=len(tied),
         components=len({c.component for c in rows}),
-        instances=len(store.instances(structure=False)),
+        instances=len(store.instances.all(structure=False)),
         events={kind: events.count(kind) for kind in ("seen_again", "moved", "removed", "added")},
         seconds=round(seconds, 2),
         frames_per_second=round(plan.fresh_frames() / seconds, 2),
@@ -151,14 +151,14 @@ def _update_notes(chunks: int, placed: int, held: int, lost: int, frames: int) -
 
 def ties(store: Store, session: int) -> list[Edge]:
     """The accepted relations between chunks of a session and chunks of the sessions before it."""
-    owner = {c.chunk_id: c.session_id for c in store.chunks()}
-    return [e for e in store.edges() if e.accepted and owner[e.u] < owner[e.v] == session]
+    owner = {c.chunk_id: c.session_id for c in store.chunks.all()}
+    return [e for e in store.edges.all() if e.accepted and owner[e.u] < owner[e.v] == session]
 
 
 def held(store: Store, session: int) -> int:
     """How many relations of a session to earlier ones are held back, see `association.session_ties`."""
-    owner = {c.chunk_id: c.session_id for c in store.chunks()}
-    return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges())
+    owner = {c.chunk_id: c.session_id for c in store.chunks.all()}
+    return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges.all())
 
 
 def _build_notes(store: Store, session: int, lost: int, bad: int, components: int) -> tuple[str, ...]:
@@ -168,15 +168,15 @@ def _build_notes(store: Store, session: int, lost: int, bad: int, components: in
         notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
     if bad:
         notes.append(f"{_count(bad, 'frame')} could not be used, skipped: {_listed(store)}")
-    if lost and store.get_value("poses") == "given":
+    if lost and store.facts.poses == "given":
         notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
     elif lost:
-        where = _runs([f.frame_index for f in store.frames(session) if f.state == "lost"])
+        where = _runs([f.frame_index for f in store.frames.all(session) if f.state == "lost"])
         notes.append(f"the camera could not be followed in {_count(lost, 'frame')} ({where}); they have no pose")
     notes += lost_reasons(store, session)
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
-    if store.get_value("gravity") == "unknown":
+    if store.facts.gravity == "unknown":
         notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
     return tuple(notes)
 
@@ -194,6 +194,6 @@ def _count(number: int, what: str) -> str:
 
 
 def _listed(store: Store, most: int = 5) -> str:
-    rows = store.bad_frames()
-    shown = ", ".join(f"{index} ({reason})" for _, index, reason in rows[:most])
+    rows = store.frames.bad()
+    shown = ", ".join(f"{f.frame_index} ({f.note})" for f in rows[:most])
     return shown + (f" and {len(rows) - most} more" if len(rows) > most else "")

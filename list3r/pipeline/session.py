@@ -23,7 +23,7 @@ from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
-from list3r.pipeline.calibration import camera_key, camera_notes, with_camera
+from list3r.pipeline.calibration import camera_notes, with_camera
 from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
 from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.finishing import check_run
@@ -110,7 +110,7 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     cuts = _cuts(store, session, job, watch)
     step = _depth_step(store, session, job, watch)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
-    done = {c.index for c in store.chunks(session)}
+    done = {c.index for c in store.chunks.all(session)}
     options = with_camera(store, session, job.source, job.options, job.settings, job.info, watch.look)
     tasks = []
     for span in spans:
@@ -139,10 +139,10 @@ def add_chunks(
     if not plan.tasks:
         return
     first, session, count = plan.tasks[0], plan.session, job.info.frame_count
-    bad = {index for s, index, _ in store.bad_frames() if s == session}
+    bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
     if watch.progress is not None:
-        watch.progress(len(store.frames(session)), count)
-    known = {c.index for c in store.chunks(session)}
+        watch.progress(len(store.frames.all(session)), count)
+    known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
     workers = min(job.run.workers or usual_workers(job.settings), len(plan.tasks))
     with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
@@ -168,34 +168,32 @@ _MOST_REASONS = 5
 
 def take_back(store: Store, session: int) -> None:
     """Leave the memory as it was before a session that is not in the library yet."""
-    placed = any(f.state == "posed" for f in store.frames(session))
+    placed = any(f.state == "posed" for f in store.frames.all(session))
     with store.transaction():
-        for name in (*(_name(store, session, what) for what in ("lost", "cuts", "depth step")), camera_key(session)):
-            store.drop_value(name)
-        store.drop_session(session)
+        store.sessions.drop(session)
         if placed:
             place_chunks(store, stored_settings(store, AssociationSettings, "association"), bend=True)
 
 
 def lost_reasons(store: Store, session: int) -> list[str]:
     """Why the camera could not be followed through chunks of a session, one sentence each, the first few."""
-    return list(store.get_value(_name(store, session, "lost"), []))[:_MOST_REASONS]
+    return list(store.sessions.get(session).lost_reasons[:_MOST_REASONS])
 
 
 def shot_cuts(store: Store, session: int) -> list[int]:
     """Positions before which the video of a session jumps."""
-    return list(store.get_value(_name(store, session, "cuts"), []))
+    return list(store.sessions.get(session).cuts or ())
 
 
 def settled_notes(store: Store, session: int) -> tuple[str, ...]:
     """What the user should know of what was settled before the chunks: the camera, and which frames get depth."""
     notes = camera_notes(store, session)
-    step = store.get_value(_name(store, session, "depth step"), 1)
+    row = store.sessions.get(session)
+    step = row.depth_step or 1
     if step == 1:
         return notes
     nth = {2: "2nd", 3: "3rd"}.get(step, f"{step}th")
-    asked = any(s.session_id == session and s.settings.get("depth_every") for s in store.sessions())
-    why = "as asked" if asked else "the picture moves slowly"
+    why = "as asked" if row.settings.get("depth_every") else "the picture moves slowly"
     return (*notes, f"{why}: depth and things are from every {nth} frame (--depth-every 1 takes all)")
 
 
@@ -203,49 +201,38 @@ def _depth_step(store: Store, session: int, job: Job, watch: Watch) -> int:
     """From every how many frames depth is computed, settled once; 1 for models that take it from elsewhere."""
     if not entry(job.settings.reconstruction).thins:
         return 1
-    name = _name(store, session, "depth step")
-    known: int | None = store.get_value(name)
+    known = store.sessions.get(session).depth_step
     if known is None:
         known = job.settings.depth_every
         if known is None:
-            begun = store.chunks(session)  # by a version that took all frames
+            begun = store.chunks.all(session)  # by a version that took all frames
             source, length = open_source(job.source, job.options), job.settings.chunks.length
             known = 1 if begun else depth_step(source, length, job.settings.pace, progress=watch.looking("pace"))
         with store.transaction():
-            store.set_value(name, known)
+            store.sessions.put(replace(store.sessions.get(session), depth_step=known))
     return known
-
-
-def _name(store: Store, session: int, what: str) -> str:
-    """Where something about a session is kept; of the first one without its number, as it always was."""
-    sessions = store.sessions()
-    return what if sessions and sessions[0].session_id == session else f"{what} {session}"
 
 
 def _note_lost(store: Store, session: int, result: ChunkResult) -> None:
     """Keep why the camera could not be followed through a chunk."""
     if result.lost_reason:
-        name = _name(store, session, "lost")
         with store.transaction():
-            store.set_value(name, [*store.get_value(name, []), result.lost_reason])
+            row = store.sessions.get(session)
+            store.sessions.put(replace(row, lost_reasons=(*row.lost_reasons, result.lost_reason)))
 
 
 def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]:
     """Where the video jumps, found once; given poses know where the camera is on either side."""
     if job.settings.poses == "given":
         return ()
-    name = _name(store, session, "cuts")
-    known = store.get_value(name)
+    known = store.sessions.get(session).cuts
     if known is None:
-        begun = store.chunks(session)  # by a version that did not look for any
-        known = (
-            []
-            if begun
-            else list(find_cuts(open_source(job.source, job.options), job.settings.cuts, watch.looking("cuts")))
-        )
+        begun = store.chunks.all(session)  # by a version that did not look for any
+        scan = watch.looking("cuts")
+        known = () if begun else tuple(find_cuts(open_source(job.source, job.options), job.settings.cuts, scan))
         with store.transaction():
-            store.set_value(name, known)
-    return tuple(known)
+            store.sessions.put(replace(store.sessions.get(session), cuts=known))
+    return known
 
 
 def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:

@@ -15,9 +15,6 @@ from list3r.memory.store.file import rename_exclusively, taken
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings, session_settings
 
-_MARK = "replaces"
-"""Under this key a new memory says which file it replaces."""
-
 
 class Target:
     """The memory being written. When nothing of worth came into it, what was there before is put back."""
@@ -33,7 +30,7 @@ class Target:
         if self._replaced is not None and _is_marked(self.store, self._replaced):
             self._replaced.unlink(missing_ok=True)
             with self.store.transaction():
-                self.store.drop_value(_MARK)
+                self.store.facts.replaces = None
         self._replaced = None
 
     def __enter__(self) -> Self:
@@ -98,13 +95,13 @@ def _replacing(path: Path, aside: Path) -> Target:
         rename_exclusively(aside, path)
         raise
     with target.store.transaction():
-        target.store.set_value(_MARK, _identity(aside))
+        target.store.facts.replaces = _identity(aside)
     return target
 
 
 def _holds_something(store: Store) -> bool:
     """Whether the camera of any frame is placed."""
-    return any(f.state == "posed" for f in store.frames())
+    return any(f.state == "posed" for f in store.frames.all())
 
 
 def _aside(path: Path) -> Path:
@@ -112,18 +109,18 @@ def _aside(path: Path) -> Path:
     return path.with_name(f"{path.name}.replaced")
 
 
-def _identity(path: Path) -> list[int] | None:
+def _identity(path: Path) -> tuple[int, ...] | None:
     """What tells an ordinary file from any other that may take its name."""
     try:
         found = path.lstat()
     except OSError:
         return None
-    return [found.st_ino, found.st_size, found.st_mtime_ns] if stat.S_ISREG(found.st_mode) else None
+    return (found.st_ino, found.st_size, found.st_mtime_ns) if stat.S_ISREG(found.st_mode) else None
 
 
 def _is_marked(store: Store, aside: Path) -> bool:
     """Whether a file is the very one that this memory replaces, and no other of that name."""
-    return _identity(aside) is not None and store.get_value(_MARK) == _identity(aside)
+    return _identity(aside) is not None and store.facts.replaces == _identity(aside)
 
 
 def _is_memory(path: Path) -> bool:
@@ -138,7 +135,7 @@ def _is_memory(path: Path) -> bool:
 
 def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None:
     """Raise `OptionError` when a memory was begun from another source or with other settings."""
-    for session in store.sessions():
+    for session in store.sessions.all():
         if session.fingerprint != info.fingerprint:
             raise OptionError(
                 f"{store.path} was begun from {session.source} with other frames or camera options; "

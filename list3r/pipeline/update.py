@@ -76,11 +76,11 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
 
 def _begun(store: Store, session: int) -> bool:
     """Whether the camera of any frame of a session is placed."""
-    return any(f.state == "posed" for f in store.frames(session))
+    return any(f.state == "posed" for f in store.frames.all(session))
 
 
 def _complete(store: Store, session: int) -> bool:
-    return any(s.session_id == session and s.state == "complete" for s in store.sessions())
+    return any(s.session_id == session and s.state == "complete" for s in store.sessions.all())
 
 
 def _check_posed(store: Store, session: int, info: SourceInfo) -> None:
@@ -93,13 +93,13 @@ def _check_posed(store: Store, session: int, info: SourceInfo) -> None:
 def _session(store: Store, job: Job) -> int:
     """The session to write to. Raises `OptionError` where this video cannot come next."""
     info, resume, force = job.info, job.run.resume, job.run.force
-    sessions = store.sessions()
+    sessions = store.sessions.all()
     for s in sessions[1:]:
         if s.state != "complete" and ((force and not resume) or not _begun(store, s.session_id)):
             take_back(store, s.session_id)
-    sessions = store.sessions()
+    sessions = store.sessions.all()
     path = str(Path(info.path).resolve())
-    if not sessions or not store.chunks(sessions[0].session_id):
+    if not sessions or not store.chunks.all(sessions[0].session_id):
         raise OptionError(f"{store.path} holds no video yet; make it with `list3r build {info.path} -m {store.path}`")
     for s in sessions:
         if s.state == "complete" and s.fingerprint == info.fingerprint:
@@ -120,4 +120,4 @@ def _session(store: Store, job: Job) -> int:
     if begun:
         return begun[0].session_id
     with store.transaction():
-        return store.add_session(path, info.fingerprint, job.settings.as_plain(), info.frame_count)
+        return store.sessions.add(path, info.fingerprint, job.settings.as_plain(), info.frame_count)

@@ -49,7 +49,7 @@ def changes(
     Within a session by kind, the surest first. A thing that no frame could look at has no event. Raises `OptionError`
     for a session or a kind that there is not.
     """
-    sessions = [s.session_id for s in store.sessions()]
+    sessions = [s.session_id for s in store.sessions.all()]
     if since is not None and since not in sessions:
         raise OptionError(f"{store.path} has no session {since}; it has {', '.join(map(str, sessions))}")
     if wrong := [k for k in kinds if k not in KINDS]:
@@ -58,9 +58,9 @@ def changes(
         raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
     wanted = [
         e
-        for e in store.events()
+        for e in store.events.all()
         if e.kind in kinds and e.confidence >= min_confidence and (since is None or e.session_id > since)
     ]
-    things = {i.id: i for i in store.instances()}
+    things = {i.id: i for i in store.instances.all()}
     found = [Changed(things[e.instance_id], e) for e in wanted if e.instance_id in things]
     return sorted(found, key=lambda c: (-c.event.session_id, KINDS.index(c.event.kind), -c.score, c.event.instance_id))

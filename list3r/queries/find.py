@@ -58,7 +58,7 @@ def find(
     if viewpoint is not None:
         viewer_from(store, viewpoint)
     gathered = gather(store, phrase)
-    loaded = store.instances() if gathered is None else store.instances_of(sorted(gathered.ids))
+    loaded = store.instances.all() if gathered is None else store.instances.of(sorted(gathered.ids))
     things = {i.id: i for i in loaded if i.state != "removed"}
     search = PhraseSearch(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
     search.notes += [] if gathered is None else gathered.notes
@@ -114,7 +114,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
         if by_vector is not None:
             return by_vector
         search.unknown += unknown
-        named = search.things.values() if search.gathered is None else search.store.instances_of(search.gathered.sample)
+        named = search.things.values() if search.gathered is None else search.store.instances.of(search.gathered.sample)
         search.notes.append(not_borne(unknown, named))
         return []
     structure = not STRUCTURE.isdisjoint(phrase.words) or bool(
@@ -135,7 +135,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
 def _unknown(search: PhraseSearch, words: Sequence[str]) -> list[str]:
     """Return words that nothing bears."""
     if search.gathered is not None:
-        known = search.store.known_words(words)
+        known = search.store.words.known(words)
         return [w for w in words if w not in known]
     return [w for w in words if not any(w in v for v in search.vocabulary.values())]
 
@@ -167,7 +167,7 @@ def _by_vector(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch] | None
 
 
 def _look_at_too(search: PhraseSearch, ids: Sequence[int]) -> None:
-    fresh = search.store.instances_of([n for n in ids if n not in search.things])
+    fresh = search.store.instances.of([n for n in ids if n not in search.things])
     for i in (i for i in fresh if i.state != "removed"):
         search.things[i.id], search.vocabulary[i.id] = i, _vocabulary(i)
 

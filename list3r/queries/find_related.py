@@ -111,11 +111,11 @@ def _pairs_of_many(
         return None
     out: dict[int, list[_Pair]] = {c.instance.id: [] for c in objects}
     from_objects = len(objects) <= len(subjects)
-    rows = search.store.related(out if from_objects else subjects, predicates, as_object=from_objects)
+    rows = search.store.relations.among(out if from_objects else subjects, predicates, as_object=from_objects)
     order = {p: n for n, p in enumerate(predicates)}
-    for s, p, o, sure in sorted(rows, key=lambda r: (r[2], order[r[1]], -r[3], r[0])):
-        if s in subjects and o in out and s != o:
-            out[o].append((s, p, sure, ""))
+    for r in sorted(rows, key=lambda r: (r.object, order[r.predicate], -r.confidence, r.subject)):
+        if r.subject in subjects and r.object in out and r.subject != r.object:
+            out[r.object].append((r.subject, r.predicate, r.confidence, ""))
     for predicate in predicates:
         held = relations(search.store, None, predicate, objects[0].instance.id)
         if held.state == "unknown" and predicate in VERTICAL:
@@ -151,7 +151,7 @@ def _pairs(
 def _near_structure(search: PhraseSearch, subjects: dict[int, PhraseMatch], o: Instance) -> list[_Pair]:
     """Return things near a wall, by the distance of surfaces: the memory keeps `near` of things only."""
     limit = _BY_STRUCTURE_M * unit_of(search.store)
-    near = set(search.store.ids_in_box(o.aabb[0] - limit, o.aabb[1] + limit))
+    near = set(search.store.instances.ids_in_box(o.aabb[0] - limit, o.aabb[1] + limit))
     out = []
     for n, c in subjects.items():
         if n in near and n != o.id and c.instance.component == o.component:
@@ -183,7 +183,7 @@ def _between(
     for a, b in pairs:
         ends = a.instance.id, b.instance.id
         box = np.stack([a.instance.aabb, b.instance.aabb])
-        near = set(search.store.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0))) - set(ends)
+        near = set(search.store.instances.ids_in_box(box[:, 0].min(axis=0), box[:, 1].max(axis=0))) - set(ends)
         for c in (c for c in found if c.instance.id in near):
             r = between(c.instance, a.instance, b.instance, noise)
             score = 0.0 if r is None else c.score * r.confidence * (0.5 + 0.25 * (a.score + b.score))

@@ -32,10 +32,10 @@ def named_by_vectors(store: Store, encoder: WordEncoder, words: str) -> dict[int
     """Return the cosine of every thing that a text may name, by id, the ids ascending; None where the memory has no
     vectors of the encoder's space. Raises `OptionError` where the encoder's weights are not there.
     """
-    if encoder.space not in store.embedding_spaces():
+    if encoder.space not in store.embeddings.spaces():
         return None
     query = np.asarray(encoder.encode(words), np.float64)
-    ids, vectors = store.embeddings(encoder.space)
+    ids, vectors = store.embeddings.all(encoder.space)
     lengths = np.linalg.norm(vectors, axis=1) * np.linalg.norm(query)
     cosine = vectors @ query / np.maximum(lengths, 1e-12)
     fits = cosine >= encoder.min_cosine

@@ -140,7 +140,7 @@ def checked_instance(store: Store, instance_id: int) -> Instance:
     """Return the instance of an id or of an alias. Raises `UnknownIdError`, also for a number that no id can be."""
     if not 0 <= int(instance_id) <= _LARGEST_ID:
         raise UnknownIdError(f"{store.path} has no instance {instance_id}; `list3r list {store.path}` shows the ids")
-    return store.instance(int(instance_id))
+    return store.instances.get(int(instance_id))
 
 
 def checked_count(k: int) -> int:

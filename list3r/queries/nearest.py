@@ -81,7 +81,7 @@ def nearest(
     named = _named(others, words)
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
-    if not named and (unknown := [w for w in wanted_words(words) if w not in store.known_words([w])]):
+    if not named and (unknown := [w for w in wanted_words(words) if w not in store.words.known([w])]):
         notes.append(not_borne(unknown, sample(store)))
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
@@ -94,20 +94,20 @@ def nearest(
 
 def _common(store: Store, words: str) -> bool:
     """Tell whether so many bear all the words that it is better to look around for them than to look at them all."""
-    return len(store.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
+    return len(store.words.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
 
 
 def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
     """Return what passes the filters: all; of a large memory those that bear the most of the words."""
     if not is_large(store):
-        return filters.select(store.instances())
+        return filters.select(store.instances.all())
     parts = (
         (ids, start)
-        for ids in store.bearing_most(wanted_words(words), _NAMED + 1)
+        for ids in store.words.bearing_most(wanted_words(words), _NAMED + 1)
         for start in range(0, len(ids), _LOADED)
     )
     for ids, start in parts:
-        found = filters.select(store.instances_of(ids[start : start + _LOADED]))
+        found = filters.select(store.instances.of(ids[start : start + _LOADED]))
         if not _named(found, words):
             continue
         if len(ids) > start + _LOADED:
@@ -126,7 +126,7 @@ def _alike(
     except OptionError as error:  # the memory has come to a machine without the model's weights
         notes.append(f"free words cannot be compared: {error}")
         return []
-    alike = filters.select(store.instances_of(list(cosine)))
+    alike = filters.select(store.instances.of(list(cosine)))
     return [(i, round(cosine[i.id], 4), like(words, cosine[i.id], encoder.space)) for i in alike]
 
 

@@ -28,9 +28,9 @@ def path(store: Store, start: int, end: int, *, structure: bool = True) -> Relat
     if a.id == b.id:
         return Relations([], "known", f"both are #{a.id}")
     graph = networkx.Graph()
-    usable = {i.id for i in store.instances() if structure or i.structure is None} | {a.id, b.id}
+    usable = {i.id for i in store.instances.all() if structure or i.structure is None} | {a.id, b.id}
     best: dict[frozenset[int], Relation] = {}
-    for r in store.relations():
+    for r in store.relations.all():
         if r.subject not in usable or r.object not in usable or r.subject == r.object:
             continue
         key = frozenset((r.subject, r.object))

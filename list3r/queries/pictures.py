@@ -138,18 +138,22 @@ def keyframe_pictures(store: Store, instance_ids: Sequence[int] | None = None) -
     With `instance_ids` only those instances, and only the pictures that show one of them. Of a frame that two chunks
     share, an instance counts where it is seen better. Raises `UnknownIdError`.
     """
-    chunks = {c.chunk_id: c for c in store.chunks()}
+    chunks = {c.chunk_id: c for c in store.chunks.all()}
     followed = _observations_by_chunk(store, instance_ids)
     sights: dict[tuple[int, int], dict[int, InstanceSight]] = {}
     keeper: dict[tuple[int, int], ChunkRow] = {}
     for chunk_id in sorted(chunks if instance_ids is None else followed):
         chunk = chunks[chunk_id]
-        frames = [k.frame_index for k in store.keyframes(chunk_id) if k.jpeg]
+        frames = [k.frame_index for k in store.keyframes.of(chunk_id) if k.jpeg]
         for frame in frames:
             keeper.setdefault((chunk.session_id, frame), chunk)
             sights.setdefault((chunk.session_id, frame), {})
         observations = followed.get(chunk_id, []) if frames else []
-        found = (x for o in observations for x in _sights(o, store.mask_track(o.chunk_id, o.local_id), frames))
+        found = (
+            x
+            for o in observations
+            for x in _sights(o, store.local_instances.mask_track(o.chunk_id, o.local_id), frames)
+        )
         for frame, sight in found:
             seen = sights[(chunk.session_id, frame)]
             if sight.instance_id not in seen or seen[sight.instance_id].worth() < sight.worth():
@@ -165,10 +169,10 @@ def keyframe_pictures(store: Store, instance_ids: Sequence[int] | None = None) -
 
 def _observations_by_chunk(store: Store, instance_ids: Sequence[int] | None) -> dict[int, list[Observation]]:
     if instance_ids is None:
-        found = store.observations()
+        found = store.observations.all()
     else:
         wanted = sorted({checked_instance(store, n).id for n in instance_ids})
-        found = [o for n in wanted for o in store.observations(n)]
+        found = [o for n in wanted for o in store.observations.of(n)]
     out: dict[int, list[Observation]] = {}
     for o in found:
         out.setdefault(o.chunk_id, []).append(o)
@@ -187,7 +191,7 @@ def _sights(o: Observation, track: MaskTrack, frames: list[int]) -> list[tuple[i
 
 def keyframe_rgb(store: Store, picture: KeyframePicture) -> NDArray[np.uint8]:
     """Return the stored picture itself. Shape (H, W, 3)."""
-    return decode_picture(store.keyframe(picture.chunk_id, picture.frame_index).jpeg)
+    return decode_picture(store.keyframes.get(picture.chunk_id, picture.frame_index).jpeg)
 
 
 def instance_picture(store: Store, instance_id: int, settings: PictureSettings | None = None) -> InstancePicture:
@@ -230,8 +234,8 @@ def _projected(store: Store, instance: Instance, settings: PictureSettings) -> I
 
 def _looking_at(store: Store, instance: Instance, most: int) -> list[KeyframePicture]:
     """Return keyframes of its component whose picture holds its centre, those in which it is largest first."""
-    poses = {(f.session_id, f.frame_index): S for f, S in store.camera_poses()}
-    lenses = {c.chunk_id: c.intrinsics for c in store.chunks()}
+    poses = {(f.session_id, f.frame_index): S for f, S in store.trajectory.poses()}
+    lenses = {c.chunk_id: c.intrinsics for c in store.chunks.all()}
     near = []
     for p in keyframe_pictures(store):
         S_world_cam = poses.get((p.session_id, p.frame_index))

@@ -88,7 +88,7 @@ def relations(
 def viewer_from(store: Store, viewpoint: Place) -> Viewpoint | None:
     """Return who looks from a place, see `Place`; None where up is not known. Raises `OptionError` and
     `UnknownIdError`."""
-    upright = store.get_value("gravity", "unknown") in ("known", "estimated")
+    upright = store.facts.gravity in ("known", "estimated")
     up = np.array([0.0, 0.0, 1.0])
     where = _parse_place(store, viewpoint) if isinstance(viewpoint, str) else viewpoint
     if isinstance(where, PosedCamera):
@@ -121,13 +121,13 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
     if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):
         wanted = set(wanted_words(what))
         if is_large(store):
-            found = store.bearing(sorted(wanted), _MOST_NAMED + 1)
+            found = store.words.bearing(sorted(wanted), _MOST_NAMED + 1)
             if len(found) > _MOST_NAMED:
                 notes.append(f"more than {_MOST_NAMED} instances match {what!r}; {_MOST_NAMED} of them were considered")
             found = sorted(found[:_MOST_NAMED])
         else:
-            found = [i.id for i in store.instances() if wanted <= words_of(i)]
-        if not found and (unknown := sorted(wanted - store.known_words(wanted))):
+            found = [i.id for i in store.instances.all() if wanted <= words_of(i)]
+        if not found and (unknown := sorted(wanted - store.words.known(wanted))):
             notes.append(not_borne(unknown, sample(store)))
         return found
     return [checked_instance(store, int(what.removeprefix("#")) if isinstance(what, str) else what).id]
@@ -135,18 +135,18 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
 
 def _stored(store: Store, subjects: list[int] | None, predicate: str | None, objects: list[int] | None) -> Relations:
     if subjects is not None and len(subjects) == 1:
-        found = [r for s in subjects for r in store.relations(s, predicate, None)]
+        found = [r for s in subjects for r in store.relations.all(s, predicate, None)]
     elif objects is not None:
-        found = [r for o in objects for r in store.relations(None, predicate, o)]
+        found = [r for o in objects for r in store.relations.all(None, predicate, o)]
     else:
-        found = store.relations(None, predicate, None)
+        found = store.relations.all(None, predicate, None)
     allowed = None if subjects is None else set(subjects), None if objects is None else set(objects)
     found = [
         r
         for r in found
         if (allowed[0] is None or r.subject in allowed[0]) and (allowed[1] is None or r.object in allowed[1])
     ]
-    if store.get_value("gravity", "unknown") not in ("known", "estimated"):
+    if store.facts.gravity not in ("known", "estimated"):
         why = "gravity is unknown in this memory, and with it what is on, in, above or under what"
         if predicate in VERTICAL and not found:
             return Relations([], "unknown", why)
@@ -165,9 +165,9 @@ def _viewed(
             "unknown",
             "gravity is unknown in this memory, and with it left and right; use a camera as the viewpoint",
         )
-    things = {i.id: i for i in store.instances()}
+    things = {i.id: i for i in store.instances.all()}
     if subjects is None and objects is None:
-        pairs = sorted({(r.subject, r.object) for p in ("near", "next_to") for r in store.relations(None, p, None)})
+        pairs = sorted({(r.subject, r.object) for p in ("near", "next_to") for r in store.relations.all(None, p, None)})
     else:
         everything = [i.id for i in things.values() if i.structure is None]
         pairs = (
@@ -193,7 +193,7 @@ def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, o
     if ones is None or others is None:
         raise OptionError("between takes two instances: give both object and other (--object A --and B)")
     noise = noise_of(store)
-    things = {i.id: i for i in store.instances()}
+    things = {i.id: i for i in store.instances.all()}
     asked = [i for i in things.values() if (i.structure is None if subjects is None else i.id in set(subjects))]
     found = [
         r
@@ -213,7 +213,10 @@ def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, o
 
 
 def _near_line(store: Store, a: Instance, b: Instance, asked: list[Instance]) -> list[Instance]:
-    near = set(store.ids_in_box(np.minimum(a.aabb[0], b.aabb[0]), np.maximum(a.aabb[1], b.aabb[1]))) - {a.id, b.id}
+    near = set(store.instances.ids_in_box(np.minimum(a.aabb[0], b.aabb[0]), np.maximum(a.aabb[1], b.aabb[1]))) - {
+        a.id,
+        b.id,
+    }
     return [i for i in asked if i.id in near]
 
 
@@ -226,10 +229,10 @@ def unit_of(store: Store) -> float:
     """Estimate what a metre is in world units: 1 where the memory is metric, else told by the distances of things from
     the cameras, which stand about two metres from what they look at indoors.
     """
-    if store.get_value("scale_kind", "metric") != "relative":
+    if store.facts.scale_kind != "relative":
         return 1.0
-    poses = store.camera_poses()
-    centers = np.array([i.center for i in store.instances()]).reshape(-1, 3)
+    poses = store.trajectory.poses()
+    centers = np.array([i.center for i in store.instances.all()]).reshape(-1, 3)
     if not poses or not len(centers):
         return 1.0
     cameras = np.array([S.translation for _, S in poses[:: -(-len(poses) // 50)]])

@@ -49,15 +49,15 @@ def seen(store: Store, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
     if not gap_s >= 0.0:
         raise OptionError(f"gap {gap_s} must be a number of seconds, 0 or more")
     instance = checked_instance(store, instance_id)
-    sessions = {c.chunk_id: c.session_id for c in store.chunks()}
+    sessions = {c.chunk_id: c.session_id for c in store.chunks.all()}
     best: dict[tuple[int, int], tuple[float, tuple[float, ...]]] = {}
-    for o in store.observations(instance.id):
-        track = store.mask_track(o.chunk_id, o.local_id)
+    for o in store.observations.of(instance.id):
+        track = store.local_instances.mask_track(o.chunk_id, o.local_id)
         views = zip(track.frames.tolist(), track.visible_fraction.tolist(), track.boxes_xyxy.tolist(), strict=True)
         for frame, visible, box in views:
             key = (sessions[o.chunk_id], frame)
             best[key] = max(best.get(key, (-1.0, ())), (visible, tuple(box)))
-    times = {(f.session_id, f.frame_index): f.time_s for f in store.frames()}
+    times = {(f.session_id, f.frame_index): f.time_s for f in store.frames.all()}
     frames = []
     for key in sorted(k for k in best if k in times):
         visible, (x0, y0, x1, y1) = best[key]
@@ -120,8 +120,8 @@ def _followed(store: Store, camera: PosedCamera) -> set[int] | None:
     if camera.frame is None:
         return None
     out = set()
-    for o in store.observations():
+    for o in store.observations.all():
         if o.chunk_id == camera.frame.chunk_id:
-            if camera.frame.frame_index in store.mask_track(o.chunk_id, o.local_id).frames:
+            if camera.frame.frame_index in store.local_instances.mask_track(o.chunk_id, o.local_id).frames:
                 out.add(o.instance_id)
     return out

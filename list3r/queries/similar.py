@@ -51,7 +51,7 @@ def similar(
     found: dict[int, Instance] = {}
 
     def passing(ids: Sequence[int]) -> set[int]:
-        found.update((i.id, i) for i in store.instances_of([n for n in ids if n not in found]))
+        found.update((i.id, i) for i in store.instances.of([n for n in ids if n not in found]))
         return {n for n in ids if n in found and filters.passes(found[n]) and (origin is None or n != origin.id)}
 
     out = []
@@ -69,7 +69,7 @@ def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: 
     if not np.isfinite(length) or length == 0.0:
         raise OptionError("the vector to compare with must be finite and not zero")
     ids, cosines = [], []
-    for some, vectors in store.embedding_batches(space):
+    for some, vectors in store.embeddings.batches(space):
         if vectors.shape[1] < part:
             raise SpaceMismatchError(f"{part} numbers cannot be compared in the space {space}, which has fewer")
         head = vectors[:, :part].astype(np.float64)
@@ -80,7 +80,7 @@ def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: 
     for start in range(0, len(order), _BATCH):
         at = order[start : start + _BATCH]
         score = dict(zip(np.concatenate(ids)[at].tolist(), np.concatenate(cosines)[at].tolist(), strict=True))
-        for i in filters.select(store.instances_of(list(score))):
+        for i in filters.select(store.instances.of(list(score))):
             reason = f"cosine {score[i.id]:.3f} of colours alone, the first {part} numbers of {space}"
             out.append(Match(i, round(score[i.id], 4), None, None, reason))
         if len(out) >= k:

@@ -46,11 +46,11 @@ def within(
     if max_depth is not None:
         raise OptionError("a largest depth needs the view of a camera")
     low, high, middle, reach = _box(lower, upper) if box else _sphere(center, radius)
-    ids, _ = store.boxes_in_box(
+    ids, _ = store.instances.boxes_in_box(
         low, high, structure=filters.structure, min_confidence=filters.min_confidence, state=filters.stored_state
     )
     found = []
-    for i in filters.select(store.instances_of(sorted(ids.tolist()))):
+    for i in filters.select(store.instances.of(sorted(ids.tolist()))):
         points = surface_of(store, i).points
         if reach is None:
             inside = np.all((points >= low) & (points <= high), axis=1)

@@ -14,9 +14,9 @@ from list3r.frames.base import Frame, FrameSource
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
-from list3r.memory.library.labels import LabelSettings, Votes, apply_labels, put_votes
+from list3r.memory.library.labels import LabelSettings, apply_labels, put_votes
 from list3r.memory.masks import decode_mask
-from list3r.memory.records import ChunkRow, MaskTrack
+from list3r.memory.records import ChunkRow, MaskTrack, Votes
 from list3r.memory.store.store import Store
 from list3r.semantics.detector import Detector
 from list3r.semantics.voting import Seen, VotingSettings, summed, vote
@@ -60,7 +60,7 @@ def detect(
     keyframes are. With `chunks` only those are looked at, and the votes of the others stay. Raises `OptionError` where
     there is no picture.
     """
-    rows = [c for c in store.chunks() if chunks is None or c.chunk_id in chunks]
+    rows = [c for c in store.chunks.all() if chunks is None or c.chunk_id in chunks]
     watch = _Watch(store, detector, sources or {}, voting)
     with store.transaction():
         for done, chunk in enumerate(rows):
@@ -84,17 +84,17 @@ class _Watch:
         self, store: Store, detector: Detector, sources: Mapping[int, FrameSource], voting: VotingSettings | None
     ) -> None:
         self._store, self._detector, self._sources, self._voting = store, detector, sources, voting
-        self._home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+        self._home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
         self._in_session, self._in_chunk = _posed(store)
-        metric = store.get_value("scale_kind", "relative") != "relative"
-        self._sizes = {i.id: i.box.size for i in store.instances()} if metric else {}
+        metric = store.facts.scale_kind != "relative"
+        self._sizes = {i.id: i.box.size for i in store.instances.all()} if metric else {}
         self._looked: set[tuple[int, int]] = set()
         self.pictures = self.boxes = 0
 
     def votes(self, chunk: ChunkRow) -> dict[int, Votes]:
         """What the detector says of the local instances of a chunk."""
         home = {n: i for (k, n), i in sorted(self._home.items()) if k == chunk.chunk_id}
-        tracks = {n: self._store.mask_track(chunk.chunk_id, n) for n in home}
+        tracks = {n: self._store.local_instances.mask_track(chunk.chunk_id, n) for n in home}
         source, session = self._sources.get(chunk.session_id), chunk.session_id
         own = self._in_session.get(session, {}) if source is None else self._in_chunk.get(chunk.chunk_id, {})
         votes, last_s, region = [], -np.inf, _region(tracks)
@@ -116,7 +116,7 @@ def open_sources(store: Store, source: str | Path, options: SourceOptions | None
     Raises `SourceError`, and `OptionError` for a source that no session came from.
     """
     opened = open_source(source, options)
-    sessions = store.sessions()
+    sessions = store.sessions.all()
     path = str(Path(opened.info.path).resolve())
     known = [s.session_id for s in sessions if s.source == path or s.fingerprint == opened.info.fingerprint]
     if not known and len(sessions) == 1:
@@ -130,7 +130,7 @@ def _posed(store: Store) -> tuple[dict[int, dict[int, float]], dict[int, dict[in
     """Seconds of the posed frames by Frame.index: of each session, and of each chunk."""
     in_session: dict[int, dict[int, float]] = {}
     in_chunk: dict[int, dict[int, float]] = {}
-    for frame in store.frames():
+    for frame in store.frames.all():
         if frame.state == "posed":
             in_session.setdefault(frame.session_id, {})[frame.frame_index] = frame.time_s
             in_chunk.setdefault(frame.chunk_id, {})[frame.frame_index] = frame.time_s
@@ -142,7 +142,7 @@ def _pictures(
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Frame.index and picture of the frames to look at, of the `own` ones (index to seconds)."""
     if source is None:
-        for keyframe in store.keyframes(chunk.chunk_id):
+        for keyframe in store.keyframes.of(chunk.chunk_id):
             image = decode_picture(keyframe.jpeg)
             if image is not None and keyframe.frame_index in own:
                 yield keyframe.frame_index, _fitting(np.asarray(image[..., ::-1]), chunk)
@@ -207,5 +207,5 @@ def _region(tracks: Mapping[int, MaskTrack]) -> NDArray[np.float32] | None:
 
 
 def _source(store: Store) -> str:
-    sessions = store.sessions()
+    sessions = store.sessions.all()
     return sessions[-1].source if sessions else "VIDEO"

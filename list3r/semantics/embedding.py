@@ -83,11 +83,11 @@ def embed_memory(
         ids = sorted(sums)
         vectors = np.array([sums[i] / max(float(np.linalg.norm(sums[i])), 1e-9) for i in ids], np.float32)
         with store.transaction():
-            store.put_embeddings(network.space, ids, vectors)
-            known = dict(store.get_value("text_models", {}))
+            store.embeddings.put(network.space, ids, vectors)
+            known = dict(store.facts.text_models)
             known[network.space] = weights
-            store.set_value("text_models", known)
-        everything = len(store.instances())
+            store.facts.text_models = known
+        everything = len(store.instances.all())
     return EmbedReport(network.space, len(ids), everything - len(ids))
 
 
@@ -132,8 +132,8 @@ class StoredWords:
 
 def stored_words(store: Store, device: str = "auto") -> StoredWords | None:
     """What compares free words with the things of a memory, None where `list3r embed` was not run on it."""
-    spaces = store.embedding_spaces()
-    for space, weights in sorted(dict(store.get_value("text_models", {})).items()):
+    spaces = store.embeddings.spaces()
+    for space, weights in sorted(dict(store.facts.text_models).items()):
         if space in spaces:
             return StoredWords(space, str(weights), device)
     return None
@@ -157,13 +157,13 @@ def _weights(model: str, asked: str | None, licence: str) -> str:
 def _views(store: Store) -> dict[int, list[_View]]:
     """The best views of every thing among the keyframes with a picture, by chunk."""
     owner: dict[int, dict[int, int]] = defaultdict(dict)
-    for seen in store.observations():
+    for seen in store.observations.all():
         owner[seen.chunk_id][seen.local_id] = seen.instance_id
     best: dict[int, list[tuple[int, _View]]] = defaultdict(list)
     for chunk_id, locals_ in sorted(owner.items()):
-        frames = {k.frame_index for k in store.keyframes(chunk_id) if k.jpeg}
+        frames = {k.frame_index for k in store.keyframes.of(chunk_id) if k.jpeg}
         for local_id, instance in sorted(locals_.items()):
-            track = store.mask_track(chunk_id, local_id)
+            track = store.local_instances.mask_track(chunk_id, local_id)
             for row in np.flatnonzero(np.isin(track.frames, list(frames))).tolist():
                 area = float(track.areas_px[row]) * max(float(track.visible_fraction[row]), 0.05)
                 view = _View(instance, int(track.frames[row]), tuple(track.boxes_xyxy[row].tolist()), area)
@@ -185,7 +185,7 @@ def _look(
     for view in wanted:
         by_frame[view.frame].append(view)
     for frame, views in sorted(by_frame.items()):
-        picture = decode_jpeg(store.keyframe(chunk_id, frame).jpeg)
+        picture = decode_jpeg(store.keyframes.get(chunk_id, frame).jpeg)
         if picture is None:
             continue
         vectors = model.encode_pictures([square_crop(picture, v.box) for v in views])

@@ -48,8 +48,8 @@ def picture_query(store: Store, image: str | Path | NDArray[np.uint8], box: Box 
     from list3r.instances.geometric.features import COLOR_PART, color_feature
     from list3r.instances.settings import FEATURE_SPACE
 
-    if FEATURE_SPACE not in store.embedding_spaces():
-        held = ", ".join(store.embedding_spaces()) or "no vectors"
+    if FEATURE_SPACE not in store.embeddings.spaces():
+        held = ", ".join(store.embeddings.spaces()) or "no vectors"
         raise OptionError(f"a picture cannot be compared with {held} in {store.path}; run `list3r embed` on it")
     return PictureQuery(FEATURE_SPACE, color_feature(_middle(picture, chosen)), COLOR_PART)
 

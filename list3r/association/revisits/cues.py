@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.store.tables.chunks import LocalNode
+from list3r.memory.store.tables.local_instances import LocalNode
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

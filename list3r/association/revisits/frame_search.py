@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.records import ChunkRow
-from list3r.memory.store.derived import Derived
+from list3r.memory.store.store import Store
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -73,19 +73,6 @@ class Candidate:
     """The cosine on the scale of trained place recognition."""
 
 
-class DescriptorStore(Protocol):
-    """What of the memory is read here."""
-
-    derived: Derived
-    """Where the index is kept."""
-
-    def chunks(self, session_id: int | None = None) -> list[ChunkRow]: ...
-
-    def chunk_checksums(self) -> dict[int, int]: ...
-
-    def keyframe_descriptors(self, chunk_ids: Sequence[int] | None = None) -> tuple[Ints, Floats]: ...
-
-
 class FrameIndex:
     """Descriptors of the stored keyframes of one length."""
 
@@ -124,10 +111,10 @@ class FrameIndices:
         self.by_length.clear()
 
 
-def find_candidates(store: DescriptorStore, chunk_id: int, settings: SearchSettings | None = None) -> list[Candidate]:
+def find_candidates(store: Store, chunk_id: int, settings: SearchSettings | None = None) -> list[Candidate]:
     """Find stored frames that look like frames of a chunk, best first; of chunks that came before it only."""
     chosen = settings or SearchSettings()
-    rows = {c.chunk_id: c for c in store.chunks()}
+    rows = {c.chunk_id: c for c in store.chunks.all()}
     own_keys, own = _descriptors(store, [chunk_id])
     if not len(own_keys):
         return []
@@ -186,10 +173,10 @@ def _is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bo
     )
 
 
-def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> FrameIndices:
+def _index(store: Store, chunk_ids: Sequence[int]) -> FrameIndices:
     """Return index with all of the given chunks in it, read anew where a chunk is no longer the one that was read."""
     wanted = set(chunk_ids)
-    checksums = {k: c for k, c in store.chunk_checksums().items() if k in wanted}
+    checksums = {k: c for k, c in store.chunks.checksums().items() if k in wanted}
     known = store.derived.of(FrameIndices)
     if any(known.checksums[k] != checksums.get(k) for k in known.checksums):
         known.clear()
@@ -202,9 +189,9 @@ def _index(store: DescriptorStore, chunk_ids: Sequence[int]) -> FrameIndices:
     return known
 
 
-def _descriptors(store: DescriptorStore, chunk_ids: Sequence[int]) -> tuple[Ints, Floats]:
+def _descriptors(store: Store, chunk_ids: Sequence[int]) -> tuple[Ints, Floats]:
     """Return keys and unit descriptors of some chunks; what is not finite becomes zero and resembles nothing."""
-    keys, descriptors = store.keyframe_descriptors(chunk_ids)
+    keys, descriptors = store.keyframes.descriptors(chunk_ids)
     if not len(keys):
         return keys, np.zeros((0, 0), np.float32)
     descriptors = np.asarray(descriptors, np.float32)

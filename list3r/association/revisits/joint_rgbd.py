@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -12,31 +11,25 @@ from list3r.frames.base import Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import TrackingError
-from list3r.memory.records import JointWindow, Session
+from list3r.memory.records import JointWindow
 from list3r.reconstruction.base import Reconstruction, Reconstructor
 from list3r.reconstruction.keyframe_record import frame_samples
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
 
-class SessionStore(Protocol):
-    """What of the memory is read here."""
-
-    def sessions(self) -> list[Session]: ...
-
-
 class RgbdJointReconstructor:
     """A `JointReconstructor` that reads the sessions' sources, opened when a window is first asked for.
 
-    `options` are those that each session was built with, by session id; the defaults where it is silent.
+    By session id `paths` are those of the sources, `options` what it was built with; the defaults where that is silent.
     """
 
     def __init__(
         self,
-        store: SessionStore,
+        paths: Mapping[int, str],
         options: Mapping[int, SourceOptions] | None = None,
         reconstructor: Reconstructor | None = None,
     ) -> None:
-        self._store = store
+        self._paths = paths
         self._options = dict(options or {})
         self._reconstructor = reconstructor or RgbdReconstructor(poses="estimate")
         self._sources: dict[int, FrameSource] = {}
@@ -67,7 +60,7 @@ class RgbdJointReconstructor:
 
     def _source(self, session_id: int) -> FrameSource:
         if session_id not in self._sources:
-            path = next(s.source for s in self._store.sessions() if s.session_id == session_id)
+            path = self._paths[session_id]
             self._sources[session_id] = open_source(path, self._options.get(session_id, SourceOptions()))
         return self._sources[session_id]
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from list3r.association.revisits.cues import (
     instance_set,
     loop_score,
 )
-from list3r.association.revisits.frame_search import Candidate, DescriptorStore, SearchSettings, find_candidates
+from list3r.association.revisits.frame_search import Candidate, SearchSettings, find_candidates
 from list3r.association.revisits.joint_window import (
     JointReconstructor,
     Objection,
@@ -39,8 +38,8 @@ from list3r.association.revisits.scaled_verification import verify_scaled
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
-from list3r.memory.store.tables.chunks import LocalNode
+from list3r.memory.records import ChunkRow, Edge, Keyframe
+from list3r.memory.store.store import Store
 
 
 @dataclass(frozen=True)
@@ -78,20 +77,6 @@ class RevisitSettings:
     chain: ChainSettings = field(default_factory=ChainSettings)
 
 
-class KeyframeStore(DescriptorStore, Protocol):
-    """What of the memory is read here."""
-
-    def keyframe(self, chunk_id: int, frame_index: int) -> Keyframe: ...
-
-    def frame_samples(self, chunk_id: int) -> FrameSamples: ...
-
-    def local_nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]: ...
-
-    def feature_space(self, chunk_id: int) -> str: ...
-
-    def edges(self) -> list[Edge]: ...
-
-
 @dataclass(frozen=True)
 class _Scored:
     """A candidate with what the instances say of it."""
@@ -103,7 +88,7 @@ class _Scored:
 
 
 def find_loops(
-    store: KeyframeStore,
+    store: Store,
     chunk_id: int,
     joint: JointReconstructor | None = None,
     settings: RevisitSettings | None = None,
@@ -180,14 +165,14 @@ def _tells(keyframe: Keyframe) -> bool:
 class _Lookout:
     """The new chunk, and the stored ones it is compared with, read once each."""
 
-    def __init__(self, store: KeyframeStore, chunk_id: int, settings: RevisitSettings) -> None:
+    def __init__(self, store: Store, chunk_id: int, settings: RevisitSettings) -> None:
         self._store = store
         self._id = chunk_id
         self._settings = settings
-        self._rows = {c.chunk_id: c for c in store.chunks()}
+        self._rows = {c.chunk_id: c for c in store.chunks.all()}
         self._sides: dict[int, Side] = {}
         self._cues: dict[int, InstanceCues] = {}
-        self._ways = Ways(store.edges(), settings.chain)
+        self._ways = Ways(store.edges.all(), settings.chain)
         self._tied = self._ways.tied_to(chunk_id)
 
     def cues(self, u: int) -> InstanceCues:
@@ -205,7 +190,7 @@ class _Lookout:
         return scored.score < self._settings.least_score and not all(map(_tells, self._keyframes(scored.candidate)))
 
     def _keyframes(self, c: Candidate) -> tuple[Keyframe, Keyframe]:
-        return self._store.keyframe(c.u, c.frame_u), self._store.keyframe(self._id, c.frame_v)
+        return self._store.keyframes.get(c.u, c.frame_u), self._store.keyframes.get(self._id, c.frame_v)
 
     def refused(self, scored: _Scored, reason: str) -> Edge:
         """Return an edge that is kept only for the record."""
@@ -282,8 +267,8 @@ class _Lookout:
     def _side(self, chunk_id: int) -> Side:
         if chunk_id not in self._sides:
             row = self._rows[chunk_id]
-            samples, nodes = self._store.frame_samples(chunk_id), self._store.local_nodes([chunk_id])
-            space = self._store.feature_space(chunk_id)
+            samples, nodes = self._store.chunks.samples(chunk_id), self._store.local_instances.nodes([chunk_id])
+            space = self._store.chunks.feature_space(chunk_id)
             instances = instance_set(nodes, samples.T_chunk_cam, space, self._settings.cues)
             height, width = row.image_size
             moving = frozenset(n.local_id for n in nodes if n.dynamic)

@@ -19,12 +19,12 @@ _ALSO_DET = "cosine"
 
 def loop_report(store: Store) -> dict[str, Any]:
     """Edges, components and uncertainties as plain numbers."""
-    times = {(f.session_id, f.frame_index): f.time_s for f in store.frames() if f.state != "bad"}
-    sessions = {c.chunk_id: c.session_id for c in store.chunks()}
+    times = {(f.session_id, f.frame_index): f.time_s for f in store.frames.all() if f.state != "bad"}
+    sessions = {c.chunk_id: c.session_id for c in store.chunks.all()}
     return {
-        "edges": [_edge(e, sessions, times) for e in store.edges()],
-        "parts": _components(store.chunks()),
-        "chunk_poses": [_chunk(c) for c in store.chunks()],
+        "edges": [_edge(e, sessions, times) for e in store.edges.all()],
+        "parts": _components(store.chunks.all()),
+        "chunk_poses": [_chunk(c) for c in store.chunks.all()],
     }
 
 

@@ -13,8 +13,7 @@ from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
-    from list3r.memory.library.labels import DetectedLabel
-    from list3r.memory.records import Instance
+    from list3r.memory.records import DetectedLabel, Instance
 
 
 def register(app: typer.Typer) -> None:
@@ -59,15 +58,15 @@ def info(
 def memory_report(scene: SceneMemory) -> dict[str, Any]:
     """The facts of a memory."""
     store = scene.store
-    frames, chunks, edges = store.frames(), store.chunks(), store.edges()
+    frames, chunks, edges = store.frames.all(), store.chunks.all(), store.edges.all()
     states = {state: sum(f.state == state for f in frames) for state in ("posed", "lost", "bad")}
     return {
         "memory": str(scene.path),
         "size_mb": round(scene.path.stat().st_size / 1e6, 2),
         "beside": store.beside(),
-        "created_by": store.get_value("created_by"),
-        "scale": store.get_value("scale_kind"),
-        "scale_source": store.get_value("scale_source"),
+        "created_by": store.facts.created_by,
+        "scale": store.facts.scale_kind,
+        "scale_source": store.facts.scale_source,
         "units": scene.units,
         "gravity": scene.gravity,
         "frames": len(frames),
@@ -76,14 +75,14 @@ def memory_report(scene: SceneMemory) -> dict[str, Any]:
         "components": len({c.component for c in chunks}),
         "loops": sum(e.kind == "loop" and e.accepted for e in edges),
         "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
-        "instances": len(store.instances(structure=False)),
-        "structure": len(store.instances(structure=True)),
-        "relations": len(store.relations()),
-        "aliases": len(store.aliases()),
-        "embedding_spaces": store.embedding_spaces(),
+        "instances": len(store.instances.all(structure=False)),
+        "structure": len(store.instances.all(structure=True)),
+        "relations": len(store.relations.all()),
+        "aliases": len(store.ids.aliases()),
+        "embedding_spaces": store.embeddings.spaces(),
         "sessions": [
             {"id": s.session_id, "source": s.source, "frames": s.frame_count, "state": s.state}
-            for s in store.sessions()
+            for s in store.sessions.all()
         ],
     }
 
@@ -150,17 +149,17 @@ def show(
 
     Example: list3r show house.l3r 12
     """
-    from list3r.memory.library.labels import detected_labels, label_source
+    from list3r.memory.library.labels import label_source
 
     with open_memory(memory) as scene:
         instance = scene.instance(instance_id)
         relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
         names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
-        aliases = scene.store.aliases_of(instance.id)
+        aliases = scene.store.ids.aliases_of(instance.id)
         track = scene.track(instance.id) if instance.dynamic else None
-        parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations(instance.id)]
+        parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations.of(instance.id)]
         units = scene.units
-        named = detected_labels(scene.store).get(instance.id)
+        named = scene.store.detected_labels.all().get(instance.id)
     if json:
         related = [vars(r) for r in relations]
         told = {"relations": related, "aliases": aliases, "observed_as": parts}

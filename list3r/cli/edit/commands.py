@@ -46,7 +46,7 @@ def merges(
 
     with open_memory(memory) as scene, scene.store.snapshot():
         entries = scene.merges(instance_id)
-        edits = {e.entry: e for e in scene.store.edits()}
+        edits = {e.entry: e for e in scene.store.edits.all()}
         state = states(scene.store)
     if json:
         print_json(

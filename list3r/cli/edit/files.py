@@ -56,8 +56,8 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
             beside = scene.store.beside()
             found = scene.store.verify()
             if not found:
-                chunks = len(scene.store.chunks())
-                state = [{"id": s.session_id, "state": s.state} for s in scene.store.sessions()]
+                chunks = len(scene.store.chunks.all())
+                state = [{"id": s.session_id, "state": s.state} for s in scene.store.sessions.all()]
     except MemoryFileError as error:
         if not _is_broken(memory, error):
             raise

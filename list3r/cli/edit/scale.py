@@ -42,7 +42,7 @@ def scale(
         if not json:
             say(f"{report.text} (entry {report.entry})")
     with open_memory(memory) as scene:
-        kind, source = scene.store.get_value("scale_kind", "relative"), scene.store.get_value("scale_source")
+        kind, source = (scene.store.facts.scale_kind or "relative"), scene.store.facts.scale_source
         units = scene.units
     if json:
         told = None if anchor is None else report.as_dict()

@@ -41,7 +41,7 @@ def scale_of(path: Path) -> str:
     if not is_memory(path):
         return "metric"
     with open_memory(path) as scene:
-        return str(scene.store.get_value("scale_kind", "relative"))
+        return str(scene.store.facts.scale_kind or "relative")
 
 
 # ---------------------------------------------------------------------------------------------- trajectories
@@ -65,10 +65,10 @@ def _stored(path: Path) -> Trajectory:
 
     with open_memory(path) as scene:
         parts: dict[tuple[int, int], list[Any]] = {}
-        component_of = {c.chunk_id: c.component for c in scene.store.chunks()}
-        for frame, S_world_cam in scene.store.camera_poses():
+        component_of = {c.chunk_id: c.component for c in scene.store.chunks.all()}
+        for frame, S_world_cam in scene.store.trajectory.poses():
             parts.setdefault((frame.session_id, component_of[frame.chunk_id]), []).append((frame, S_world_cam))
-        frames = scene.store.frames()
+        frames = scene.store.frames.all()
     if not parts:
         raise OptionError(f"{path} has no frame with a pose; finish its build with --resume")
     session, component = min(parts, key=lambda k: (-len(parts[k]), k))
@@ -213,7 +213,7 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
 
     with open_memory(path) as scene:
         main = read_components(scene.store)[0]
-        supports = [scene.store.support(i.id).points.astype(np.float64) for i in main.instances]
+        supports = [scene.store.surfaces.of(i.id).points.astype(np.float64) for i in main.instances]
     points = np.concatenate([*supports, np.zeros((0, 3))])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -253,7 +253,9 @@ def mask_frames(store: Store, ids_folder: Path, every: int) -> Iterator[tuple[An
     from list3r.memory.errors import SourceError
     from list3r.memory.masks import decode_mask
 
-    tracks = [(o.instance_id, store.mask_track(o.chunk_id, o.local_id)) for o in store.observations()]
+    tracks = [
+        (o.instance_id, store.local_instances.mask_track(o.chunk_id, o.local_id)) for o in store.observations.all()
+    ]
     found: dict[int, dict[int, list[Any]]] = {}
     for instance_id, track in tracks:
         for frame, mask in zip(track.frames.tolist(), track.masks, strict=True):

@@ -62,9 +62,9 @@ def revisits(
             raise OptionError(f"--save {save}: the file must end in .npz")
         check_target(save)
     with open_memory(memory) as scene:
-        chunks = [c for c in scene.store.chunks() if c.session_id == session]
-        frames = scene.store.frames(session)
-        edges = scene.store.edges()
+        chunks = [c for c in scene.store.chunks.all() if c.session_id == session]
+        frames = scene.store.frames.all(session)
+        edges = scene.store.edges.all()
     if not chunks:
         raise OptionError(f"{memory} has no session {session}; `list3r info` lists them")
     found = read_covisibility_of(truth, every)

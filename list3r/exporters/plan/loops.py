@@ -14,7 +14,7 @@ def loop_ends(store: Store, component: Component) -> NDArray[np.float64]:
     session_of = {c.chunk_id: c.session_id for c in component.chunks}
     camera = {(f.session_id, f.frame_index): S_world_cam.translation for f, S_world_cam in component.poses}
     ends = []
-    for edge in store.edges():
+    for edge in store.edges.all():
         if edge.kind != "loop" or not edge.accepted or edge.frames is None:
             continue
         pair = [camera.get((session_of.get(k, -1), n)) for k, n in zip((edge.u, edge.v), edge.frames, strict=True)]

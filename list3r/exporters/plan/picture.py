@@ -52,7 +52,7 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
     sheet = Sheet(frame, layout, settings)
     draw_picture(sheet, component, supports)
     draw_boxes(sheet, things, {i.id for i in tagged})
-    moved = {i.id: store.track(i.id)[1] for i in component.instances if i.dynamic}
+    moved = {i.id: store.tracks.of(i.id)[1] for i in component.instances if i.dynamic}
     draw_tracks(sheet, {n: places[np.isfinite(places).all(axis=1)] for n, places in moved.items()})
     draw_loops(sheet, loop_ends(store, component))
     draw_camera_path(sheet, component)
@@ -80,7 +80,7 @@ def _subtitle(store: Store, component: Component) -> str:
         f"{len(component.instances) - len(structure)} things",
         f"structure: {kinds}" if kinds else "no structure",
         f"{len(component.poses):,} posed frames",
-        f"scale {store.get_value('scale_kind', 'relative')}",
+        f"scale {(store.facts.scale_kind or 'relative')}",
     ]
     return "  ·  ".join(words)
 
@@ -89,7 +89,7 @@ def _frame(
     store: Store, component: Component, supports: dict[int, Support], settings: PlanSettings, things: int
 ) -> tuple[PlanFrame, Layout]:
     """Choose a view with the walls along the page, everything inside, as large as the page allows."""
-    rotation, note = choose_rotation(component, store.get_value("gravity", "unknown"))
+    rotation, note = choose_rotation(component, store.facts.gravity)
     low, high = _extent(component, supports, rotation)
     if high[1] - low[1] > high[0] - low[0]:
         rotation = quarter_turn(rotation)

@@ -81,7 +81,7 @@ def set_time_range(stage: Usd.Stage, components: list[Component], store: Store) 
         return
     stage.SetStartTimeCode(min(frames))
     stage.SetEndTimeCode(max(frames))
-    rates = [frames_per_second(store.frames(s.session_id)) for s in store.sessions()]
+    rates = [frames_per_second(store.frames.all(s.session_id)) for s in store.sessions.all()]
     rate = next((r for r in rates if r is not None), 30.0)
     stage.SetTimeCodesPerSecond(round(rate, 3))
     stage.SetFramesPerSecond(round(rate, 3))

@@ -87,8 +87,8 @@ def _prepare(stage: Usd.Stage, store: Store) -> Usd.Prim:
         "format": "list3r-usd",
         "version": 1,
         "units": units(store),
-        "metric": str(store.get_value("scale_kind", "relative")),
-        "gravity": str(store.get_value("gravity", "unknown")),
+        "metric": str(store.facts.scale_kind or "relative"),
+        "gravity": store.facts.gravity,
     }
     if facts["units"] != "m":
         facts["note"] = "the scale of this memory is relative: metersPerUnit 1 is nominal, lengths are not metres"
@@ -135,7 +135,7 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
 
 def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:
     """Add samples of a moving thing's place, as it is turned where it was last; time codes are frame numbers."""
-    keys, _, places = store.track_frames(instance.id)
+    keys, _, places = store.tracks.frames(instance.id)
     if not len(keys):
         return
     translate = UsdGeom.Xformable(prim).GetOrderedXformOps()[0]
@@ -218,7 +218,7 @@ def _set_facts(prim: Usd.Prim, instance: Instance) -> None:
 def _add_relations(stage: Usd.Stage, store: Store, paths: dict[int, Sdf.Path]) -> None:
     """Add `list3r:relation:on` to subject, its targets the objects, with confidences and margins in the same order."""
     found: dict[tuple[int, str], list[tuple[Sdf.Path, float, float]]] = {}
-    for r in store.relations():
+    for r in store.relations.all():
         if r.subject in paths and r.object in paths:
             key = (r.subject, Tf.MakeValidIdentifier(r.predicate))
             found.setdefault(key, []).append((paths[r.object], r.confidence, r.margin))

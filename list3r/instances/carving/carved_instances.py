@@ -36,7 +36,7 @@ from list3r.memory.masks import encode_mask
 from list3r.memory.overlap.visibility import DepthView, views_of
 from list3r.memory.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.chunks import LocalNode
+from list3r.memory.store.tables.local_instances import LocalNode
 
 __all__ = ["ChangedPlaceSettings", "add_changed_places"]
 
@@ -48,17 +48,17 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
     here are left as they are.
     """
     s = settings or ChangedPlaceSettings()
-    chunks = store.chunks()
+    chunks = store.chunks.all()
     worlds = {c.component for c in chunks if c.session_id == session_id}
     near = [c for c in chunks if c.component in worlds and c.session_id <= session_id]
     if len({c.session_id for c in near}) < 2:
         return 0
-    keyframes = {c.chunk_id: store.keyframes(c.chunk_id) for c in near}
-    upright = store.get_value("gravity", "unknown") != "unknown"
+    keyframes = {c.chunk_id: store.keyframes.of(c.chunk_id) for c in near}
+    upright = store.facts.gravity != "unknown"
     asked: list[tuple[ChunkRow, list[DepthView], float, CarvedSurfaces]] = []
     for chunk in near:
         others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
-        if others and store.feature_space(chunk.chunk_id) == FEATURE_SPACE:
+        if others and store.chunks.feature_space(chunk.chunk_id) == FEATURE_SPACE:
             unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
             own = views_of([chunk], keyframes, unit)
             asked.append((chunk, own, unit, ask(own, views_of(others, keyframes, unit), unit, s)))
@@ -67,13 +67,13 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
     for chunk, own, unit, seen in asked:
         here = [c for c, *_ in asked if c.component == chunk.component]
         came = [left[c.chunk_id] for c in here if _is(c, session_id) != _is(chunk, session_id)]
-        nodes = store.local_nodes([chunk.chunk_id])
+        nodes = store.local_instances.nodes([chunk.chunk_id])
         place = _Change(left[chunk.chunk_id], came, told(seen, s), unit, s)
         standing = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
         clusters = _unexplained(place, nodes, standing, chunk)
         if not clusters:
             continue
-        frames = [f for f in store.frames(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
+        frames = [f for f in store.frames.all(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
         pictures = [_picture(k) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
         maker = _Maker(chunk, list(zip(own, pictures, strict=True)), frames, unit, upright, s)
         in_chunk = unit / float(chunk.S_world_chunk.scale)
@@ -81,8 +81,8 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         for cluster in clusters:
             thing = maker.make(following, cluster)
             if thing is not None:
-                store.add_local_instance(chunk.chunk_id, thing)
-                store.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, standing, in_chunk, s))
+                store.local_instances.add(chunk.chunk_id, thing)
+                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, standing, in_chunk, s))
                 following += 1
                 added += 1
     return added

@@ -73,7 +73,7 @@ def find_changes(
     if len(sessions) < 2:
         return Changes(groups, {}, {}, (), [])
     places = Places(store, groups, chunks, summaries, settings)
-    matching = ChangeMatching(places, found, store.constraints(), settings)
+    matching = ChangeMatching(places, found, store.edits.constraints(), settings)
     for session in sessions[1:]:
         matching.match(session)
     return matching.result()

@@ -50,7 +50,7 @@ class FreeSpaceCarving:
         """Return the keyframes of a chunk, in its own coordinates."""
         k = shapes.chunk_id
         if k not in self._views:
-            self._views[k] = chunk_views(shapes.session_id, self._store.keyframes(k), shapes.unit)
+            self._views[k] = chunk_views(shapes.session_id, self._store.keyframes.of(k), shapes.unit)
         self._views.move_to_end(k)
         while len(self._views) > _KEPT:
             self._views.popitem(last=False)

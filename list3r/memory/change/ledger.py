@@ -14,9 +14,9 @@ from scipy.cluster.hierarchy import DisjointSet
 from list3r.memory.change.records import Changes
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.records import ChunkRow
+from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
 
-_NAME = "tale"
 Group = tuple[Key, ...]
 
 
@@ -116,20 +116,17 @@ def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> M
 
 def read_ledger(store: Store, chunks: Sequence[ChunkRow]) -> ChangeLedger | None:
     """Return what stands of changes; None where several sessions have ended and nothing is written down of them."""
-    told = store.get_value(_NAME)
+    told = store.facts[_LEDGER]
     if told is not None:
-        moved = (MovedInstance(tuple(_keys(p) for p in m["places"]), int(m["now"])) for m in told["moved"])
-        return ChangeLedger(int(told["session"]), tuple(moved), frozenset(_keys(told["told"])))
-    complete = {s.session_id for s in store.sessions() if s.state == "complete"}
+        return told
+    complete = {s.session_id for s in store.sessions.all() if s.state == "complete"}
     ended = sorted({c.session_id for c in chunks} & complete)
     return ChangeLedger(ended[0] if ended else 0) if len(ended) < 2 else None
 
 
 def write_ledger(store: Store, ledger: ChangeLedger) -> None:
     """Keep it; call inside `transaction()`."""
-    moved = [{"places": [list(map(list, p)) for p in m.places], "now": m.now} for m in ledger.moved]
-    store.set_value(_NAME, {"session": ledger.session, "moved": moved, "told": sorted(map(list, ledger.with_events))})
+    store.facts[_LEDGER] = ledger
 
 
-def _keys(pairs: Sequence[Sequence[int]]) -> Group:
-    return tuple((int(k), int(n)) for k, n in pairs)
+_LEDGER = Fact[ChangeLedger | None]("change_ledger", ChangeLedger, None)

@@ -57,7 +57,7 @@ class Places:
         self.rows = {c.chunk_id: c for c in chunks}
         self.shapes: dict[int, ChunkShapes] = {k: v.shapes for k, v in summaries.items()}
         self.unit = world_unit(chunks, summaries)
-        self._upright = store.get_value("gravity", "unknown") != "unknown"
+        self._upright = store.facts.gravity != "unknown"
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
         self._views: dict[tuple[int, int], list[DepthView]] = {}
@@ -244,7 +244,7 @@ class Places:
     def _views_of(self, session: int, component: int) -> list[DepthView]:
         if (session, component) not in self._views:
             rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
-            keyframes = {c.chunk_id: self._store.keyframes(c.chunk_id) for c in rows}
+            keyframes = {c.chunk_id: self._store.keyframes.of(c.chunk_id) for c in rows}
             self._views[session, component] = views_of(rows, keyframes, self.unit)
         return self._views[session, component]
 

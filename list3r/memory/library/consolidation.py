@@ -27,6 +27,7 @@ from list3r.memory.library.identities import Identities
 from list3r.memory.library.region import DirtySet, Region
 from list3r.memory.library.rows import log_decisions, moved
 from list3r.memory.library.rules import (
+    WORLD,
     ConsolidationReport,
     ConsolidationSettings,
     World,
@@ -63,11 +64,11 @@ def consolidate(
     comes to the same library.
     """
     s = settings_of(store, settings)
-    chunks = store.chunks()
+    chunks = store.chunks.all()
     if not chunks:
         return ConsolidationReport(0, 0, (), (), 0)
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
-    summaries, before = chunk_summaries(store, s.shapes), store.settled()
+    summaries, before = chunk_summaries(store, s.shapes), store.library.settled.all()
     ledger, world = read_ledger(store, chunks), _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))
     if ledger is None or world is None or _most_moved(store, moved, len(before), world, s):
@@ -80,14 +81,14 @@ def consolidate(
     report = _derive(region, dirty, ledger, last, ended=ended)
     if ended and not dirty.whole:
         _put_exactly(region, report.written or ())
-    store.set_value("library", replace(world, edits=last_edit(store)).as_dict())
-    store.touched = set()
+    store.facts[WORLD] = replace(world, edits=last_edit(store))
+    store.library.touched = set()
     return report
 
 
 def _standing_world(store: Store, summaries: Summaries, s: ConsolidationSettings, *, ended: bool) -> World | None:
     """Return what the instances were derived with, where that still holds; None for a short memory."""
-    chunks = store.chunks()
+    chunks = store.chunks.all()
     world = known_world(store, chunks, s) if len(chunks) > s.whole_chunks else None
     if world is None or len(chunks) < 2 * world.chunks or not (ended or len(chunks) <= _LOOKED_AT):
         return world
@@ -97,14 +98,14 @@ def _standing_world(store: Store, summaries: Summaries, s: ConsolidationSettings
 
 def _replaced(store: Store, settled: Collection[int]) -> set[int] | None:
     """Return chunks that were placed since the last derivation; None where that is not known."""
-    if store.touched is None:
+    if store.library.touched is None:
         return None
-    return store.touched | {c.chunk_id for c in store.chunks()[-1:] if c.chunk_id not in settled}
+    return store.library.touched | {c.chunk_id for c in store.chunks.all()[-1:] if c.chunk_id not in settled}
 
 
 def _most_moved(store: Store, moved: Collection[int], known: int, world: World, s: ConsolidationSettings) -> bool:
     """Return whether so many chunks have moved that all are derived anew, or one has another feature space."""
-    other_space = world.space and any(store.feature_space(k) != world.space for k in moved)
+    other_space = world.space and any(store.chunks.feature_space(k) != world.space for k in moved)
     return bool(other_space) or len(moved) > max(2, s.whole_share * known)
 
 
@@ -137,9 +138,11 @@ def _derive(
         writer.relate(touched)
         log_decisions(store, chunk_id, decisions, named.before, named.ids)
         ids = named.ids
-    instances, structure = store.instance_count()
+    instances, structure = store.instances.count()
     written = None if dirty.whole else frozenset(touched)
-    return ConsolidationReport(instances, structure, ids.new, ids.aliases, store.hidden_groups(), written)
+    return ConsolidationReport(
+        instances, structure, ids.new, ids.aliases, store.library.members.hidden_groups(), written
+    )
 
 
 def _told_otherwise(group: Group, before: ChangeLedger, now: ChangeLedger) -> bool:
@@ -154,14 +157,14 @@ def _put_exactly(region: Region, written: Collection[int]) -> None:
     store = region.store
     fresh: dict[int, Anchor] = {}
     records = []
-    for n, anchor in store.anchors().items():
-        now = store.chunk(anchor.chunk_id).S_world_chunk @ region.pose(anchor.chunk_id).inverse()
+    for n, anchor in store.library.anchors.all().items():
+        now = store.chunks.get(anchor.chunk_id).S_world_chunk @ region.pose(anchor.chunk_id).inverse()
         if n in written or np.array_equal(now.as_matrix(), anchor.S_exact_settled.as_matrix()):
             continue
-        (instance,) = store.instances_of([n])
+        (instance,) = store.instances.of([n])
         there = moved(moved(instance, anchor.S_exact_settled.inverse()), now)
-        seen_in = [store.chunk(k) for k in sorted({o.chunk_id for o in store.observations(n)})]
+        seen_in = [store.chunks.get(k) for k in sorted({o.chunk_id for o in store.observations.of(n)})]
         records.append(replace(there, position_sigma_m=position_sigma(there.center, seen_in)))
         fresh[n] = Anchor(anchor.chunk_id, now)
-    store.put_instances(records)
-    store.put_anchors(fresh)
+    store.instances.put(records)
+    store.library.anchors.put(fresh)

@@ -19,7 +19,7 @@ class Grouping:
 
     def __init__(self, region: Region, dirty: DirtySet, ledger: ChangeLedger) -> None:
         self.region, self.dirty, self.ledger = region, dirty, ledger
-        self.constraints = region.store.constraints()
+        self.constraints = region.store.edits.constraints()
         self.home: dict[Key, Group] = {}
         """The group of each local instance of the chunks that were looked up, as it is now."""
         self.before: dict[Key, Group] = {}
@@ -34,9 +34,9 @@ class Grouping:
         if not missing:
             return
         self._known.update(missing)
-        found = self.region.store.members_in(missing)
-        for first, shown in sorted({v for v in found.values()}):
-            group = tuple(self.region.store.group_of(first))
+        found = self.region.store.library.members.of(missing)
+        for first, shown in sorted({(m.first, m.shown) for m in found.values()}):
+            group = tuple(self.region.store.library.members.group(first))
             if group and group[0] not in self.before:
                 self.before.update(dict.fromkeys(group, group))
                 self.shown_before[group] = shown

@@ -139,7 +139,7 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
     m, cache = members, store.derived.of(InstanceCache)
     shown_by = m.of(m.shown_by)
     poses = tuple(
-        (store.node_checksum(k), m.chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in m.group})
+        (store.chunks.checksum(k), m.chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in m.group})
     )
     cuts = b"".join(np.packbits(x.dropped[slice(*x.span)]).tobytes() for x in shown_by)
     key = (instance_id, m.component, m.upright, tuple(m.group), tuple(m.shown_by), poses, cuts, m.mover, settings)

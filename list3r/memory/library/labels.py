@@ -1,6 +1,6 @@
 """What instances are called by detectors and by discoverers with class names: votes kept for local instances.
 
-Votes are log odds that add up, kept in the key-value table for each chunk and each source, so that labels follow
+Votes are log odds that add up, kept for each local instance and each source, so that labels follow
 whatever becomes of the groups, and a source that looks again replaces what it said itself and nothing else. An
 operator's word always wins, a name that an operator took away stays away, and structure is never named.
 """
@@ -9,42 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from list3r.memory.constraints import Key
-from list3r.memory.records import Instance
+from list3r.memory.records import DetectedLabel, Instance, Votes
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
 
-_CLASSES = "label classes"
-"""Key of the classes that each source knows; there as soon as one has voted."""
 _SCORES = (0.02, 0.98)
 """No score of a discoverer is taken for less or more than this."""
 PRIOR_ODDS = math.log(0.02 / 0.98)
 """Log odds that an instance is of a given class before anything is seen: some fifty kinds of instances stand in
 rooms."""
-
-
-@dataclass(frozen=True)
-class Votes:
-    """What was seen of a local instance, or of several together."""
-
-    missed: float
-    """Log odds that every class loses for all frames that looked; a class has them back for those that found it."""
-    classes: Mapping[str, tuple[float, float]]
-    """By class: in how many pictures it was found (weighted), and the log odds that they add up to."""
-    looks: float = 0.0
-    """In how many pictures it was looked at (weighted); 0 where nobody counted."""
-
-    def __add__(self, other: Votes) -> Votes:
-        names = sorted({*self.classes, *other.classes})
-        zero = (0.0, 0.0)
-        return Votes(
-            self.missed + other.missed,
-            {n: _plus(self.classes.get(n, zero), other.classes.get(n, zero)) for n in names},
-            self.looks + other.looks,
-        )
 
 
 @dataclass(frozen=True)
@@ -63,19 +40,6 @@ class LabelSettings:
     """A detector may be wrong in the same way in every picture; no label is surer than one less this."""
 
 
-@dataclass(frozen=True)
-class DetectedLabel:
-    """A label and where it comes from."""
-
-    label: str
-    confidence: float
-    """Probability of the class, in [0, 1]."""
-    found: float
-    """Independent pictures in which it was found, weighted."""
-    detector: str
-    """Who found it, by name, with commas between several."""
-
-
 def put_votes(
     store: Store, chunk_id: int, source: str, votes: Mapping[int, Votes], class_names: Iterable[str] | None = None
 ) -> None:
@@ -83,19 +47,22 @@ def put_votes(
 
     `class_names` are the classes that it knows, where that is a closed list: it says nothing against others.
     """
-    rows = {
-        str(n): [
-            round(v.missed, 4),
-            {c: [round(a, 4), round(b, 4)] for c, (a, b) in v.classes.items()},
-            round(v.looks, 4),
-        ]
-        for n, v in sorted(votes.items())
-    }
-    store.set_value(_key(chunk_id), {**store.get_value(_key(chunk_id), {}), source: rows})
-    known = store.get_value(_CLASSES, {})
+    store.votes.put(
+        chunk_id,
+        source,
+        {
+            n: Votes(
+                round(v.missed, 4),
+                {c: (round(a, 4), round(b, 4)) for c, (a, b) in v.classes.items()},
+                round(v.looks, 4),
+            )
+            for n, v in votes.items()
+        },
+    )
+    known = dict(store.facts.label_classes or {})
     names = None if class_names is None else sorted(class_names)
     if source not in known or known[source] != names:
-        store.set_value(_CLASSES, {**known, source: names})
+        store.facts.label_classes = {**known, source: names}
 
 
 def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
@@ -111,18 +78,6 @@ def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
         p = min(max(score, _SCORES[0]), _SCORES[1])
         classes[name] = _plus(classes.get(name, (0.0, 0.0)), (0.5, 0.5 * (math.log(p / (1.0 - p)) - PRIOR_ODDS)))
     return Votes(0.0, classes, looks)
-
-
-def votes_of(store: Store, chunk_id: int) -> dict[str, dict[int, Votes]]:
-    """By source, its votes by local id; nothing where none looked at the chunk."""
-    told: dict[str, dict[str, Any]] = store.get_value(_key(chunk_id), {})
-    return {
-        source: {
-            int(n): Votes(missed, {c: (a, b) for c, (a, b) in got.items()}, *looks)
-            for n, (missed, got, *looks) in rows.items()  # before looks were counted there were two
-        }
-        for source, rows in told.items()
-    }
 
 
 def decide(
@@ -160,12 +115,6 @@ def _said(votes: Votes, name: str, known: Collection[str] | None, likeness: floa
     return found, (got - missed) / (1.0 + likeness * max(votes.looks - 1.0, 0.0))
 
 
-def detected_labels(store: Store) -> dict[int, DetectedLabel]:
-    """Return the labels that instances have from detectors and discoverers, by id."""
-    rows: dict[str, list[Any]] = store.get_value("detected labels", {})
-    return {int(n): DetectedLabel(str(r[0]), float(r[1]), float(r[2]), str(r[3])) for n, r in rows.items()}
-
-
 def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str, Any]:
     """Return who gave an instance its label and how sure that is, for JSON; nothing for one without a label."""
     if instance.label is None:
@@ -184,14 +133,14 @@ def apply_labels(
     returned. Nothing is done to a memory that no detector looked at. Call inside `transaction()`, after the library was
     derived.
     """
-    known = store.get_value(_CLASSES)
+    known = store.facts.label_classes
     if known is None:
         return {}
     settings = settings or stored_settings(store, LabelSettings, "library", "labels")
-    before: dict[str, list[Any]] = store.get_value("detected labels", {})
-    instances = store.instances() if written is None else store.instances_of(sorted(written))
+    before = store.detected_labels.all()
+    instances = store.instances.all() if written is None else store.instances.of(sorted(written))
     home = _home(store, None if written is None else [i.id for i in instances])
-    votes = {chunk_id: votes_of(store, chunk_id) for chunk_id in sorted({k for k, _ in home})}
+    votes = {chunk_id: store.votes.of(chunk_id) for chunk_id in sorted({k for k, _ in home})}
     spoken = _named_by_operators(store, home)
     members: dict[int, list[Key]] = {}
     for key, n in home.items():
@@ -205,19 +154,19 @@ def apply_labels(
         if label is not None:
             out[i.id] = label
         text = None if label is None else label.label
-        if i.label != text and (text is not None or str(i.id) in before):
+        if i.label != text and (text is not None or i.id in before):
             changed[i.id] = text
-    store.set_labels(changed)
-    rows = {} if written is None else {n: row for n, row in before.items() if int(n) not in written}
-    rows |= {str(n): [d.label, round(d.confidence, 4), round(d.found, 2), d.detector] for n, d in out.items()}
-    if rows != before:
-        store.set_value("detected labels", dict(sorted(rows.items(), key=lambda row: int(row[0]))))
+    store.instances.set_labels(changed)
+    store.detected_labels.replace(
+        {n: replace(d, confidence=round(d.confidence, 4), found=round(d.found, 2)) for n, d in out.items()},
+        None if written is None else written,
+    )
     return out
 
 
 def _home(store: Store, ids: Iterable[int] | None) -> dict[Key, int]:
     """Return which instance each local instance belongs to, of all instances or of some."""
-    rows = store.observations() if ids is None else [o for n in ids for o in store.observations(n)]
+    rows = store.observations.all() if ids is None else [o for n in ids for o in store.observations.of(n)]
     return {(o.chunk_id, o.local_id): o.instance_id for o in rows}
 
 
@@ -241,12 +190,8 @@ def _label(
 
 def _named_by_operators(store: Store, home: Mapping[Key, int]) -> Collection[int]:
     """Return instances of which an operator said what they are called, or that they are called nothing."""
-    return {home[k] for keys, _ in store.constraints().labels for k in keys if k in home}
+    return {home[k] for keys, _ in store.edits.constraints().labels for k in keys if k in home}
 
 
 def _plus(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
     return a[0] + b[0], a[1] + b[1]
-
-
-def _key(chunk_id: int) -> str:
-    return f"label votes {chunk_id}"

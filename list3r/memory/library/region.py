@@ -70,12 +70,12 @@ class Region:
     def __init__(self, store: Store, summaries: Summaries, world: World, settings: ConsolidationSettings) -> None:
         self.store, self.world, self.settings = store, world, settings
         self.summaries = summaries
-        self.rows = store.settled()
+        self.rows = store.library.settled.all()
         """The settled chunks by id."""
         self._extents = np.array([r.extent for r in self.rows.values()])
-        self._T_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+        self._T_world_graph = store.facts.S_world_graph
         self._carving = FreeSpaceCarving(store, settings.changes.visibility)
-        self.has_motion = store.has_moving()
+        self.has_motion = store.local_instances.any_dynamic()
         """Whether any local instance was seen moving."""
         self._summary: dict[int, ChunkSummary] = {}
         self._poses: dict[int, Sim3] = {}
@@ -118,12 +118,12 @@ class Region:
 
     def settled_chunk(self, chunk_id: int) -> ChunkRow:
         """Return the row of a chunk, with its settled pose."""
-        return replace(self.store.chunk(chunk_id), S_world_chunk=self.pose(chunk_id))
+        return replace(self.store.chunks.get(chunk_id), S_world_chunk=self.pose(chunk_id))
 
     def times_of(self, chunk_id: int) -> dict[tuple[int, int], float]:
         """Return seconds by (session id, Frame.index) of the frames in the span of a chunk."""
         if chunk_id not in self._times:
-            self._times[chunk_id] = self.store.frame_times(self.store.chunk(chunk_id))
+            self._times[chunk_id] = self.store.frames.times(self.store.chunks.get(chunk_id))
         return self._times[chunk_id]
 
     def near(self, chunk_id: int, here: SettledRow | None = None) -> list[int]:
@@ -140,12 +140,12 @@ class Region:
         """Write the overlaps of dirty chunks, measured anew where one of the two has moved; return the local instances
         of which most lay on another one, or the other way round, by what was written before.
         """
-        stored = self.store.overlaps(sorted(dirty.chunks))
+        stored = self.store.library.overlaps.all(sorted(dirty.chunks))
         near = {(min(k, n), max(k, n)) for k in dirty.chunks for n in self.near(k)}
         kept = {p for p in near if p in stored and dirty.moved.isdisjoint(p)}
         fresh = {p: pack_scores(self._score(*p)) for p in sorted(near - kept)}
-        self.store.drop_overlaps(stored.keys() - near)
-        self.store.put_overlaps(fresh)
+        self.store.library.overlaps.drop(stored.keys() - near)
+        self.store.library.overlaps.put(fresh)
         left: set[Key] = set()
         for u, v in stored.keys() - kept:
             p = unpack_scores(stored[u, v])
@@ -162,7 +162,7 @@ class Region:
         """Return the scores of all pairs of which one is among these chunks, in order."""
         wanted = set(chunk_ids)
         missing = sorted(wanted - self._paired)
-        for pair in self.store.overlapping(missing) if missing else ():
+        for pair in self.store.library.overlaps.pairs(missing) if missing else ():
             if pair not in self._pairs:
                 self._pairs[pair] = self._linked_pair(pair)
         self._paired |= wanted
@@ -174,7 +174,7 @@ class Region:
         found = kept.get(pair)
         if found is None or any(a is not b for a, b in zip(found.rows, rows, strict=True)) or found.stamp != stamp:
             shapes = {k: self.shapes(k) for k in pair}
-            known = {pair: unpack_scores(self.store.overlap(pair))}
+            known = {pair: unpack_scores(self.store.library.overlaps.get(pair))}
             known = without_moving(known, shapes, self.motions(pair))
             graph = {k: self.rows[k].S_graph_chunk for k in pair}
             scores = across_sessions(known, shapes, graph, self._carving, self.settings.changes)[pair]
@@ -222,7 +222,9 @@ class Region:
 
     def near_in_time(self, chunk_ids: Collection[int]) -> set[int]:
         """Return the chunks seen so shortly before or after one of these that what moves may be the same."""
-        order = sorted(self.rows, key=lambda k: (self.store.chunk(k).session_id, self.store.chunk(k).first_frame))
+        order = sorted(
+            self.rows, key=lambda k: (self.store.chunks.get(k).session_id, self.store.chunks.get(k).first_frame)
+        )
         at = {k: n for n, k in enumerate(order)}
         out = set(chunk_ids)
         for k in chunk_ids:
@@ -232,7 +234,7 @@ class Region:
 
     def _meet_in_time(self, a: int, b: int) -> bool:
         """Return whether two chunks of one session lie so near in time that what moves may be the same."""
-        if self.store.chunk(a).session_id != self.store.chunk(b).session_id:
+        if self.store.chunks.get(a).session_id != self.store.chunks.get(b).session_id:
             return False
         one, two = (list(self.times_of(k).values()) or [0.0] for k in (a, b))
         return max(min(two) - max(one), min(one) - max(two)) <= self.settings.moving.most_gap_s
@@ -242,7 +244,9 @@ class Region:
     def span_of(self, chunk_id: int) -> Array:
         """Return the box round the points and the cameras of a chunk, in the frame of the graph. Shape (2, 3)."""
         extent = self.rows[chunk_id].extent
-        frames = [f.T_chunk_cam[:3, 3] for f in self.store.frames_of(self.store.chunk(chunk_id)) if f.state == "posed"]
+        frames = [
+            f.T_chunk_cam[:3, 3] for f in self.store.frames.of(self.store.chunks.get(chunk_id)) if f.state == "posed"
+        ]
         if not frames:
             return extent
         at = self.rows[chunk_id].S_graph_chunk.apply(np.array(frames))

@@ -85,7 +85,7 @@ def log_decisions(
     for d in decisions:
         a, b = _key(d.a), _key(d.b)
         held = d.kind == "merge" and a in before and before[a] == before.get(b)
-        if not held and not store.has_decided(d.kind, d.a, d.b):
+        if not held and not store.merges.has_decided(d.kind, d.a, d.b):
             fresh.append(d)
     for old, new in ids.aliases:
         reason = f"#{old} and #{new} are one instance; the older id stays"
@@ -93,7 +93,7 @@ def log_decisions(
     for old, new in ids.splits:
         reason = f"what was #{old} is more than one instance; the larger part keeps the id"
         fresh.append(MergeDecision("split", f"#{old}", f"#{new}", {}, reason))
-    store.log_decisions(chunk_id, fresh)
+    store.merges.add_all(chunk_id, fresh)
 
 
 def _key(name: str) -> Key:

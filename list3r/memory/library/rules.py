@@ -23,6 +23,7 @@ from list3r.memory.records import ChunkRow
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.relations.structure import StructureSettings
 from list3r.memory.settings import stored_settings
+from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
 from list3r.memory.world.gravity import GravitySettings, floor_height
 
@@ -57,7 +58,7 @@ def settings_of(store: Store, settings: ConsolidationSettings | None) -> Consoli
     What no sensor measured is less exact.
     """
     s = settings or stored_settings(store, ConsolidationSettings, "library")
-    if store.get_value("scale_kind", "metric") == "metric":
+    if store.facts.scale_kind == "metric":
         return s
     noise, band = s.relations.computed_noise_m, s.structure.computed_floor_band_m
     return replace(
@@ -109,12 +110,6 @@ class World:
     edits: int = 0
     """The last edit of an operator that was obeyed."""
 
-    def as_dict(self) -> dict[str, object]:
-        """For the key-value table."""
-        light = [self.light.white_l, *self.light.cast_ab]
-        plain = {k: v for k, v in vars(self).items() if k != "light"}
-        return {**plain, "light": light}
-
     def near(self, other: World) -> bool:
         """Return whether what was derived with the other one holds: the light, the unit and the floor may differ a
         little.
@@ -135,6 +130,9 @@ class World:
         return lit and risen <= _FLOOR_M * self.unit
 
 
+WORLD = Fact[World | None]("library", World, None)
+"""What the library was derived with; None where it has to be derived as a whole."""
+
 _UNIT, _FLOOR_M = 0.02, 0.03
 _WHITE_L, _CAST = 3.0, 2.0
 """Changes that do not turn one colour name into another for more than borderline cases."""
@@ -146,7 +144,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
     upright = _upright(store)
     inside = [c for c in chunks if c.component == first]
     unit = world_unit(chunks, summaries)
-    spaces = {store.feature_space(c.chunk_id) for c in sample_of(chunks)}
+    spaces = {store.chunks.feature_space(c.chunk_id) for c in sample_of(chunks)}
     return World(
         unit=unit,
         light=light_of(chunks, summaries),
@@ -154,7 +152,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         upright=upright,
         first=first,
         chunks=len(chunks),
-        posed=store.posed_count(_POSED),
+        posed=store.frames.posed_count(_POSED),
         space=spaces.pop() if len(spaces) == 1 else "",
         stamp=_stamp(store, s),
         edits=last_edit(store),
@@ -163,24 +161,22 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
 
 def known_world(store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) -> World | None:
     """Return what the library was derived with, where that still holds as far as can be told without looking at all."""
-    told = store.get_value("library")
-    if not told:
+    world = store.facts[WORLD]
+    if world is None:
         return None
-    white, a, b = told.pop("light")
-    world = World(light=Reference(white, (a, b)), **told)
-    now = (_upright(store), min(c.component for c in chunks), store.posed_count(_POSED), _stamp(store, s))
+    now = (_upright(store), min(c.component for c in chunks), store.frames.posed_count(_POSED), _stamp(store, s))
     return world if (world.upright, world.first, world.posed, world.stamp) == now else None
 
 
 def _upright(store: Store) -> bool:
-    return bool(store.get_value("gravity", "unknown") != "unknown")
+    return store.facts.gravity != "unknown"
 
 
 def _floor(store: Store, inside: list[ChunkRow], summaries: Summaries, unit: float) -> float | None:
     """0 where the world was laid on its floor, else the height at which the planes show one."""
-    estimate = store.get_value("gravity_estimate")
+    estimate = store.facts.gravity_estimate
     if estimate is not None:
-        return None if estimate["floor_height"] is None else 0.0
+        return None if estimate.floor_height is None else 0.0
     some = sample_of(inside)
     cameras = cameras_of(store, some).translation
     planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in some])
@@ -188,17 +184,17 @@ def _floor(store: Store, inside: list[ChunkRow], summaries: Summaries, unit: flo
 
 
 def _stamp(store: Store, s: ConsolidationSettings) -> int:
-    return zlib.crc32(repr((s, store.get_value("T_world_graph"), store.get_value("scale_kind"))).encode())
+    return zlib.crc32(repr((s, store.facts.S_world_graph, store.facts.scale_kind)).encode())
 
 
 def last_edit(store: Store) -> int:
     """Return the entry of the last edit, 0 where there is none."""
-    return max((e.entry for e in store.edits()), default=0)
+    return max((e.entry for e in store.edits.all()), default=0)
 
 
 def edited_since(store: Store, since: int) -> frozenset[Key]:
     """Return the local instances that edits after an entry name; an undo names those of what it takes back."""
-    edits = {e.entry: e for e in store.edits()}
+    edits = {e.entry: e for e in store.edits.all()}
     left = [e for n, e in edits.items() if n > since]
     out: set[Key] = set()
     while left:

@@ -37,7 +37,7 @@ class SessionChanges:
         groups and the decisions.
         """
         region = self._g.region
-        rows = {k: self._store.chunk(k) for k in self._rows}
+        rows = {k: self._store.chunks.get(k) for k in self._rows}
         first = min(c.session_id for c in rows.values())
         later = [k for k, c in rows.items() if c.session_id > first]
         if not later:
@@ -66,7 +66,7 @@ class SessionChanges:
     def state(self, before: str | None, group: Group) -> str:
         """Return the state of a group, which was in the state `before`."""
         if self._found is None:
-            return self._g.ledger.state(before, group, {k: self._store.chunk(k) for k in {k for k, _ in group}})
+            return self._g.ledger.state(before, group, {k: self._store.chunks.get(k) for k in {k for k, _ in group}})
         if group[0] in self._found.states:
             return self._found.states[group[0]]
         unseen = group not in self._compared and self._rows[group[0][0]].component in self._apart
@@ -78,13 +78,13 @@ class SessionChanges:
         """
         if self._found is None:
             return {}, {}
-        owner = self._store.observed_as([g[0] for g in groups])
-        self._store.replace_events(as_events(self._found, owner))
+        owner = self._store.observations.owners([g[0] for g in groups])
+        self._store.events.replace(as_events(self._found, owner))
         states = {n: self._found.states.get(key, "present") for key, n in owner.items()}
-        now = self._store.states()
+        now = self._store.instances.states()
         for n, (_, component) in now.items():
             states.setdefault(n, "unseen" if component in self._apart else "present")
         fresh = {n: states[n] for n, (was, _) in now.items() if states[n] != was}
-        self._store.set_states(fresh)
+        self._store.instances.set_states(fresh)
         turned = [n for n, s in fresh.items() if "removed" in (s, now[n][0])]
-        return fresh, {i.id: i.aabb for i in self._store.instances_of(sorted(turned))}
+        return fresh, {i.id: i.aabb for i in self._store.instances.of(sorted(turned))}

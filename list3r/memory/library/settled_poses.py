@@ -42,9 +42,9 @@ def settle(
     Writes to the table `settled`, so that a build that goes on takes up the same poses.
     """
     s = settings or HysteresisSettings()
-    chunks = store.chunks() if among is None else [store.chunk(k) for k in sorted(among)]
+    chunks = store.chunks.all() if among is None else [store.chunks.get(k) for k in sorted(among)]
     T_graph_world = _world_of_graph(store).inverse()
-    before = store.settled()
+    before = store.library.settled.all()
     fresh: dict[int, SettledRow] = {}
     for c in chunks:
         S_graph_chunk, row = T_graph_world @ c.S_world_chunk, before.get(c.chunk_id)
@@ -53,18 +53,18 @@ def settle(
             extent = _extent(summaries[c.chunk_id], S_graph_chunk, 0.5 * _FAR_M * unit)
             fresh[c.chunk_id] = SettledRow(c.component, S_graph_chunk, extent)
     if fresh:
-        store.put_settled(fresh)
+        store.library.settled.put(fresh)
     return frozenset(fresh)
 
 
 def settled_chunks(store: Store) -> list[ChunkRow]:
     """Return all chunks, which must be settled, at their settled poses in the world."""
-    T_world_graph, rows = _world_of_graph(store), store.settled()
-    return [replace(c, S_world_chunk=T_world_graph @ rows[c.chunk_id].S_graph_chunk) for c in store.chunks()]
+    T_world_graph, rows = _world_of_graph(store), store.library.settled.all()
+    return [replace(c, S_world_chunk=T_world_graph @ rows[c.chunk_id].S_graph_chunk) for c in store.chunks.all()]
 
 
 def _world_of_graph(store: Store) -> Sim3:
-    return Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+    return store.facts.S_world_graph
 
 
 def _near(a: Sim3, b: Sim3, unit: float, s: HysteresisSettings) -> bool:

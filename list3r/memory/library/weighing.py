@@ -124,11 +124,11 @@ class Weighing:
         at = {g: n for n, g in enumerate(groups)}
         keys = [k for g in groups for k in g]
         visible = [shown.get(g, False) for g in groups]
-        before = self._g.constraints.remembered(groups, self._region.store.observed_as(keys))
+        before = self._g.constraints.remembered(groups, self._region.store.observations.owners(keys))
         before = without_missed(before, groups, [weighed.evidence.get(g, _UNWEIGHED) for g in groups], visible)
         within = [None if (w := inner.get(g)) is None else at[w] for g in groups]
         weights = {key: len(self._region.frames_of(key)) for key in keys}
-        ids = assign_ids(groups, before, weights, visible, within, self._region.store.next_id())
+        ids = assign_ids(groups, before, weights, visible, within, self._region.store.ids.next())
         return Named(ids, groups, before)
 
     # ------------------------------------------------------------------ points that belong to something else
@@ -158,7 +158,7 @@ class Weighing:
             if len(other):
                 self._dropped[k] = bits
                 out |= {self._g.home[k, int(shapes[k].local_id[n])] for n in np.unique(shapes[k].owner[other])}
-        region.store.set_dropped({k: self._dropped[k] for k in found if k in self._dropped})
+        region.store.library.settled.set_dropped({k: self._dropped[k] for k in found if k in self._dropped})
         return out
 
     def _regrouped(self, changed: Sequence[Group]) -> dict[int, list[int]]:
@@ -188,5 +188,5 @@ class Weighing:
         """Return which points of a chunk's shapes belong to something else. Shape (R,)."""
         if chunk_id not in self._dropped:
             count = len(self._region.shapes(chunk_id).points)
-            self._dropped[chunk_id] = self._region.store.dropped(chunk_id, count)
+            self._dropped[chunk_id] = self._region.store.library.settled.dropped(chunk_id, count)
         return self._dropped[chunk_id]

@@ -21,7 +21,7 @@ from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.predicates import relations
 from list3r.memory.relations.scene import PairMeasures
 from list3r.memory.relations.structure import classify_structure, flagged_only
-from list3r.memory.store.tables.library import Anchor
+from list3r.memory.store.tables.library import Anchor, Member
 
 _SLACK_M = 0.05
 """Boxes in the R*Tree are rounded and lie where the chunks lie to the last digit."""
@@ -52,19 +52,19 @@ class Writer:
         of = {g: n for g, n in zip(named.groups, ids.of_group, strict=True)}
         fresh = {n: g for g, n in of.items() if n is not None and g in weighed.evidence}
         for g in recut - weighed.evidence.keys():
-            fresh |= dict.fromkeys(store.observed_as(g[:1]).values(), g)
-        before = store.observed_as([k for g in weighed.evidence for k in g])
-        known = store.states().keys() if self._g.dirty.whole else set(before.values())
+            fresh |= dict.fromkeys(store.observations.owners(g[:1]).values(), g)
+        before = store.observations.owners([k for g in weighed.evidence for k in g])
+        known = store.instances.states().keys() if self._g.dirty.whole else set(before.values())
         gone = sorted(known - fresh.keys() - set(of.values()))
-        was = {i.id: i for i in store.instances_of([*sorted(fresh), *gone])}
+        was = {i.id: i for i in store.instances.of([*sorted(fresh), *gone])}
         boxes = {n: i.aabb for n, i in was.items()}
         labels = {n: i.label for n, i in was.items()} | self._edited_labels(fresh)
         self._states |= {n: self._sessions.state(was[n].state if n in was else None, g) for n, g in fresh.items()}
         for n in gone:
-            store.drop_instance(n, dict(ids.aliases).get(n))
+            store.instances.drop(n, dict(ids.aliases).get(n))
         now = {key: n for n, g in fresh.items() for key in g}
-        store.forget_observations(before.keys() - now.keys())
-        store.set_observations(Observation(n, *key) for key, n in now.items() if before.get(key) != n)
+        store.observations.forget(before.keys() - now.keys())
+        store.observations.set(Observation(n, *key) for key, n in now.items() if before.get(key) != n)
         order = sorted(fresh)
         for n in order:
             found = self._derive(n, fresh[n], was[n].structure if n in was else None)
@@ -76,8 +76,8 @@ class Writer:
         self._put(order, fresh, labels)
         again = sorted(self._classify(order, boxes))
         if again:
-            self._put(again, {n: self._group_of(n) for n in again}, {i.id: i.label for i in store.instances_of(again)})
-        store.set_value("last_id", max(ids.last_id, int(store.get_value("last_id", 0))))
+            self._put(again, {n: self._group_of(n) for n in again}, {i.id: i.label for i in store.instances.of(again)})
+        store.facts.last_id = max(ids.last_id, store.facts.last_id)
         self.written.update(order, again)
         touched = {n: self._derived[n].geometry.aabb for n in (*order, *again)}
         return {n: around(touched.get(n), boxes.get(n)) for n in {*touched, *gone}}
@@ -100,7 +100,7 @@ class Writer:
 
     def _stored(self, ids: Iterable[int]) -> list[InstanceGeometry]:
         """Return geometries of instances as they are in the store."""
-        for instance in self._store.instances_of(sorted(n for n in ids if n not in self._derived)):
+        for instance in self._store.instances.of(sorted(n for n in ids if n not in self._derived)):
             group = self._group_of(instance.id)
             if group:
                 found = self._derive(instance.id, group, instance.structure)
@@ -112,8 +112,8 @@ class Writer:
     def _put_members(self, shown: Mapping[Group, bool]) -> None:
         """Write who is grouped with whom, where that was otherwise."""
         before, shown_before = self._g.before, self._g.shown_before
-        self._store.put_members(
-            (key, g[0], show)
+        self._store.library.members.put(
+            Member(key, g[0], show)
             for g, show in shown.items()
             for key in g
             if key not in before or (before[key][0], shown_before[before[key]]) != (g[0], show)
@@ -136,34 +136,33 @@ class Writer:
         return {of[groups[at]]: text for at, text in found.items() if groups[at] in of}
 
     def _group_of(self, n: int) -> Group:
-        return tuple((o.chunk_id, o.local_id) for o in self._store.observations(n))
+        return tuple((o.chunk_id, o.local_id) for o in self._store.observations.of(n))
 
     def _put(self, ids: Sequence[int], groups: Mapping[int, Group], labels: Mapping[int, str | None]) -> None:
         store = self._store
-        metric = store.get_value("scale_kind", "metric") != "relative"
+        metric = store.facts.scale_kind != "relative"
         anchors, records = {}, []
         for n in ids:
             found = self._derived[n]
             chunks = sorted({k for k, _ in groups[n]})
             times = {f: t for k in chunks for f, t in self._region.times_of(k).items()}
-            exact = store.chunk(found.anchor).S_world_chunk @ self._region.pose(found.anchor).inverse()
+            exact = store.chunks.get(found.anchor).S_world_chunk @ self._region.pose(found.anchor).inverse()
             record = moved(record_of(found, labels.get(n), times, self._world, metric=metric), exact)
-            sigma = position_sigma(record.center, [store.chunk(k) for k in chunks])
+            sigma = position_sigma(record.center, [store.chunks.get(k) for k in chunks])
             records.append(replace(record, state=self._states[n], position_sigma_m=sigma))
             anchors[n] = Anchor(found.anchor, exact)
-        store.put_instances(records)
-        store.put_anchors(anchors)
+        store.instances.put(records)
+        store.library.anchors.put(anchors)
         if self._world.space and ids:
             features = np.array([self._derived[n].feature for n in ids], np.float32)
-            store.put_embeddings(self._world.space, list(ids), features)
-            store.set_value("feature_space", self._world.space)
+            store.embeddings.put(self._world.space, list(ids), features)
 
     # ------------------------------------------------------------------ structure and relations
 
     def _near(self, box: Array, reach: Array) -> list[int]:
         """Return ids of the instances whose boxes come within `reach` of a box, along each axis."""
         slack = reach + _SLACK_M * self._world.unit
-        return self._store.ids_in_box(box[0] - slack, box[1] + slack)
+        return self._store.instances.ids_in_box(box[0] - slack, box[1] + slack)
 
     def _classify(self, ids: Sequence[int], before: Mapping[int, Array]) -> list[int]:
         """Tell structure from what stands in the room near what changed; the ids that became something else."""
@@ -216,7 +215,7 @@ class Writer:
             vertical = self._world.upright and component == self._world.first
             found += relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=measured)
         kept = [r for r in found if r.subject in subjects or r.object in subjects]
-        self._store.replace_relations(sorted(subjects), kept)
+        self._store.relations.replace(sorted(subjects), kept)
 
 
 def around(a: Array | None, b: Array | None) -> Array:

@@ -57,10 +57,10 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
     Raises `UnknownIdError`, and `OptionError` for two that are one already or lie in parts that were never joined.
     """
     with store.transaction():
-        first, second = sorted((store.resolve(a), store.resolve(b)))
+        first, second = sorted((store.ids.resolve(a), store.ids.resolve(b)))
         if first == second:
             raise OptionError(f"{a} and {b} are one instance already, #{first}")
-        if store.instance(first).component != store.instance(second).component:
+        if store.instances.get(first).component != store.instances.get(second).component:
             raise OptionError(
                 f"#{first} and #{second} lie in parts of the memory that were never joined, each with its own frame of "
                 "reference; add a session that connects them first"
@@ -77,7 +77,7 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
     Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.
     """
     with store.transaction():
-        known = store.resolve(instance_id)
+        known = store.ids.resolve(instance_id)
         before = _as_they_are(store, [known])
         keys = before[0][2]
         if len(keys) < 2:
@@ -93,19 +93,19 @@ def label(store: Store, instance_id: int, text: str | None, author: str | None =
     """Give an instance a name; nothing, or an empty text, takes it away. Raises `UnknownIdError` and `OptionError`."""
     cleaned = _line(text or "", "label") or None
     with store.transaction():
-        known = store.resolve(instance_id)
+        known = store.ids.resolve(instance_id)
         before = _as_they_are(store, [known])
         edit = replace(_edit("label", (before[0][2],), before, author), text=cleaned)
         reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} took the label of #{known}"
         edit = _write_down(store, edit, (f"#{known}", cleaned or ""), reason)
-        store.set_labels({known: cleaned})
+        store.instances.set_labels({known: cleaned})
         return EditReport(edit.entry, "label", (known,), (), (), (), reason)
 
 
 def delete(store: Store, instance_id: int, author: str | None = None) -> EditReport:
     """Take an instance out of the library, with all that is seen of it later. Raises `UnknownIdError`."""
     with store.transaction():
-        known = store.resolve(instance_id)
+        known = store.ids.resolve(instance_id)
         before = _as_they_are(store, [known])
         edit = _edit("delete", (before[0][2],), before, author)
         return _carry_out(store, edit, (f"#{known}", ""), f"{edit.author} deleted #{known}")
@@ -119,7 +119,7 @@ def scale(store: Store, anchor: str, author: str | None = None) -> EditReport:
     said = parse_anchor(_line(anchor, "anchor"))
     with store.transaction():
         found = measure(store, said)
-        what = f"#{store.resolve(said.instance_id)}" if said.kind in ("size", "height") else said.kind
+        what = f"#{store.ids.resolve(said.instance_id)}" if said.kind in ("size", "height") else said.kind
         edit = _edit("scale", (found.keys,) if found.keys else (), (), author)
         edit = replace(edit, text=said.text, scale=(found.chunk_id, found.metres_per_unit))
         reason = f"{edit.author} anchored the scale: {said.text} where it was {found.length:.4g} units"
@@ -133,7 +133,7 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
     is not, that is undone already, or that decided nothing.
     """
     with store.transaction():
-        edits = store.edits()
+        edits = store.edits.all()
         in_force = standing(edits)
         if entry is None:
             last = [e.entry for e in in_force if e.kind != "undo"]
@@ -159,7 +159,7 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
 
 def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
     """Decide otherwise what merging decided, by an edit of the two local instances that it spoke of."""
-    found = next((e for e in store.log_entries() if e.entry == entry), None)
+    found = next((e for e in store.merges.all() if e.entry == entry), None)
     if found is None:
         raise OptionError(f"the log has no entry {entry}; `list3r merges {store.path}` shows all")
     d = found.decision
@@ -209,22 +209,23 @@ def _user() -> str:
 def _as_they_are(store: Store, ids: Sequence[int]) -> Before:
     """Return what an undo brings back: ids, labels and local instances of instances."""
     return tuple(
-        (n, store.instance(n).label, tuple((o.chunk_id, o.local_id) for o in store.observations(n))) for n in ids
+        (n, store.instances.get(n).label, tuple((o.chunk_id, o.local_id) for o in store.observations.of(n)))
+        for n in ids
     )
 
 
 def _owners(store: Store, keys: Sequence[Key]) -> Before:
     """Return the same of all instances that any of these local instances belong to."""
-    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
     return _as_they_are(store, sorted({home[k] for k in keys if k in home}))
 
 
 def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -> Edit:
     """Append the edit to the log and to the edits; the edit with its number."""
-    through = max((c.chunk_id for c in store.chunks()), default=0)
-    entry = store.add_log_entry(through, MergeDecision(f"edit {edit.kind}", *names, {}, reason))
+    through = max((c.chunk_id for c in store.chunks.all()), default=0)
+    entry = store.merges.add(through, MergeDecision(f"edit {edit.kind}", *names, {}, reason))
     edit = replace(edit, entry=entry, through=through)
-    store.add_edit(edit)
+    store.edits.add(edit)
     return edit
 
 
@@ -233,20 +234,20 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
     if any(not keys for _, _, keys in edit.before):
         raise OptionError(f"{store.path} does not hold what {names[0]} was made from; only its label can be changed")
     edit = _write_down(store, edit, names, reason)
-    there = {i.id for i in store.instances()}
-    aliases = store.aliases()
+    there = {i.id for i in store.instances.all()}
+    aliases = store.ids.aliases()
     _give_back(store, bring_back, there, aliases)
     if _of_scale(store, edit):
         rescale(store)
     report = consolidate(store)
-    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
     _check_effect(edit, home)
-    now = {i.id: i.label for i in store.instances()}
-    named = {n for keys, _ in store.constraints().labels for n in {home.get(k) for k in keys}}
-    store.set_labels({n: text for n, text, _ in bring_back if n in now and n not in named})
+    now = {i.id: i.label for i in store.instances.all()}
+    named = {n for keys, _ in store.edits.constraints().labels for n in {home.get(k) for k in keys}}
+    store.instances.set_labels({n: text for n, text, _ in bring_back if n in now and n not in named})
     retired = _retired(store, edit.before + bring_back, home, now, dict(report.merged))
-    store.add_aliases(retired)
-    store.drop_revived_aliases()
+    store.ids.add_aliases(retired)
+    store.ids.drop_revived_aliases()
     touched = sorted({home[k] for _, _, keys in edit.before + bring_back for k in keys if k in home})
     apply_labels(store, written=None if report.written is None else report.written | {*touched})
     first = [n for n, _, _ in bring_back + edit.before if n in touched]
@@ -255,7 +256,7 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
         kind=edit.kind,
         ids=tuple(dict.fromkeys([*first, *touched])),
         new=tuple(n for n in report.new if n in touched),
-        aliases=tuple((old, new) for old, new in sorted(store.aliases().items()) if aliases.get(old) != new),
+        aliases=tuple((old, new) for old, new in sorted(store.ids.aliases().items()) if aliases.get(old) != new),
         restored=tuple(n for n in touched if n not in there and n not in report.new),
         text=reason,
     )
@@ -263,7 +264,7 @@ def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, br
 
 def _of_scale(store: Store, edit: Edit) -> bool:
     """Return whether it anchors the scale, or takes an anchor back, or brings one back."""
-    edits = {e.entry: e for e in store.edits()}
+    edits = {e.entry: e for e in store.edits.all()}
     while edit.kind == "undo" and edit.target in edits:
         edit = edits[edit.target]
     return edit.kind == "scale"
@@ -271,14 +272,14 @@ def _of_scale(store: Store, edit: Edit) -> bool:
 
 def _give_back(store: Store, before: Before, there: Collection[int], aliases: Mapping[int, int]) -> None:
     """Ids that retired own again what they owned and what has not gone to a third one since."""
-    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations()}
+    home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
     for instance_id, _, keys in before:
         if instance_id not in there:
             heir = aliases.get(instance_id)
             while heir is not None and heir not in there and heir in aliases:
                 heir = aliases[heir]
             own = [k for k in keys if home.get(k) in (None, heir)]
-            store.set_observations(Observation(instance_id, *key) for key in own)
+            store.observations.set(Observation(instance_id, *key) for key in own)
 
 
 def _check_effect(edit: Edit, home: Mapping[Key, int]) -> None:
@@ -294,7 +295,7 @@ def _retired(
 ) -> dict[int, int]:
     """Return ids that were touched, name no instance now and have no alias yet: what most of them has become."""
     out = {}
-    known = store.aliases()
+    known = store.ids.aliases()
     for instance_id, _, keys in before:
         heirs = [home[k] for k in keys if k in home]
         if instance_id in now or not heirs or known.get(instance_id) in now:

@@ -20,19 +20,19 @@ def world_at(store: Store, session_id: int) -> list[Instance]:
     those of today, which rest on all that was ever seen of an instance. Raises `OptionError` for a session that there
     is not.
     """
-    sessions = [s.session_id for s in store.sessions()]
+    sessions = [s.session_id for s in store.sessions.all()]
     if session_id not in sessions:
         raise OptionError(f"{store.path} has no session {session_id}; it has {', '.join(map(str, sessions))}")
-    owner = {c.chunk_id: c.session_id for c in store.chunks()}
+    owner = {c.chunk_id: c.session_id for c in store.chunks.all()}
     seen: dict[int, set[int]] = {}
-    for o in store.observations():
+    for o in store.observations.all():
         seen.setdefault(o.instance_id, set()).add(owner[o.chunk_id])
     story: dict[int, list[ChangeEvent]] = {}
-    for event in store.events():
+    for event in store.events.all():
         story.setdefault(event.instance_id, []).append(event)
     latest = _latest(store, session_id)
     out = []
-    for instance in store.instances():
+    for instance in store.instances.all():
         told = story.get(instance.id, [])
         known = seen.get(instance.id, set()) | {e.session_id for e in told}
         if known and min(known) <= session_id:
@@ -44,7 +44,7 @@ def world_at(store: Store, session_id: int) -> list[Instance]:
 def _latest(store: Store, session_id: int) -> dict[int, int]:
     """By component: the last session up to this one that saw it."""
     out: dict[int, int] = {}
-    for c in store.chunks():
+    for c in store.chunks.all():
         if c.session_id <= session_id:
             out[c.component] = max(c.session_id, out.get(c.component, 0))
     return out

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.labels import apply_labels
+from list3r.memory.records import Session
 from list3r.memory.store.checksums import (
     OWN_CRC,
     SUMS_SINCE,
@@ -24,7 +25,7 @@ from list3r.memory.store.checksums import (
     summed_tables,
     write_part,
 )
-from list3r.memory.store.codec import checksum, pack_sim3, unpack
+from list3r.memory.store.codec import checksum, unpack
 from list3r.memory.store.file import (
     check_beside,
     check_schema,
@@ -40,11 +41,11 @@ from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
 from list3r.memory.store.store import Store
 from list3r.memory.store.values import bad_values
 
-_DERIVED = ("instances", "observations", "embeddings", "relations", "events")
+_DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
 """Tables that consolidation writes; a row lost there is written anew."""
 _PASSING = ("settled", "overlaps", "members", "anchors")
 """Tables that consolidation goes on with; without them it derives the library as a whole."""
-_OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations")
+_OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""
 
@@ -250,10 +251,10 @@ def _salvage(damaged: sqlite3.Connection, store: Store, lost: _Lost) -> None:
         for name, rows in kept.items():
             table = summed_tables()[name]
             marks = ",".join("?" * len(table.columns))
-            store._database.executemany(
+            store.connection.execute_many(
                 f"INSERT INTO {name} ({', '.join(table.columns)}) VALUES ({marks})", list(rows.values())
             )
-        store.index_boxes()
+        store.instances.index_boxes()
         _stand_in_for_lost(store, lost)
 
 
@@ -376,40 +377,29 @@ def _name_missing(lost: _Lost, table: str, key: Row) -> None:
 def _stand_in_for_lost(store: Store, lost: _Lost) -> None:
     """What the rest cannot do without: a session of which only chunks are left, the kind of scale."""
     _place_lost(store, lost)
-    held = {s.session_id for s in store.sessions()}
+    held = {s.session_id for s in store.sessions.all()}
     frames: dict[int, int] = {}
-    for f in store.frames():
+    for f in store.frames.all():
         frames[f.session_id] = max(frames.get(f.session_id, 0), f.frame_index + 1)
-    for session_id in sorted({c.session_id for c in store.chunks()} - held):
+    for session_id in sorted({c.session_id for c in store.chunks.all()} - held):
         _name_missing(lost, "sessions", (session_id,))
-        store._database.execute(
-            "INSERT INTO sessions (session_id, source, fingerprint, settings, frame_count, state)"
-            " VALUES (?, 'unknown', '', '{}', ?, 'complete')",
-            (session_id, frames.get(session_id, 0)),
-        )
-    if store.get_value("scale_kind") is None and any(c.scale_kind != "metric" for c in store.chunks()):
-        store.set_value("scale_kind", "relative")
-    ids = [o.instance_id for o in store.observations()]
-    store.set_value("last_id", max([store.next_id() - 1, *ids]))
+        store.sessions.put(Session(session_id, "unknown", "", {}, frames.get(session_id, 0), "complete"))
+    if store.facts.scale_kind is None and any(c.scale_kind != "metric" for c in store.chunks.all()):
+        store.facts.scale_kind = "relative"
+    ids = [o.instance_id for o in store.observations.all()]
+    store.facts.last_id = max([store.ids.next() - 1, *ids])
 
 
 def _place_lost(store: Store, lost: _Lost) -> None:
     """Chunks whose place is lost are put where a relation to a chunk that has one puts them, or apart."""
-    rows = store._database.execute("SELECT chunk_id FROM chunks ORDER BY chunk_id").fetchall()
-    there = {c.chunk_id for c in store.chunks()}
-    missing = [k for (k,) in rows if k not in there]
-    if not missing:
-        return
-    own = pack_sim3(Sim3.identity())
-    store._database.executemany("INSERT INTO placements VALUES (?, ?, ?, NULL)", [(k, k, own) for k in missing])
-    store.forget_rows()
+    missing = store.chunks.place_unplaced()
     left = dict.fromkeys(missing)
-    edges = [e for e in store.edges() if e.accepted]
+    edges = [e for e in store.edges.all() if e.accepted]
     while ties := [e for e in edges if (e.u in left) != (e.v in left)]:
         u, v, S_v_u = ties[0].u, ties[0].v, ties[0].S_v_u
         here, lost_one, S_here_lost = (u, v, S_v_u.inverse()) if v in left else (v, u, S_v_u)
-        row = store.chunk(here)
-        store.place_chunks({lost_one: row.S_world_chunk @ S_here_lost}, {lost_one: row.component})
+        row = store.chunks.get(here)
+        store.chunks.place({lost_one: row.S_world_chunk @ S_here_lost}, {lost_one: row.component})
         del left[lost_one]
     for k in missing:
         _name_missing(lost, "placements", (k,))
@@ -423,12 +413,13 @@ def _needs_deriving(lost: _Lost) -> bool:
 def _derive(store: Store) -> None:
     """The library anew from the chunks: ids stay where the observations of an instance, or the row itself, stayed."""
     with store.transaction():
-        if not store.chunks():
+        if not store.chunks.all():
             for name in _DERIVED:
-                store._database.execute(f"DELETE FROM {name}")
-            store._database.execute("DELETE FROM instance_boxes")
+                store.connection.execute(f"DELETE FROM {name}")
+            store.connection.execute("DELETE FROM instance_boxes")
             return
         consolidate(store)
+        apply_labels(store)
 
 
 # ------------------------------------------------------------------------------------------- report
@@ -457,9 +448,9 @@ def _report(target: Path, original: Path, damage: tuple[str, ...], lost: _Lost, 
         if count > 0 and not (rebuilt and table in _DERIVED):
             names.setdefault(table, []).append(f"{count} more")
     with Store.open(target) as store:
-        ids = {i.id for i in store.instances()}
-        chunks = len(store.chunks())
-        gone = sorted(lost.instances - ids - store.aliases().keys())
+        ids = {i.id for i in store.instances.all()}
+        chunks = len(store.chunks.all())
+        gone = sorted(lost.instances - ids - store.ids.aliases().keys())
     if gone:
         names["instances"] = [str(n) for n in gone]
     return RepairReport(target, original, damage, names, rebuilt, chunks, len(ids))

@@ -34,7 +34,7 @@ def propose_split(store: Store, keys: Sequence[Key]) -> tuple[Key, ...]:
 def _distances(store: Store, keys: Sequence[Key]) -> Array:
     """Shape (N, N), symmetric, 0 on the diagonal."""
     summaries = chunk_summaries(store)
-    placed = {c.chunk_id: c.S_world_chunk for c in store.chunks()}
+    placed = {c.chunk_id: c.S_world_chunk for c in store.chunks.all()}
     shapes = {k: summaries[k].shapes for k in sorted({k for k, _ in keys})}
     at = [int(np.searchsorted(shapes[k].local_id, n)) for k, n in keys]
     center = np.array([placed[k].apply(shapes[k].center[[a]])[0] for (k, _), a in zip(keys, at, strict=True)])

@@ -72,24 +72,24 @@ class Summaries(Mapping[int, ChunkSummary]):
     def __init__(self, store: Store, settings: ShapeSettings | None = None) -> None:
         self._store = store
         self._settings = settings
-        self._ids = [c.chunk_id for c in store.chunks()]
+        self._ids = [c.chunk_id for c in store.chunks.all()]
         self._known = store.derived.of(SummaryCache)
         self._checked: dict[int, int] = {}
 
     def __getitem__(self, chunk_id: int) -> ChunkSummary:
         if chunk_id not in self._checked:
-            self._checked[chunk_id] = self._store.node_checksum(chunk_id)
+            self._checked[chunk_id] = self._store.chunks.checksum(chunk_id)
         key = chunk_id, self._checked[chunk_id], self._settings
         found = self._known.get(key)
-        return found or self._known.put(key, _summary(self._store, self._store.chunk(chunk_id), self._settings))
+        return found or self._known.put(key, _summary(self._store, self._store.chunks.get(chunk_id), self._settings))
 
     @property
     def metre(self) -> float | None:
         """What a metre is where the chunks lie now, of a memory whose scale was anchored; None where nobody knows."""
-        metres = self._store.get_value("metres_per_graph_unit")
+        metres = self._store.facts.metres_per_graph_unit
         if metres is None:
             return None
-        scale = Sim3.from_matrix(self._store.get_value("T_world_graph", np.eye(4).tolist())).scale
+        scale = self._store.facts.S_world_graph.scale
         return float(scale) / float(metres)
 
     def __iter__(self) -> Iterator[int]:
@@ -127,20 +127,20 @@ def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:
 
 
 def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> ChunkSummary:
-    nodes = store.local_nodes([chunk.chunk_id])
+    nodes = store.local_instances.nodes([chunk.chunk_id])
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
     if chunk.scale_kind != "metric":
-        shapes = with_samples(shapes, store.frame_samples(chunk.chunk_id))
+        shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
     lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
-    motions = {n: store.motion_track(chunk.chunk_id, n) for n in moves}
-    return ChunkSummary(shapes, planes, store.cannot_links(chunk.chunk_id), unit, lab, motions)
+    motions = {n: store.local_instances.motion_track(chunk.chunk_id, n) for n in moves}
+    return ChunkSummary(shapes, planes, store.chunks.cannot_links(chunk.chunk_id), unit, lab, motions)
 
 
 def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
-    centers = [k.T_chunk_cam[:3, 3] for k in store.keyframes(chunk.chunk_id)] or [np.zeros(3)]
+    centers = [k.T_chunk_cam[:3, 3] for k in store.keyframes.of(chunk.chunk_id)] or [np.zeros(3)]
     if len(planes.points) == 0:
         return 1.0
     distance = np.linalg.norm(planes.points[:, None] - np.array(centers)[None], axis=2)
@@ -166,7 +166,7 @@ def light_of(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) 
 def cameras_of(store: Store, chunks: Sequence[ChunkRow]) -> Sim3:
     """Return poses `S_world_cam` of all posed frames of these chunks, batched over frames."""
     placed = {c.chunk_id: c.S_world_chunk for c in chunks}
-    frames = [f for c in chunks for f in store.frames_of(c) if f.state == "posed"]
+    frames = [f for c in chunks for f in store.frames.of(c) if f.state == "posed"]
     if not frames:
         return Sim3(np.ones(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     T_chunk_cam: Array = np.array([f.T_chunk_cam for f in frames])

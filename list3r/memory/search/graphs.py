@@ -17,7 +17,7 @@ def relation_graph(store: Store) -> networkx.MultiDiGraph:
     import networkx
 
     graph = networkx.MultiDiGraph(name=str(store.path.name))
-    for i in store.instances():
+    for i in store.instances.all():
         graph.add_node(
             i.id,
             description=i.description,
@@ -28,7 +28,7 @@ def relation_graph(store: Store) -> networkx.MultiDiGraph:
             confidence=i.confidence,
             state=i.state,
         )
-    for r in store.relations():
+    for r in store.relations.all():
         graph.add_edge(
             r.subject, r.object, key=r.predicate, predicate=r.predicate, confidence=r.confidence, margin=r.margin
         )
@@ -44,9 +44,9 @@ def merge_graph(store: Store) -> networkx.Graph:
     import networkx
 
     graph = networkx.Graph(name=str(store.path.name))
-    for o in store.observations():
+    for o in store.observations.all():
         graph.add_node(f"{o.chunk_id}:{o.local_id}", instance=o.instance_id, chunk=o.chunk_id, local=o.local_id)
-    for d in store.decisions():
+    for d in store.merges.decisions():
         both = d.kind == "merge" and d.a in graph and d.b in graph
         if both and graph.nodes[d.a]["instance"] == graph.nodes[d.b]["instance"]:
             graph.add_edge(d.a, d.b, reason=d.reason, **d.scores)

@@ -70,7 +70,7 @@ class VectorIndex:
         and none was named.
         """
         chosen = _chosen_space(store, space)
-        stamp = store.state_stamp()
+        stamp = store.connection.stamp()
         held = store.derived.of(VectorIndices).of_space
         found = held.get(chosen)
         if found is None or found._made_of != stamp[0] or not found._caught_up(store, stamp):
@@ -82,10 +82,10 @@ class VectorIndex:
         """Take in what the store has changed since; False when that is so much that building anew is better."""
         if stamp == self._stamp:
             return True
-        changed = sorted(set(store.vectors_touched[self._seen :]))
+        changed = sorted(set(store.embeddings.touched[self._seen :]))
         if len(changed) > max(1000, _REBUILD * self.count):
             return False
-        ids, vectors = store.embeddings_of(self.space, changed)
+        ids, vectors = store.embeddings.of(self.space, changed)
         if len(ids) and vectors.shape[1] != self.dimension:
             return False
         self._fresh = (ids, _unit(vectors)) if len(ids) else None
@@ -114,7 +114,7 @@ class VectorIndex:
         score, at = _ask(self.index, query, min(width, self.count), probed)
         found = [(int(n), float(s)) for n, s in zip(at, score, strict=True) if n >= 0 and int(n) not in self._stale]
         if self.count > _EXACT:
-            ids, vectors = store.embeddings_of(self.space, [n for n, _ in found])
+            ids, vectors = store.embeddings.of(self.space, [n for n, _ in found])
             found = list(zip(ids.tolist(), (_unit(vectors) @ query).tolist(), strict=True)) if len(ids) else []
         if self._fresh is not None:
             found += zip(self._fresh[0].tolist(), (self._fresh[1] @ query).tolist(), strict=True)
@@ -122,7 +122,7 @@ class VectorIndex:
 
     def vector(self, store: Store, instance_id: int) -> NDArray[np.float32]:
         """Return the vector of an instance. Raises `OptionError` when it has none in this space."""
-        ids, vectors = store.embeddings_of(self.space, [instance_id])
+        ids, vectors = store.embeddings.of(self.space, [instance_id])
         if len(ids) == 0:
             raise OptionError(f"instance {instance_id} has no vector in the space {self.space}")
         return np.asarray(vectors[0])
@@ -157,9 +157,9 @@ def _first(
 
 
 def _chosen_space(store: Store, space: str | None) -> str:
-    made_of, kept = store.state_stamp()[0], store.derived.of(VectorIndices)
-    if kept.spaces is None or kept.spaces[0] != made_of or store.spaces_touched - set(kept.spaces[1]):
-        kept.spaces = (made_of, store.embedding_spaces())
+    made_of, kept = store.connection.stamp()[0], store.derived.of(VectorIndices)
+    if kept.spaces is None or kept.spaces[0] != made_of or store.embeddings.spaces_touched - set(kept.spaces[1]):
+        kept.spaces = (made_of, store.embeddings.spaces())
     spaces = kept.spaces[1]
     if space is None:
         if len(spaces) != 1:
@@ -178,11 +178,11 @@ def _build(store: Store, space: str, stamp: tuple[int, int, bool]) -> VectorInde
     """Read all vectors once, a batch at a time."""
     import faiss
 
-    count = store.embedding_count(space)
+    count = store.embeddings.count(space)
     index, total = _flat(store, space) if count <= _EXACT else _inverted(store, space, count)
     if index is None:
         index = faiss.IndexIDMap(faiss.IndexFlatIP(1))
-    return VectorIndex(space, int(index.d), total, index, stamp[0], len(store.vectors_touched), stamp)
+    return VectorIndex(space, int(index.d), total, index, stamp[0], len(store.embeddings.touched), stamp)
 
 
 def _flat(store: Store, space: str) -> tuple[Any, int]:
@@ -191,7 +191,7 @@ def _flat(store: Store, space: str) -> tuple[Any, int]:
 
     index: Any = None
     total = 0
-    for ids, vectors in store.embedding_batches(space):
+    for ids, vectors in store.embeddings.batches(space):
         if index is None:
             index = faiss.IndexIDMap(faiss.IndexFlatIP(vectors.shape[1]))
         index.add_with_ids(_unit(vectors), ids)
@@ -205,14 +205,14 @@ def _inverted(store: Store, space: str, count: int) -> tuple[Any, int]:
 
     pointer: Any = faiss.swig_ptr
     place = cache_file(store.path, space)
-    dimension = next(store.embedding_batches(space, 1))[1].shape[1]
+    dimension = next(store.embeddings.batches(space, 1))[1].shape[1]
     cells = Cells.load(place, dimension, count)
     while True:
         if cells is None:
-            cells = Cells.learned(_unit(store.embedding_sample(space, sample_size(count))), count)
+            cells = Cells.learned(_unit(store.embeddings.sample(space, sample_size(count))), count)
         index, quantizer = _empty(cells, dimension)
         total = 0
-        for ids, vectors in store.embedding_batches(space):
+        for ids, vectors in store.embeddings.batches(space):
             unit = _unit(vectors)
             placed = cells.of(quantizer, ids, unit)
             index.add_core(len(ids), pointer(unit), pointer(ids), pointer(placed))

@@ -1,4 +1,4 @@
-"""One memory file: opening, migrating, transactions and the key-value table."""
+"""One memory file: opening, migrating, transactions, and the statements that all tables are read and written by."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import contextlib
 import os
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from traceback import walk_tb
 from types import TracebackType
 from typing import Any, Self, cast
 
-from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.checksums import Sums
-from list3r.memory.store.codec import from_json, to_json
 from list3r.memory.store.committed import Committed
-from list3r.memory.store.derived import Derived
 from list3r.memory.store.file import (
     check_beside,
     connected,
@@ -32,16 +32,28 @@ from list3r.memory.store.file import (
     write_empty,
 )
 from list3r.memory.store.lock import WriterLock
-from list3r.memory.store.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, unbelieved
+from list3r.memory.store.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, any_text, unbelieved
 from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.word_index import WordIndex, up_to_date, write_words
 
 _LAST_WAIT_MS = 2000
 """How long a writer that closes waits for readers."""
+Arguments = Sequence[Any] | Mapping[str, Any]
+"""Values of a statement by place or by name."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a statement did."""
+
+    row: int
+    """Number of the row that it inserted last."""
+    count: int
+    """How many rows it changed."""
 
 
 class Connection:
-    """The file and its transactions; the verbs of the store stand on it.
+    """The file and its transactions; the tables of the store stand on it.
 
     One object may be used by several threads; a snapshot or a transaction of one keeps the others waiting.
     """
@@ -58,11 +70,9 @@ class Connection:
         self._checks = ReadChecks(database, self._committed, whole=_size(database) <= WHOLE_BYTES)
         self._writing = False
         self._guard = threading.RLock()
-        self.derived = Derived()
+        self._on_forget: list[weakref.WeakMethod[Callable[[], None]]] = []
         self.rollbacks = 0
         """How often something written was taken back: an id may then stand for something else."""
-        self.unsettled = 0
-        """How often a chunk was unsettled, see `memory.library_verbs`."""
 
     @property
     def writable(self) -> bool:
@@ -152,7 +162,7 @@ class Connection:
             if not up_to_date(database):
                 with opened.transaction():
                     write_words(database)
-            opened._rows("SELECT 1 FROM memory LIMIT 1")  # the first read of a new log ends what holds off checkpoints
+            opened.rows("SELECT 1 FROM memory LIMIT 1")  # the first read of a new log ends what holds off checkpoints
             return opened
         except BaseException as error:
             if database is not None:
@@ -186,22 +196,6 @@ class Connection:
             self._lock.release()
         self._lock = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        ours = isinstance(error, Exception) and not isinstance(error, List3rError | OSError) and _is_ours(trace)
-        found = self._damage() if ours else []
-        self.close()
-        if found:
-            raise MemoryFileError(_damaged(self.path, found[0])) from error
-
-    def _damage(self) -> list[str]:
-        """What explains that something read could not be understood."""
-        return []
-
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
         """All that is written inside is written together or not at all. Not re-entrant."""
@@ -234,7 +228,7 @@ class Connection:
 
     def _refuse(self, found: str | None) -> None:
         if found is not None:
-            raise MemoryFileError(_damaged(self.path, found))
+            raise MemoryFileError(damaged(self.path, found))
 
     def _roll_back(self) -> None:
         self.rollbacks += 1
@@ -242,6 +236,18 @@ class Connection:
             follower.forget()
         if self._database.in_transaction:
             self._database.execute("ROLLBACK")
+        self.forget()
+
+    def on_forget(self, forget: Callable[[], None]) -> None:
+        """Call this method whenever what a table keeps of its rows may not hold any more. It keeps no table alive."""
+        self._on_forget.append(weakref.WeakMethod(forget))
+
+    def forget(self) -> None:
+        """Let every table read its rows again when they are next asked for."""
+        for known in self._on_forget:
+            forget = known()
+            if forget is not None:
+                forget()
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
@@ -268,26 +274,46 @@ class Connection:
                     with contextlib.suppress(sqlite3.DatabaseError):  # nothing was written; damage was met on the way
                         self._database.execute("ROLLBACK")
 
-    def get_value(self, key: str, default: Any = None) -> Any:
-        """A value of the key-value table, decoded from JSON.
+    @contextlib.contextmanager
+    def unchecked(self) -> Iterator[sqlite3.Connection]:
+        """One state of the file as SQLite reads it, damaged text too, for what looks for damage; other threads wait."""
+        with self._guard:
+            before, self._database.text_factory = self._database.text_factory, any_text
+            try:
+                with self._state(), self._checks.resting():
+                    yield self._database
+            finally:
+                self._database.text_factory = before
 
-        Keys in use: `scale_kind`, `scale_source`, `gravity` (known, estimated, unknown), `T_world_graph` (4x4),
-        `gravity_estimate` (up and floor in the graph's frame, see `memory.gravity`), `library` (what all things are
-        derived with, see `memory.library_rules`), `tale` (what stands of changes between sessions, see `memory.tale`),
-        `feature_space`, `last_id`, `created_by`.
-        """
-        rows = self._rows("SELECT value FROM memory WHERE key = ?", (key,))
-        return from_json(rows[0][0], f"the value {key} of {self.path}") if rows else default
+    @contextlib.contextmanager
+    def temporary(self) -> Iterator[None]:
+        """Temporary tables may be made and written inside, of a file that is only read."""
+        self._database.execute("PRAGMA query_only=OFF")
+        try:
+            yield
+        finally:
+            self._database.execute("PRAGMA query_only=ON")
 
-    def set_value(self, key: str, value: object) -> None:
-        """Set a value of the key-value table; anything JSON holds."""
-        self._database.execute("INSERT OR REPLACE INTO memory VALUES (?, ?)", (key, to_json(value)))
+    def execute(self, statement: str, arguments: Arguments = ()) -> Done:
+        """Run one statement that writes; inside `transaction()`."""
+        cursor = self._database.execute(statement, arguments)
+        return Done(int(cursor.lastrowid or 0), cursor.rowcount)
 
-    def drop_value(self, key: str) -> None:
-        """Forget a value of the key-value table, if there is one."""
-        self._database.execute("DELETE FROM memory WHERE key = ?", (key,))
+    def execute_many(self, statement: str, arguments: Iterable[Arguments]) -> None:
+        """Run a statement that writes for many rows; inside `transaction()`."""
+        self._database.executemany(statement, arguments)
 
-    def _rows(self, query: str, arguments: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    @property
+    def data_version(self) -> int:
+        """Another number as soon as another connection has changed the file."""
+        return int(self.rows("PRAGMA data_version")[0][0])
+
+    def stamp(self) -> tuple[int, int, bool]:
+        """Changes whenever the content may have: by other processes, by this store, by a rollback."""
+        return self.data_version, self._database.total_changes, self._database.in_transaction
+
+    def rows(self, query: str, arguments: Arguments = ()) -> list[tuple[Any, ...]]:
+        """All rows of a question, checked as `read_checks` says."""
         self._check_process()
         try:
             rows = self._database.execute(query, arguments).fetchall()
@@ -301,7 +327,7 @@ class Connection:
         if os.getpid() != self._process:
             raise MemoryFileError(f"{self.path} was opened by the process that this one was forked from; open it again")
 
-    def _believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    def believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
         if self._checks.by_part(table):
             written = frozenset[int]() if self._sums is None else self._sums.touched(table)
@@ -312,7 +338,7 @@ class Connection:
             self._refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
         return rows
 
-    def _sound(self, table: str, keys: Iterable[int]) -> None:
+    def sound(self, table: str, keys: Iterable[int]) -> None:
         """Check what rows with these first keys stand in, where the table is not checked as a whole."""
         self._refuse(self._checks.found_in_parts(table, keys))
 
@@ -327,7 +353,7 @@ class _Closed:
         raise MemoryFileError(f"{self._path} is closed; open it again")
 
 
-def _is_ours(trace: TracebackType | None) -> bool:
+def is_ours(trace: TracebackType | None) -> bool:
     """Whether an error came out of this package, and not of what its user does beside."""
     return any(str(frame.f_globals.get("__name__", "")).startswith("list3r.") for frame, _ in walk_tb(trace))
 
@@ -338,7 +364,8 @@ def remove_memory(path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _damaged(path: Path, found: str) -> str:
+def damaged(path: Path, found: str) -> str:
+    """Return what is said of a damaged file."""
     return f"{path} is damaged ({found}); `list3r repair {path}` saves what is sound"
 
 

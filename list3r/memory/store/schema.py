@@ -132,6 +132,50 @@ MIGRATIONS: tuple[str, ...] = (
     WHERE key LIKE 'label votes _%' AND json_valid(value);
     UPDATE memory SET key = 'label classes', value = '{}' WHERE key = 'label votes';
     """,
+    # 8: facts of sessions, votes of detectors and the labels from them leave the key-value table
+    """
+    ALTER TABLE sessions ADD COLUMN camera TEXT;
+    ALTER TABLE sessions ADD COLUMN cuts TEXT;
+    ALTER TABLE sessions ADD COLUMN depth_step INTEGER;
+    ALTER TABLE sessions ADD COLUMN lost_reasons TEXT NOT NULL DEFAULT '[]';
+    UPDATE sessions SET
+        camera = (SELECT value FROM memory WHERE key = 'camera ' || session_id),
+        cuts = (SELECT value FROM memory WHERE key = 'cuts ' || session_id),
+        depth_step = (SELECT CAST(value AS INTEGER) FROM memory WHERE key = 'depth step ' || session_id),
+        lost_reasons = coalesce((SELECT value FROM memory WHERE key = 'lost ' || session_id), '[]');
+    UPDATE sessions SET
+        cuts = (SELECT value FROM memory WHERE key = 'cuts'),
+        depth_step = (SELECT CAST(value AS INTEGER) FROM memory WHERE key = 'depth step'),
+        lost_reasons = coalesce((SELECT value FROM memory WHERE key = 'lost'), '[]')
+    WHERE session_id = (SELECT min(session_id) FROM sessions);
+    CREATE TABLE votes (
+        chunk_id INTEGER NOT NULL REFERENCES chunks, local_id INTEGER NOT NULL, source TEXT NOT NULL,
+        missed REAL NOT NULL, classes TEXT NOT NULL, looks REAL NOT NULL,
+        PRIMARY KEY (chunk_id, local_id, source)) WITHOUT ROWID;
+    INSERT OR IGNORE INTO votes
+        SELECT CAST(substr(m.key, 13) AS INTEGER), CAST(l.key AS INTEGER), s.key, json_extract(l.value, '$[0]'),
+            json_extract(l.value, '$[1]'), coalesce(json_extract(l.value, '$[2]'), 0.0)
+        FROM memory m, json_each(CASE WHEN json_valid(m.value) THEN m.value ELSE '{}' END) s,
+            json_each(CASE s.type WHEN 'object' THEN s.value ELSE '{}' END) l
+        WHERE m.key LIKE 'label votes _%' AND l.type = 'array';
+    CREATE TABLE detected_labels (
+        instance INTEGER PRIMARY KEY REFERENCES instances, label TEXT NOT NULL, confidence REAL NOT NULL,
+        found REAL NOT NULL, detector TEXT NOT NULL);
+    INSERT OR IGNORE INTO detected_labels
+        SELECT CAST(l.key AS INTEGER), json_extract(l.value, '$[0]'), json_extract(l.value, '$[1]'),
+            json_extract(l.value, '$[2]'), json_extract(l.value, '$[3]')
+        FROM memory m, json_each(CASE WHEN json_valid(m.value) THEN m.value ELSE '{}' END) l
+        WHERE m.key = 'detected labels' AND l.type = 'array';
+    UPDATE memory SET value = json_set(value, '$.light', json_object('white_l', json_extract(value, '$.light[0]'),
+        'cast_ab', json_array(json_extract(value, '$.light[1]'), json_extract(value, '$.light[2]'))))
+    WHERE key = 'library' AND json_valid(value);
+    UPDATE memory SET key = 'change_ledger',
+        value = json_set(json_remove(value, '$.told'), '$.with_events', json(json_extract(value, '$.told')))
+    WHERE key = 'tale' AND json_valid(value);
+    DELETE FROM memory WHERE key IN ('lost', 'cuts', 'depth step', 'detected labels', 'feature_space')
+        OR key LIKE 'camera _%' OR key LIKE 'lost _%' OR key LIKE 'cuts _%' OR key LIKE 'depth step _%'
+        OR key LIKE 'label votes _%';
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -2,57 +2,160 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
-from typing import Any
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
-import numpy as np
-
+from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.checksums import summed_tables
-from list3r.memory.store.read_checks import BOXES, FAILURES, WORDS, any_text, damage_of
-from list3r.memory.store.tables.edits import EditVerbs
-from list3r.memory.store.tables.events import EventVerbs
-from list3r.memory.store.tables.library import LibraryVerbs
+from list3r.memory.store.connection import Connection, damaged, is_ours
+from list3r.memory.store.derived import Derived
+from list3r.memory.store.facts import Facts
+from list3r.memory.store.placed import Surfaces, Tracks, Trajectory
+from list3r.memory.store.read_checks import BOXES, FAILURES, WORDS, damage_of
+from list3r.memory.store.tables.chunks import Chunks
+from list3r.memory.store.tables.edges import Bends, Edges
+from list3r.memory.store.tables.edits import Edits, MergeLog
+from list3r.memory.store.tables.embeddings import Embeddings
+from list3r.memory.store.tables.events import Events
+from list3r.memory.store.tables.frames import Frames, Keyframes
+from list3r.memory.store.tables.ids import Ids
+from list3r.memory.store.tables.instances import Instances
+from list3r.memory.store.tables.labels import DetectedLabels, LabelVotes
+from list3r.memory.store.tables.library import LibraryState
+from list3r.memory.store.tables.local_instances import LocalInstances, Supports
+from list3r.memory.store.tables.observations import Observations
+from list3r.memory.store.tables.relations import Relations
+from list3r.memory.store.tables.sessions import Sessions
+from list3r.memory.store.tables.words import Words
 
 
-class Store(EditVerbs, EventVerbs, LibraryVerbs):
-    """Verbs of the memory file. `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew."""
+class Store:
+    """The memory file: `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew.
+
+    What it holds is asked for and written by one object for each table (`store.chunks.all()`). What writes is called
+    inside `transaction()`.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self.derived = Derived()
+        """What is made of the memory and kept until it is closed."""
+        self.facts = Facts(connection)
+        self._add_measured(connection)
+        self._add_library(connection)
+
+    def _add_measured(self, connection: Connection) -> None:
+        """What chunks measured, and where they lie."""
+        self.library = LibraryState(connection)
+        self.sessions = Sessions(connection)
+        self.frames = Frames(connection)
+        self.keyframes = Keyframes(connection)
+        self.supports = Supports(connection)
+        self.local_instances = LocalInstances(connection, self.supports, self.library)
+        self.chunks = Chunks(connection, self.frames, self.keyframes, self.local_instances, self.library)
+        self.edges = Edges(connection)
+        self.bends = Bends(connection)
+        self.votes = LabelVotes(connection)
+        self.trajectory = Trajectory(self.chunks, self.frames, self.bends)
+
+    def _add_library(self, connection: Connection) -> None:
+        """What is derived from that, and what operators said of it."""
+        self.merges = MergeLog(connection)
+        self.edits = Edits(connection)
+        self.ids = Ids(connection, self.facts, self.edits)
+        self.embeddings = Embeddings(connection)
+        self.relations = Relations(connection, self.ids)
+        self.events = Events(connection)
+        self.detected_labels = DetectedLabels(connection)
+        of_instance = self.embeddings, self.relations, self.events, self.detected_labels
+        self.instances = Instances(connection, self.ids, self.library, of_instance)
+        self.observations = Observations(connection, self.ids)
+        self.words = Words(connection)
+        self.surfaces = Surfaces(self.chunks, self.supports, self.instances, self.events)
+        self.tracks = Tracks(
+            (self.chunks, self.frames), (self.local_instances, self.supports), (self.instances, self.observations)
+        )
+
+    @classmethod
+    def create(cls, path: str | Path) -> Self:
+        """Create a memory, empty and open for writing. Raises `MemoryFileError` when the path is taken or not writable.
+
+        The file appears under its name only when it is whole.
+        """
+        return cls(Connection.create(path))
+
+    @classmethod
+    def open(cls, path: str | Path, *, writable: bool = False) -> Self:
+        """Open a memory. Raises `MemoryFileError` for anything else, and for a memory of a newer schema.
+
+        See `Connection.open` for memories of older schemas.
+        """
+        return cls(Connection.open(path, writable=writable))
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.connection.path
+
+    @property
+    def writable(self) -> bool:
+        """Whether the file was opened for writing."""
+        return self.connection.writable
+
+    def beside(self) -> str | None:
+        """Return what is to be known of a file that is not whole by itself; None where it is."""
+        return self.connection.beside()
+
+    def transaction(self) -> AbstractContextManager[None]:
+        """Write all that is written inside together or not at all. Not re-entrant."""
+        return self.connection.transaction()
+
+    def snapshot(self) -> AbstractContextManager[None]:
+        """Read all that is read inside of one state of the memory, whatever a writer commits meanwhile."""
+        return self.connection.snapshot()
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the one file, release the lock. A second call does nothing."""
+        self.connection.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        unexplained = isinstance(error, Exception) and not isinstance(error, List3rError | OSError) and is_ours(trace)
+        found = self.verify() if unexplained else []
+        self.close()
+        if found:
+            raise MemoryFileError(damaged(self.path, found[0])) from error
 
     def verify(self) -> list[str]:
-        """Every damage found: pages, checksums of rows and blobs, rows that point nowhere, boxes that lie.
+        """Return every damage found: pages, checksums of rows and blobs, rows that point nowhere, boxes that lie.
 
         Empty when the file is sound. One pass over the file; about 0.1 s for 25 MB.
         """
-        with self._guard:
-            before = self._database.text_factory
-            self._database.text_factory = any_text
-            try:
-                with self._state(), self._checks.resting():
-                    return list(self._verify())
-            finally:
-                self._database.text_factory = before
+        with self.connection.unchecked() as database:
+            return list(_damage(database))
 
-    def index_boxes(self) -> None:
-        """Fill the R*Tree anew from the instances; call inside `transaction()`."""
-        rows = self._rows("SELECT id, geometry FROM instances ORDER BY id")
-        boxes = [(i, *np.frombuffer(g, "<f8")[3:9].reshape(2, 3).T.ravel().tolist()) for i, g in rows]
-        self._database.execute("DELETE FROM instance_boxes")
-        self._database.executemany("INSERT INTO instance_boxes VALUES (?, ?, ?, ?, ?, ?, ?)", boxes)
 
-    def _damage(self) -> list[str]:
-        return self.verify()
-
-    def _verify(self) -> Iterator[str]:
-        for text in self._asked("PRAGMA integrity_check"):
-            yield from (f"SQLite: {t}" for t in text if t != "ok")
-        for name in (*summed_tables(), BOXES, WORDS):
-            try:
-                yield from damage_of(self._database, name, pages=False)
-            except FAILURES as error:
-                yield f"{name}: {error}"
-
-    def _asked(self, query: str) -> Iterator[tuple[Any, ...]]:
-        """Rows of a query; what SQLite says where it fails, as one row."""
+def _damage(database: sqlite3.Connection) -> Iterator[str]:
+    for text in _asked(database, "PRAGMA integrity_check"):
+        yield from (f"SQLite: {t}" for t in text if t != "ok")
+    for name in (*summed_tables(), BOXES, WORDS):
         try:
-            yield from self._database.execute(query)
+            yield from damage_of(database, name, pages=False)
         except FAILURES as error:
-            yield (str(error),)
+            yield f"{name}: {error}"
+
+
+def _asked(database: sqlite3.Connection, query: str) -> Iterator[tuple[Any, ...]]:
+    """Rows of a query; what SQLite says where it fails, as one row."""
+    try:
+        yield from database.execute(query)
+    except FAILURES as error:
+        yield (str(error),)

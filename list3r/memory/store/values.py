@@ -86,6 +86,10 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "settings": _checked("list3r_object", "an object of JSON", "text"),
         "frame_count": _integer(0),
         "state": _one_of("building", "complete"),
+        "camera": _maybe(_checked("list3r_object", "an object of JSON", "text")),
+        "cuts": _maybe(_checked("list3r_wholes", "a list of whole numbers", "text")),
+        "depth_step": _maybe(_integer(1)),
+        "lost_reasons": _checked("list3r_texts", "a list of texts", "text"),
     },
     "chunks": {
         "chunk_id": _CHUNK,
@@ -193,6 +197,20 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         **{name: _text() for name in ("kind", "a", "b", "reason")},
         "scores": _checked("list3r_object", "an object of JSON", "text"),
     },
+    "votes": {
+        "chunk_id": _CHUNK,
+        "local_id": _LOCAL,
+        "source": _text(),
+        "missed": _number(-1e9, 1e9),
+        "classes": _checked("list3r_votes", "pairs of numbers by class", "text"),
+        "looks": _number(0.0, 1e9),
+    },
+    "detected_labels": {
+        "instance": _integer(1),
+        **{name: _text() for name in ("label", "detector")},
+        "confidence": _SHARE,
+        "found": _number(0.0, 1e9),
+    },
     "aliases": {"id": _integer(1), "instance": _integer(1)},
     "placements": {
         "chunk_id": _CHUNK,
@@ -250,6 +268,8 @@ REFERENCES = (
     ("local_instances", "chunk_id", "chunks", "chunk_id"),
     ("supports", "chunk_id", "chunks", "chunk_id"),
     ("anchors", "instance", "instances", "id"),
+    ("votes", "chunk_id", "chunks", "chunk_id"),
+    ("detected_labels", "instance", "instances", "id"),
     ("events", "instance", "instances", "id"),
     ("events", "session_id", "sessions", "session_id"),
 )
@@ -328,6 +348,21 @@ def _are_numbers(text: str) -> bool:
 def _are_pairs(text: str) -> bool:
     held = json.loads(text)
     return isinstance(held, list) and all(len(p) == 2 and all(type(n) is int and 0 <= n < _ID for n in p) for p in held)
+
+
+def _are_wholes(text: str) -> bool:
+    held = json.loads(text)
+    return isinstance(held, list) and all(type(n) is int and 0 <= n < _ID for n in held)
+
+
+def _are_texts(text: str) -> bool:
+    held = json.loads(text)
+    return isinstance(held, list) and all(isinstance(t, str) and len(t) <= _MOST_TEXT for t in held)
+
+
+def _are_votes(text: str) -> bool:
+    held = json.loads(text)
+    return isinstance(held, dict) and all(len(pair) == 2 and all(map(_finite, pair)) for pair in held.values())
 
 
 def _finite(value: object) -> bool:
@@ -411,8 +446,7 @@ _VALUES: Mapping[str, Callable[[Any], object]] = {
         name: lambda v: isinstance(v, str) and len(v) <= _MOST_TEXT
         for name in ("scale_kind", "scale_source", "created_by", "poses")
     },
-    **{name: lambda v: isinstance(v, dict) for name in ("library", "tale", "text_models", "label classes")},
-    "feature_space": lambda v: isinstance(v, str),
+    **{name: lambda v: isinstance(v, dict) for name in ("library", "change_ledger", "text_models", "label classes")},
 }
 
 _FUNCTIONS: Mapping[str, Callable[..., bool]] = {
@@ -420,6 +454,9 @@ _FUNCTIONS: Mapping[str, Callable[..., bool]] = {
     "list3r_object": _is_object,
     "list3r_numbers": _are_numbers,
     "list3r_pairs": _are_pairs,
+    "list3r_wholes": _are_wholes,
+    "list3r_texts": _are_texts,
+    "list3r_votes": _are_votes,
     "list3r_sim3": _is_sim3,
     "list3r_pose": _is_pose,
     "list3r_covariance": _is_covariance,

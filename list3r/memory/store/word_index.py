@@ -15,8 +15,9 @@ from list3r.memory.description.words import VERSION, vocabulary
 _TEXTS = "label, structure, description, color_name"
 _BATCH = 500_000
 """Rows that are sorted at once."""
-_STAMP = ("", VERSION, 0)
+STAMP = ("", VERSION, 0)
 """A row of no word says which words the table holds."""
+ASK_STAMP = "SELECT * FROM words WHERE word = ''"
 
 Weights = dict[str, int]
 """Hundredths by word."""
@@ -73,7 +74,7 @@ class WordIndex:
 def write_words(database: sqlite3.Connection) -> None:
     """Make the whole table anew; inside a transaction."""
     database.execute("DELETE FROM words")
-    database.execute("INSERT INTO words VALUES (?, ?, ?)", _STAMP)
+    database.execute("INSERT INTO words VALUES (?, ?, ?)", STAMP)
     expected = expected_words(database)
     while rows := sorted(islice(expected, _BATCH)):
         database.executemany("INSERT INTO words VALUES (?, ?, ?)", rows)
@@ -81,7 +82,7 @@ def write_words(database: sqlite3.Connection) -> None:
 
 def up_to_date(database: sqlite3.Connection) -> bool:
     """Whether the table holds the words that this program knows."""
-    return database.execute("SELECT * FROM words WHERE word = ''").fetchall() == [_STAMP]
+    return database.execute(ASK_STAMP).fetchall() == [STAMP]
 
 
 def expected_words(database: sqlite3.Connection) -> Iterator[tuple[str, int, int]]:

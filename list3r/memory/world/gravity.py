@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from list3r.memory.geometry import Array, Sim3, rotation_exp
 from list3r.memory.overlap.planes import Planes, place_planes
 from list3r.memory.overlap.summaries import cameras_of, chunk_summaries, sample_of, world_unit
+from list3r.memory.records import UpEstimate
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
 
@@ -186,7 +186,7 @@ def estimate_gravity(
     every chunk.
     """
     s = settings or stored_settings(store, GravitySettings, "library", "gravity")
-    chunks = store.chunks()
+    chunks = store.chunks.all()
     if S_graph_chunk is None or components is None:
         S_graph_chunk = {c.chunk_id: c.S_world_chunk for c in chunks}
         components = {c.chunk_id: c.component for c in chunks}
@@ -201,22 +201,24 @@ def estimate_gravity(
     if summaries.metre is not None:
         unit *= float(inside[0].S_world_chunk.scale) / float(rows[0].S_world_chunk.scale)
     found = gravity_from_planes(planes, cameras_of(store, inside), unit, s)
-    settled = _with_hysteresis(found, store.get_value("gravity_estimate"), unit, s)
+    settled = _with_hysteresis(found, store.facts.gravity_estimate, unit, s)
     if settled is found and found.status != "unknown":
-        store.set_value("gravity_estimate", {"up": found.up.tolist(), "floor_height": found.floor_height})
+        store.facts.gravity_estimate = UpEstimate(found.up, found.floor_height)
     return settled
 
 
-def _with_hysteresis(found: Gravity, before: dict[str, Any] | None, unit: float, s: GravitySettings) -> Gravity:
+def _with_hysteresis(found: Gravity, before: UpEstimate | None, unit: float, s: GravitySettings) -> Gravity:
     """Return the estimate before where it holds still, else the one found now."""
-    if found.status == "unknown" or before is None or (before["floor_height"] is None) != (found.floor_height is None):
+    if found.status == "unknown" or before is None:
         return found
-    up = np.array(before["up"])
+    now, then, up = found.floor_height, before.floor_height, before.up
+    if (then is None) != (now is None):
+        return found
     turned = float(np.degrees(np.arccos(np.clip(up @ found.up, -1.0, 1.0))))
-    risen = 0.0 if found.floor_height is None else abs(found.floor_height - before["floor_height"])
+    risen = 0.0 if now is None or then is None else abs(now - then)
     if turned > s.hysteresis_deg or risen > s.hysteresis_m * unit:
         return found
-    return replace(found, up=up, floor_height=before["floor_height"])
+    return replace(found, up=up, floor_height=before.floor_height)
 
 
 def world_from_graph(gravity: Gravity) -> Sim3:

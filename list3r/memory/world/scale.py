@@ -91,11 +91,11 @@ def parse_anchor(text: str) -> ScaleAnchor:
 
 def measure(store: Store, anchor: ScaleAnchor) -> MeasuredAnchor:
     """Return how long the anchor is now. Raises `OptionError` and `UnknownIdError` where it cannot be measured."""
-    chunks = _main_part(store.chunks())
+    chunks = _main_part(store.chunks.all())
     if not chunks:
         raise OptionError(f"{store.path} holds no chunk yet; there is nothing to measure")
-    if store.get_value("scale_kind") == "metric":
-        raise OptionError(f"lengths of {store.path} are metres already ({store.get_value('scale_source')})")
+    if store.facts.scale_kind == "metric":
+        raise OptionError(f"lengths of {store.path} are metres already ({store.facts.scale_source})")
     length, keys = _length(store, anchor, chunks)
     if not (math.isfinite(length) and length > 0):
         raise OptionError(f"anchor {anchor.text!r} has no length in {store.path}; choose another one")
@@ -110,11 +110,10 @@ def write_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
     `S_graph_chunk` holds the chunks in the frame of the pose graph.
     """
     found = world_scale(store, chunks, S_graph_chunk)
-    for name, value in (("scale_kind", found.kind), ("scale_source", found.source)):
-        if value is not None and store.get_value(name) != value:
-            store.set_value(name, value)
-    if store.get_value("metres_per_graph_unit") != found.metres:
-        store.set_value("metres_per_graph_unit", found.metres)
+    store.facts.scale_kind = found.kind
+    if found.source is not None:
+        store.facts.scale_source = found.source
+    store.facts.metres_per_graph_unit = found.metres
     return Sim3(np.asarray(1.0 if found.metres is None else found.metres), np.eye(3), np.zeros(3))
 
 
@@ -122,14 +121,14 @@ def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
     """Return what a unit of the graph is: by the chunks that are metric, else by the last anchor that stands."""
     inside = _main_part(chunks)
     metric = [c.chunk_id for c in inside if c.scale_kind == "metric"]
-    said = store.get_value("scale_source")
+    said = store.facts.scale_source
     if inside and len(metric) == len(inside):
         return WorldScale("metric", None if said not in (None, "none") else "the reconstruction model", None)
     if metric:
         mean = float(np.mean([math.log(float(S_graph_chunk[k].scale)) for k in metric]))
         return WorldScale("metric", f"{len(metric)} of {len(inside)} chunks are metric", math.exp(-mean))
     known = {c.chunk_id for c in inside}
-    for edit in reversed(standing(store.edits())):
+    for edit in reversed(standing(store.edits.all())):
         if edit.kind == "scale" and edit.scale is not None and edit.scale[0] in known:
             chunk_id, metres = edit.scale
             factor = metres / float(S_graph_chunk[chunk_id].scale)
@@ -142,16 +141,16 @@ def rescale(store: Store) -> None:
 
     Writes where chunks lie; the library is to be derived anew then.
     """
-    chunks = store.chunks()
-    S_world_graph = Sim3.from_matrix(store.get_value("T_world_graph", np.eye(4).tolist()))
+    chunks = store.chunks.all()
+    S_world_graph = store.facts.S_world_graph
     S_graph_world = S_world_graph.inverse()
     grow = write_scale(store, chunks, {c.chunk_id: S_graph_world @ c.S_world_chunk for c in chunks})
     factor = float(grow.scale) / float(S_world_graph.scale)
     if abs(factor - 1.0) < 1e-12:
         return
     S_new_old = Sim3(np.asarray(factor), np.eye(3), np.zeros(3))
-    store.set_value("T_world_graph", (S_new_old @ S_world_graph).as_matrix().tolist())
-    store.place_chunks(
+    store.facts.S_world_graph = S_new_old @ S_world_graph
+    store.chunks.place(
         {c.chunk_id: S_new_old @ c.S_world_chunk for c in chunks},
         {c.chunk_id: c.component for c in chunks},
         {c.chunk_id: c.covariance for c in chunks if c.covariance is not None},
@@ -165,24 +164,24 @@ def _main_part(chunks: list[ChunkRow]) -> list[ChunkRow]:
 
 
 def _length(store: Store, anchor: ScaleAnchor, chunks: list[ChunkRow]) -> tuple[float, tuple[Key, ...]]:
-    upright = store.get_value("gravity", "unknown") != "unknown"
+    upright = store.facts.gravity != "unknown"
     if anchor.kind == "points":
         assert anchor.points_world is not None
         return float(np.linalg.norm(anchor.points_world[1] - anchor.points_world[0])), ()
     if anchor.kind == "camera":
-        estimate = store.get_value("gravity_estimate")
-        if not upright or estimate is None or estimate["floor_height"] is None:
+        estimate = store.facts.gravity_estimate
+        if not upright or estimate is None or estimate.floor_height is None:
             raise OptionError(
                 f"{store.path} knows no floor to measure camera_height from; anchor an instance by its ID"
             )
         return float(np.median(cameras_of(store, chunks).translation[:, 2])), ()
-    instance = store.instance(store.resolve(anchor.instance_id))
+    instance = store.instances.get(store.ids.resolve(anchor.instance_id))
     if instance.component != chunks[0].component:
         raise OptionError(
             f"#{instance.id} lies in a part of the memory that was never joined to the first one; its size says "
             "nothing of that one's scale"
         )
-    keys = tuple((o.chunk_id, o.local_id) for o in store.observations(instance.id))
+    keys = tuple((o.chunk_id, o.local_id) for o in store.observations.of(instance.id))
     if anchor.kind == "size":
         return float(instance.box.size.max()), keys
     if not upright:

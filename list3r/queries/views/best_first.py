@@ -57,7 +57,7 @@ def nearest_first(store: Store, aabb: NDArray[np.float64], search: NearestSearch
     k-th best is far.
     """
     k, filters, limit = search.k, search.filters, search.limit
-    bounds = store.world_bounds()
+    bounds = store.instances.bounds()
     if bounds is None:
         return []
     touch = search.touch + STRAY * float(np.linalg.norm(bounds[1] - bounds[0]))
@@ -70,7 +70,7 @@ def nearest_first(store: Store, aabb: NDArray[np.float64], search: NearestSearch
     shrinking = 4
     while True:
         most = _MOST + k if shrinking else -1
-        ids, boxes = store.boxes_in_box(
+        ids, boxes = store.instances.boxes_in_box(
             aabb[0] - reach,
             aabb[1] + reach,
             structure=filters.structure,
@@ -110,7 +110,7 @@ def _measure(
             break
         fresh = [int(ids[n]) for n in part if int(ids[n]) not in measured and int(ids[n]) != search.leave_out]
         gap = dict(zip(ids[part].tolist(), gaps[part].tolist(), strict=True))
-        for i in store.instances_of(fresh):
+        for i in store.instances.of(fresh):
             if len(best) >= k and gap[i.id] > best[k - 1][0] + farther:
                 continue
             measured[i.id] = (search.measure(i), i) if search.filters.passes(i) else None
@@ -129,4 +129,4 @@ def box_gaps(boxes: NDArray[np.float64], aabb: NDArray[np.float64]) -> NDArray[n
 def _spacing(store: Store, bounds: NDArray[np.float64], k: int) -> float:
     """Guess how far the k-th nearest lies, as if all ids ever given were spread evenly over the world."""
     side = np.maximum(bounds[1] - bounds[0], 1e-3)
-    return float(np.cbrt(np.prod(side) * k / max(store.next_id(), 1)))
+    return float(np.cbrt(np.prod(side) * k / max(store.ids.next(), 1)))

@@ -47,7 +47,7 @@ def camera_of_frame(store: Store, frame: int, session: int | None = None) -> Pos
 
     Raises `OptionError` for a frame that is not there or has no pose, with the nearest one that has.
     """
-    rows = [f for f in store.frames(_checked_session(store, session)) if f.state == "posed"]
+    rows = [f for f in store.frames.all(_checked_session(store, session)) if f.state == "posed"]
     found = [f for f in rows if f.frame_index == frame]
     if not found:
         near = min(rows, key=lambda f: abs(f.frame_index - frame), default=None)
@@ -60,7 +60,7 @@ def camera_at_time(store: Store, time_s: float, session: int | None = None) -> P
     """Return the camera of the posed frame nearest to a time, seconds of the source's clock. Raises `OptionError`."""
     if not np.isfinite(time_s):
         raise OptionError(f"time {time_s} must be a finite number of seconds")
-    rows = [f for f in store.frames(_checked_session(store, session)) if f.state == "posed"]
+    rows = [f for f in store.frames.all(_checked_session(store, session)) if f.state == "posed"]
     if not rows:
         raise OptionError(f"{store.path} has no frame with a pose")
     return _camera(store, min(rows, key=lambda f: (abs(f.time_s - time_s), f.session_id, f.frame_index)))
@@ -83,7 +83,7 @@ def camera_at_pose(
         raise OptionError(f"quat must be four numbers w, x, y, z, not {quat_wxyz!r}") from error
     if quat.shape != (4,) or not np.isfinite(quat).all() or not 1e-9 < np.abs(quat).max() < 1e9:
         raise OptionError(f"quat must be four finite numbers w, x, y, z, not all zero, not {quat_wxyz!r}")
-    chunks = store.chunks(_checked_session(store, session))
+    chunks = store.chunks.all(_checked_session(store, session))
     if not chunks:
         raise OptionError(f"{store.path} has no camera yet; give it a video first")
     pose = np.eye(4)
@@ -94,21 +94,21 @@ def camera_at_pose(
 
 def last_camera(store: Store, session: int | None = None) -> PosedCamera:
     """Return where the camera was last. Raises `OptionError` when no frame has a pose."""
-    rows = [f for f in store.frames(_checked_session(store, session)) if f.state == "posed"]
+    rows = [f for f in store.frames.all(_checked_session(store, session)) if f.state == "posed"]
     if not rows:
         raise OptionError(f"{store.path} has no frame with a pose to look from")
     return _camera(store, rows[-1])
 
 
 def _checked_session(store: Store, session: int | None) -> int | None:
-    known = [s.session_id for s in store.sessions()]
+    known = [s.session_id for s in store.sessions.all()]
     if session is not None and session not in known:
         raise OptionError(f"{store.path} has no session {session}; it has: {', '.join(map(str, known)) or 'none'}")
     return session
 
 
 def _camera(store: Store, frame: FrameRow) -> PosedCamera:
-    chunk = _chunk_of(store.chunks(frame.session_id), frame)
+    chunk = _chunk_of(store.chunks.all(frame.session_id), frame)
     S_world_cam = chunk.S_world_chunk @ Sim3.from_matrix(frame.T_chunk_cam)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = S_world_cam.rotation, S_world_cam.translation

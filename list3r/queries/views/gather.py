@@ -44,7 +44,7 @@ class Gathered:
     def bearing(self, store: Store, words: tuple[str, ...]) -> list[int]:
         """Return ids that bear all of some words, the best first."""
         if words not in self._bearing:
-            found = store.bearing(words, _MOST_BEARING + 1)
+            found = store.words.bearing(words, _MOST_BEARING + 1)
             if len(found) > _MOST_BEARING:
                 self.notes.append(f"more than {_MOST_BEARING} instances match {' '.join(words)}; add words")
             self._bearing[words] = found[:_MOST_BEARING]
@@ -54,25 +54,25 @@ class Gathered:
         """Return longest edges of some of things that bear some words, of any where fewer than four do; ascending."""
         bearing = self.bearing(store, words) if words else []
         ids = bearing[:: -(-len(bearing) // _SAMPLE)] if len(bearing) >= 4 else self.sample
-        edges = [float(np.max(i.box.size)) for i in store.instances_of(ids) if i.structure is None]
+        edges = [float(np.max(i.box.size)) for i in store.instances.of(ids) if i.structure is None]
         return np.sort(np.array(edges))
 
 
 def is_large(store: Store) -> bool:
     """Tell whether a memory holds too much to look at all of it."""
-    return store.largest_id() > EVERYTHING
+    return store.ids.largest() > EVERYTHING
 
 
 def sample(store: Store) -> list[Instance]:
     """Return all instances, or some of all in a memory that holds too many."""
-    return store.instances_of(store.sample_ids(_SAMPLE)) if is_large(store) else store.instances()
+    return store.instances.of(store.ids.sample(_SAMPLE)) if is_large(store) else store.instances.all()
 
 
 def gather(store: Store, phrase: Phrase) -> Gathered | None:
     """Collect what to search for a question; None where that is everything."""
     if not is_large(store):
         return None
-    out = Gathered(sample=store.sample_ids(_SAMPLE))
+    out = Gathered(sample=store.ids.sample(_SAMPLE))
     own = _candidates(store, phrase, out)
     _keep(out, phrase, out.sample if own is None else own)
     return out
@@ -104,8 +104,8 @@ def _standing(
         _keep(out, clause.object, out.sample)
         return None
     from_objects = objects is not None and (found is None or len(objects) <= len(found))
-    rows = store.related((objects if from_objects else found) or [], clause.predicates, as_object=from_objects)
-    pairs = {(subject, object) for subject, _, object, _ in rows}
+    rows = store.relations.among((objects if from_objects else found) or [], clause.predicates, as_object=from_objects)
+    pairs = {(r.subject, r.object) for r in rows}
     if "near" in clause.predicates:
         pairs |= _near_structure(store, objects or [])
     subjects, others = None if found is None else set(found), None if objects is None else set(objects)
@@ -121,9 +121,9 @@ def _standing(
 def _near_structure(store: Store, objects: Sequence[int]) -> set[tuple[int, int]]:
     """Return pairs of anything and a wall or floor among some objects, whose boxes nearly meet."""
     out = set()
-    for wall in store.instances_of(store.structure_among(objects[:_MOST])[:_KEPT]):
+    for wall in store.instances.of(store.instances.structure_among(objects[:_MOST])[:_KEPT]):
         reach = 0.1 * float(np.linalg.norm(np.ptp(wall.aabb, axis=0))) + 1.0
-        out |= {(n, wall.id) for n in store.ids_in_box(wall.aabb[0] - reach, wall.aabb[1] + reach)[:_MOST]}
+        out |= {(n, wall.id) for n in store.instances.ids_in_box(wall.aabb[0] - reach, wall.aabb[1] + reach)[:_MOST]}
     return out
 
 

@@ -106,13 +106,13 @@ def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) 
 
     In a memory of more than `_MANY` things those are left out that are narrower there than two cells of the buffer.
     """
-    bounds = store.world_bounds()
+    bounds = store.instances.bounds()
     if bounds is None:
         return []
     step = max(1.0, camera.image_size[1] / _WIDTH)
     ends = np.abs(bounds - camera.place).max(axis=0)
     far = float(np.linalg.norm(ends)) if max_depth is None else (1.0 + _MARGIN) * max_depth
-    many = store.largest_id() > _MANY
+    many = store.ids.largest() > _MANY
     fx, fy, cx, cy = camera.intrinsics
     height, width = camera.image_size
     beside = _MAX_REACH * step
@@ -120,13 +120,13 @@ def in_front(store: Store, camera: PosedCamera, max_depth: float | None = None) 
     rays = np.array([[(x - cx) / fx, (y - cy) / fy, 1.0] for x in u for y in v]) * far
     corners = np.vstack([rays @ camera.T_world_cam[:3, :3].T + camera.place, camera.place])
     slack = _MARGIN * far
-    ids, boxes = store.boxes_in_box(corners.min(axis=0) - slack, corners.max(axis=0) + slack)
+    ids, boxes = store.instances.boxes_in_box(corners.min(axis=0) - slack, corners.max(axis=0) + slack)
     if many:
         apart = np.maximum(0.0, np.maximum(boxes[:, 0] - camera.place, camera.place - boxes[:, 1]))
         away = np.linalg.norm(apart, axis=1)
         wide = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1) * fx >= _LEAST_CELLS * step * away
         ids = ids[wide & (_depths(boxes, camera).max(axis=1) > 0.0)]
-    return [i for i in store.instances_of(sorted(ids.tolist())) if i.state != "removed"]
+    return [i for i in store.instances.of(sorted(ids.tolist())) if i.state != "removed"]
 
 
 def _depths(boxes: NDArray[np.float64], camera: PosedCamera) -> NDArray[np.float64]:
@@ -193,7 +193,7 @@ def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], flo
     """Return the surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie
     apart: of most of them the second neighbour is nearer, so that squares of that width close the surface.
     """
-    points = inside_box(store.support(instance.id).points.astype(np.float64), instance)
+    points = inside_box(store.surfaces.of(instance.id).points.astype(np.float64), instance)
     if len(points) < _FEW:
         side = np.linspace(-0.5, 0.5, _FEW)
         grid = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)

@@ -1,84 +1,103 @@
-"""Relations of chunks: how they were measured to lie to each other."""
+"""How chunks were measured to lie to each other, and how each of them bends."""
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
-from list3r.memory.records import (
-    Edge,
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.bends import Bend
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.records import Edge
+from list3r.memory.store.columns import Columns, joined
+from list3r.memory.store.connection import Connection
+from list3r.memory.store.table import Table
+
+_NO_FRAMES = (-1, -1)
+_FRAMES = joined(
+    ("frame_u", "frame_v"),
+    ("frames",),
+    lambda frames: frames or _NO_FRAMES,
+    lambda u, v: (None if u < 0 else (u, v),),
 )
-from list3r.memory.store.codec import (
-    pack_sim3,
-    to_json,
-)
-from list3r.memory.store.lock import WriterLock
-from list3r.memory.store.rows import (
-    f8,
-    read_edge,
-)
-from list3r.memory.store.tables.bends import BendVerbs
+_Key = tuple[int, int, str, int, int]
 
 
-class EdgeVerbs(BendVerbs):
-    """Writing and reading how chunks lie to each other. Writing verbs are called inside `transaction()`."""
+class Edges:
+    """The table of edges. What writes is called inside `transaction()`."""
 
-    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
-        super().__init__(path, database, lock)
-        self._edge_version = -1
-        self._edge_rows: dict[tuple[int, int, str, int, int], Edge] | None = None
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._rows = Table(connection, "edges", Columns(Edge, _FRAMES), "u, v, kind, frame_u, frame_v")
+        self._version = -1
+        self._known: dict[_Key, Edge] | None = None
+        connection.on_forget(self._forget)
 
-    def forget_rows(self) -> None:
-        """Read again when they are next asked for what was kept of rows."""
-        self._edge_rows = None
+    def add(self, edges: Iterable[Edge]) -> None:
+        """Store measured edges; one measured again replaces the old one."""
+        known, fresh = self._by_key(), list(edges)
+        self._rows.put(fresh)
+        condition = "u = ? AND v = ? AND kind = ? AND frame_u = ? AND frame_v = ?"
+        known |= {_key(e): e for key in map(_key, fresh) for e in self._rows.all(condition, key)}
+        self._known = dict(sorted(known.items()))
 
-    def add_edges(self, edges: Iterable[Edge]) -> None:
-        """Store measured relations of chunks; one measured again replaces the old one."""
-        known = self._known_edges()
-        fresh = list(edges)
-        self._database.executemany(
-            "INSERT OR REPLACE INTO edges (u, v, kind, frame_u, frame_v, S_v_u, confidence, weight, inliers,"
-            " residual_m, accepted, reason, scores, covariance) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            [
-                (
-                    e.u,
-                    e.v,
-                    e.kind,
-                    *(e.frames or (-1, -1)),
-                    pack_sim3(e.S_v_u),
-                    e.confidence,
-                    e.weight,
-                    e.inliers,
-                    e.residual_m,
-                    int(e.accepted),
-                    e.reason,
-                    to_json(e.scores),
-                    None if e.covariance is None else f8(e.covariance),
-                )
-                for e in fresh
-            ],
-        )
-        for e in fresh:
-            key = (e.u, e.v, e.kind, *(e.frames or (-1, -1)))
-            known |= self._read_edges("WHERE u = ? AND v = ? AND kind = ? AND frame_u = ? AND frame_v = ?", key)
-        self._edge_rows = dict(sorted(known.items()))
+    def all(self) -> list[Edge]:
+        """Return all measured edges, accepted or not."""
+        return list(self._by_key().values())
 
-    def edges(self) -> list[Edge]:
-        """All measured relations of chunks, accepted or not."""
-        return list(self._known_edges().values())
-
-    def _known_edges(self) -> dict[tuple[int, int, str, int, int], Edge]:
+    def _by_key(self) -> dict[_Key, Edge]:
         """All edges by key and in order, read again only when another process or a rollback may have changed them."""
-        version = int(self._rows("PRAGMA data_version")[0][0])
-        if self._edge_rows is None or self._edge_version != version:
-            self._edge_rows, self._edge_version = self._read_edges(), version
-        return self._edge_rows
+        version = self._connection.data_version
+        if self._known is None or self._version != version:
+            self._known, self._version = {_key(e): e for e in self._rows.all()}, version
+        return self._known
 
-    def _read_edges(self, where: str = "", key: tuple[Any, ...] = ()) -> dict[tuple[int, int, str, int, int], Edge]:
-        query = (
-            "SELECT u, v, kind, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, scores, frame_u,"
-            f" frame_v, covariance FROM edges {where} ORDER BY u, v, kind, frame_u, frame_v"
-        )
-        return {(r[0], r[1], r[2], r[11], r[12]): read_edge(r) for r in self._rows(query, key)}
+    def _forget(self) -> None:
+        self._known = None
+
+
+def _key(edge: Edge) -> _Key:
+    return edge.u, edge.v, edge.kind, *(edge.frames or _NO_FRAMES)
+
+
+@dataclass(frozen=True)
+class _BendRow:
+    chunk_id: int
+    bend: Bend
+
+
+_BEND = joined(
+    ("frames", "twists"),
+    ("bend",),
+    lambda bend: (_doubles(bend.frames), _doubles(bend.twists)),
+    lambda frames, twists: (_bend(frames, twists),),
+)
+
+
+class Bends:
+    """The table of bends: one small row for each chunk that bends, written when a session is finished."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._rows = Table(connection, "bends", Columns(_BendRow, _BEND), "chunk_id")
+
+    def replace(self, bends: Mapping[int, Bend]) -> None:
+        """Replace what is known of how chunks bend, by chunk id; call inside `transaction()`."""
+        self._rows.delete()
+        self._rows.put(_BendRow(k, bend) for k, bend in sorted(bends.items()))
+
+    def all(self) -> dict[int, Bend]:
+        """Return the bends by chunk id; a chunk that is not in it is rigid. Raises `MemoryFileError`."""
+        return {row.chunk_id: row.bend for row in self._rows.all()}
+
+
+def _doubles(values: NDArray[np.float64]) -> bytes:
+    return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def _bend(frames: bytes, twists: bytes) -> Bend:
+    at, x = np.frombuffer(frames, "<f8"), np.frombuffer(twists, "<f8").reshape(-1, 7)
+    if len(at) != len(x) or not len(at) or not np.isfinite(at).all() or not np.isfinite(x).all():
+        raise MemoryFileError("the bend is damaged")
+    return Bend(at, x)

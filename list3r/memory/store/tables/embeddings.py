@@ -2,97 +2,87 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.lock import WriterLock
-from list3r.memory.store.tables.chunks import ChunkVerbs
-from list3r.memory.store.tables.words import WordVerbs
-
-_BATCH = 500
-"""Rows asked for by id in one statement."""
+from list3r.memory.store.connection import Connection
+from list3r.memory.store.table import batches
 
 
-class EmbeddingVerbs(ChunkVerbs, WordVerbs):
-    """Vectors in, vectors out. Writing verbs are called inside `transaction()`."""
+class Embeddings:
+    """The table of embeddings: vectors in, vectors out. What writes is called inside `transaction()`."""
 
-    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
-        super().__init__(path, database, lock)
-        self.vectors_touched: list[int] = []
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self.touched: list[int] = []
         """Instances whose vectors this store has written or dropped since it was opened, in order; may repeat."""
         self.spaces_touched: set[str] = set()
         """Spaces that this store has written to."""
 
-    def state_stamp(self) -> tuple[int, int, bool]:
-        """Changes whenever the content may have: by other processes, by this store, by a rollback."""
-        other = int(self._rows("PRAGMA data_version")[0][0])
-        return other, self._database.total_changes, self._database.in_transaction
-
-    def put_embeddings(self, space: str, ids: Sequence[int], vectors: NDArray[np.float32]) -> None:
+    def put(self, space: str, ids: Sequence[int], vectors: NDArray[np.float32]) -> None:
         """Set the vectors of instances in a named space. `vectors` has shape (N, D)."""
-        self.vectors_touched += [int(i) for i in ids]
+        self.touched += [int(i) for i in ids]
         self.spaces_touched.add(space)
-        self._database.executemany(
-            "INSERT OR REPLACE INTO embeddings VALUES (?, ?, ?)",
+        self._connection.execute_many(
+            "INSERT OR REPLACE INTO embeddings (instance, space, vector) VALUES (?, ?, ?)",
             [(int(i), space, v.astype("<f4").tobytes()) for i, v in zip(ids, vectors, strict=True)],
         )
 
-    def embeddings(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Ids of shape (N,) and vectors of shape (N, D) of a named space."""
-        rows = self._rows("SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance", (space,))
-        self._sound("embeddings", (row[0] for row in rows))
-        ids = np.array([r[0] for r in rows], dtype=np.int64)
-        return ids, np.array([np.frombuffer(r[1], "<f4") for r in rows], dtype=np.float32)
+    def all(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return ids (N,) and vectors (N, D) of a named space."""
+        query = "SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance"
+        return self._checked(self._connection.rows(query, (space,)), space)
 
-    def embeddings_of(self, space: str, ids: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Of these instances (no aliases) those with a vector in the space: ids (N,), ascending, and vectors (N, D)."""
+    def drop(self, instance_id: int) -> None:
+        """Forget the vectors of an instance."""
+        self.touched.append(int(instance_id))
+        self._connection.execute("DELETE FROM embeddings WHERE instance = ?", (instance_id,))
+
+    def of(self, space: str, ids: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one."""
         rows: list[tuple[Any, ...]] = []
-        for start in range(0, len(ids), _BATCH):
-            part = [int(i) for i in ids[start : start + _BATCH]]
-            marks = ",".join("?" * len(part))
+        for part, marks in batches(ids):
             query = f"SELECT instance, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
-            rows += self._rows(query, (*part, space))
-        self._sound("embeddings", (row[0] for row in rows))
-        return _vectors(sorted(rows), space)
+            rows += self._connection.rows(query, (*part, space))
+        return self._checked(sorted(rows), space)
 
-    def embedding_batches(
-        self, space: str, size: int = 20_000
-    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-        """Ids (n,) and vectors (n, D) of a named space, in order of ids, at most `size` at a time."""
+    def batches(self, space: str, size: int = 20_000) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+        """Yield ids (n,) and vectors (n, D) of a named space, in order of ids, at most `size` at a time."""
         last = -1
         query = "SELECT instance, vector FROM embeddings WHERE instance > ? AND space = ? ORDER BY instance LIMIT ?"
-        while rows := self._rows(query, (last, space, size)):
+        while rows := self._connection.rows(query, (last, space, size)):
             last = rows[-1][0]
-            self._sound("embeddings", (row[0] for row in rows))
-            yield _vectors(rows, space)
+            yield self._checked(rows, space)
 
-    def embedding_count(self, space: str) -> int:
-        """How many vectors a named space holds."""
-        return int(self._rows("SELECT count(*) FROM embeddings WHERE space = ?", (space,))[0][0])
+    def count(self, space: str) -> int:
+        """Return how many vectors a named space holds."""
+        return int(self._connection.rows("SELECT count(*) FROM embeddings WHERE space = ?", (space,))[0][0])
 
-    def embedding_sample(self, space: str, size: int) -> NDArray[np.float32]:
-        """About `size` of the vectors of a named space, spread evenly over it; all where there are fewer. (n, D)."""
-        stride = max(1, self.embedding_count(space) // size)
+    def sample(self, space: str, size: int) -> NDArray[np.float32]:
+        """Return about `size` vectors of a named space, spread evenly over it; all where there are fewer. (n, D)."""
+        stride = max(1, self.count(space) // size)
         query = (
             "SELECT instance, vector FROM embeddings"
             " WHERE space = ? AND ((instance % 1000003) * 2654435761 >> 7) % ? = 0 ORDER BY instance"
         )
-        return _vectors(self._rows(query, (space, stride)), space)[1]
+        return _vectors(self._connection.rows(query, (space, stride)), space)[1]
 
-    def embedding_spaces(self) -> list[str]:
-        """The named spaces that hold vectors."""
+    def spaces(self) -> list[str]:
+        """Return the named spaces that hold vectors."""
         query = (
             "WITH RECURSIVE held (space) AS (SELECT min(space) FROM embeddings UNION ALL"
             " SELECT (SELECT min(e.space) FROM embeddings e WHERE e.space > held.space) FROM held"
             " WHERE held.space IS NOT NULL) SELECT space FROM held WHERE space IS NOT NULL"
         )
-        return [r[0] for r in self._rows(query)]
+        return [r[0] for r in self._connection.rows(query)]
+
+    def _checked(self, rows: list[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        self._connection.sound("embeddings", (row[0] for row in rows))
+        return _vectors(rows, space)
 
 
 def _vectors(rows: Sequence[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

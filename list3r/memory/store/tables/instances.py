@@ -3,136 +3,145 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import UnknownIdError
-from list3r.memory.records import Instance
-from list3r.memory.store.instance_rows import COLUMNS, instance_row, read_instance
-from list3r.memory.store.tables.embeddings import EmbeddingVerbs
+from list3r.memory.geometry import OrientedBox
+from list3r.memory.records import BestView, Instance
+from list3r.memory.store.codec import raw_array
+from list3r.memory.store.columns import Columns, joined
+from list3r.memory.store.connection import Connection
+from list3r.memory.store.table import Table, batches
+from list3r.memory.store.tables.embeddings import Embeddings
+from list3r.memory.store.tables.events import Events
+from list3r.memory.store.tables.ids import Ids
+from list3r.memory.store.tables.labels import DetectedLabels
+from list3r.memory.store.tables.library import LibraryState
+from list3r.memory.store.tables.relations import Relations
 
-_BATCH = 500
-"""Rows asked for by id in one statement."""
+Array = NDArray[np.float64]
 
 
-class InstanceVerbs(EmbeddingVerbs):
-    """Writing and reading the library: instances and the boxes in which they lie. Writing verbs are called inside
-    `transaction()`."""
+def _pack_geometry(center: Array, aabb: Array, box: OrientedBox) -> tuple[bytes]:
+    parts = [center, aabb.ravel(), box.center, box.size, box.rotation.ravel()]
+    return (np.concatenate(parts).astype("<f8").tobytes(),)
 
-    def instances(self, *, structure: bool | None = None) -> list[Instance]:
-        """All instances by id; only structure or only things where asked."""
-        where = {None: "", True: "WHERE structure IS NOT NULL", False: "WHERE structure IS NULL"}[structure]
-        rows = self._rows(f"SELECT {COLUMNS} FROM instances {where} ORDER BY id")
-        return [read_instance(row) for row in self._believed("instances", rows)]
 
-    def instance(self, instance_id: int) -> Instance:
-        """One instance; an alias gives the instance it was merged into. Raises `UnknownIdError`."""
-        resolved = self.resolve(instance_id)
-        rows = self._rows(f"SELECT {COLUMNS} FROM instances WHERE id = ?", (resolved,))
-        return read_instance(self._believed("instances", rows)[0])
+def _read_geometry(blobs: Sequence[bytes]) -> list[list[Any]]:
+    """Centres, axis-aligned boxes and boxes of many rows at once."""
+    g = raw_array(b"".join(blobs), "<f8", (len(blobs), 24), "the geometry").copy()
+    boxes = map(OrientedBox, g[:, 9:12], g[:, 12:15], g[:, 15:24].reshape(-1, 3, 3))
+    return [list(g[:, :3]), list(g[:, 3:9].reshape(-1, 2, 3)), list(boxes)]
 
-    def instances_of(self, ids: Sequence[int]) -> list[Instance]:
-        """The instances of these ids that are there, in the order of `ids`; aliases are not resolved."""
-        found: dict[int, Instance] = {}
-        for start in range(0, len(ids), _BATCH):
-            part = [int(i) for i in ids[start : start + _BATCH]]
-            marks = ",".join("?" * len(part))
-            rows = self._rows(f"SELECT {COLUMNS} FROM instances WHERE id IN ({marks})", tuple(part))
-            for row in self._believed("instances", rows):
-                found[row[0]] = read_instance(row)
+
+def _pack_view(view: BestView | None) -> tuple[int | None, int | None, bytes | None]:
+    if view is None:
+        return None, None, None
+    return view.session_id, int(view.frame_index), np.asarray(view.box_xyxy, dtype="<f8").tobytes()
+
+
+def _read_views(*columns: Sequence[Any]) -> list[list[BestView | None]]:
+    boxes = iter(np.frombuffer(b"".join(box for box in columns[2] if box is not None), "<f8").reshape(-1, 4).tolist())
+    rows = zip(*columns[:2], strict=True)
+    return [[None if s is None else BestView(s, frame, tuple(next(boxes))) for s, frame in rows]]
+
+
+_COLUMNS = Columns(
+    Instance,
+    replace(joined(("geometry",), ("center", "aabb", "box"), _pack_geometry, tuple), read=_read_geometry),
+    joined(
+        ("color_rgb",),
+        ("color_rgb",),
+        lambda rgb: (int(rgb[0]) << 16 | int(rgb[1]) << 8 | int(rgb[2]),),
+        lambda packed: ((packed >> 16 & 255, packed >> 8 & 255, packed & 255),),
+    ),
+    replace(joined(("view_session", "view_frame", "view_box"), ("best_view",), _pack_view, tuple), read=_read_views),
+)
+
+
+class Instances:
+    """The table of instances and the R*Tree of their boxes. What writes is called inside `transaction()`."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        ids: Ids,
+        library: LibraryState,
+        of_instance: tuple[Embeddings, Relations, Events, DetectedLabels],
+    ) -> None:
+        """`of_instance` are the tables whose rows go with an instance."""
+        self._connection = connection
+        self._ids = ids
+        self._library = library
+        self._embeddings, self._relations, self._events, self._labels = of_instance
+        self._rows = Table(connection, "instances", _COLUMNS, "id", checked=True)
+
+    def all(self, *, structure: bool | None = None) -> list[Instance]:
+        """Return all instances by id; only structure or only things where asked."""
+        return self._rows.all({None: "", True: "structure IS NOT NULL", False: "structure IS NULL"}[structure])
+
+    def get(self, instance_id: int) -> Instance:
+        """Return one instance; an alias gives the instance it was merged into. Raises `UnknownIdError`."""
+        return self._rows.all("id = ?", (self._ids.resolve(instance_id),))[0]
+
+    def of(self, ids: Sequence[int]) -> list[Instance]:
+        """Return the instances of these ids that are there, in the order of `ids`; aliases are not resolved."""
+        found = {i.id: i for i in self._rows.among("id", ids)}
         return [found[i] for i in map(int, ids) if i in found]
 
-    def resolve(self, instance_id: int) -> int:
-        """The id that stands for an id today. Raises `UnknownIdError` for an id the memory has never held."""
-        seen = set()
-        current = int(instance_id)
-        while current not in seen:
-            seen.add(current)
-            if self._rows("SELECT 1 FROM instances WHERE id = ?", (current,)):
-                return current
-            target = self._rows("SELECT instance FROM aliases WHERE id = ?", (current,))
-            if not target:
-                break
-            current = int(target[0][0])
-        raise UnknownIdError(f"{self.path} has no instance {instance_id}; `list3r list {self.path}` shows the ids")
-
-    def put_instances(self, instances: Iterable[Instance]) -> None:
+    def put(self, instances: Iterable[Instance]) -> None:
         """Write instances, new or changed, with their boxes in the R*Tree."""
-        rows = list(instances)
-        marks = ",".join("?" * 18)
-        self._database.executemany(
-            f"INSERT OR REPLACE INTO instances ({COLUMNS}) VALUES ({marks})", [instance_row(i) for i in rows]
-        )
-        self._database.executemany(
-            "INSERT OR REPLACE INTO instance_boxes VALUES (?, ?, ?, ?, ?, ?, ?)",
-            [(i.id, *(float(x) for x in i.aabb.T.ravel())) for i in rows],
-        )
+        records = list(instances)
+        self._rows.put(records)
+        self._put_boxes((i.id, i.aabb) for i in records)
 
-    def drop_instance(self, instance_id: int, alias_of: int | None) -> None:
+    def drop(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
-        self.vectors_touched.append(int(instance_id))
-        for table, column in (
-            ("instances", "id"),
-            ("instance_boxes", "id"),
-            ("embeddings", "instance"),
-            ("anchors", "instance"),
-        ):
-            self._database.execute(f"DELETE FROM {table} WHERE {column} = ?", (instance_id,))
-        self._database.execute("DELETE FROM relations WHERE subject = ? OR object = ?", (instance_id, instance_id))
+        self._rows.delete("id = ?", (instance_id,))
+        self._connection.execute("DELETE FROM instance_boxes WHERE id = ?", (instance_id,))
+        self._embeddings.drop(instance_id)
+        self._library.anchors.drop(instance_id)
+        self._labels.drop(instance_id)
+        self._relations.drop(instance_id)
+        self._events.drop(instance_id, alias_of)
         if alias_of is not None:
-            query = "UPDATE OR IGNORE events SET instance = ? WHERE instance = ?"
-            self._database.execute(query, (alias_of, instance_id))
-        self._database.execute("DELETE FROM events WHERE instance = ?", (instance_id,))
-        if alias_of is not None:
-            self._database.execute("INSERT OR REPLACE INTO aliases VALUES (?, ?)", (instance_id, alias_of))
+            self._ids.add_aliases({instance_id: alias_of})
 
     def states(self) -> dict[int, tuple[str, int]]:
-        """State and component of every instance, by id."""
-        return {n: (state, part) for n, state, part in self._rows("SELECT id, state, component FROM instances")}
+        """Return state and component of every instance, by id."""
+        rows = self._connection.rows("SELECT id, state, component FROM instances")
+        return {n: (state, component) for n, state, component in rows}
 
     def set_states(self, states: Mapping[int, str]) -> None:
         """Write the state of instances, by id."""
-        self._database.executemany(
-            "UPDATE instances SET state = ? WHERE id = ?", [(state, n) for n, state in sorted(states.items())]
-        )
+        statement = "UPDATE instances SET state = ? WHERE id = ?"
+        self._connection.execute_many(statement, [(state, n) for n, state in sorted(states.items())])
 
-    def instance_count(self) -> tuple[int, int]:
-        """How many things and how many pieces of structure there are."""
-        total, things = self._rows("SELECT count(*), count(*) - count(structure) FROM instances")[0]
+    def set_labels(self, labels: Mapping[int, str | None]) -> None:
+        """Name instances, by id; None takes a name away."""
+        statement = "UPDATE instances SET label = ? WHERE id = ?"
+        self._connection.execute_many(statement, [(text, n) for n, text in sorted(labels.items())])
+
+    def count(self) -> tuple[int, int]:
+        """Return how many things and how many pieces of structure there are."""
+        total, things = self._connection.rows("SELECT count(*), count(*) - count(structure) FROM instances")[0]
         return int(things), int(total) - int(things)
 
-    def next_id(self) -> int:
-        """The smallest id that was never used; ids are not used again."""
-        query = "SELECT max((SELECT coalesce(max(id), 0) FROM instances), (SELECT coalesce(max(id), 0) FROM aliases))"
-        return max(int(self._rows(query)[0][0]), int(self.get_value("last_id", 0))) + 1
+    def structure_among(self, ids: Sequence[int]) -> list[int]:
+        """Return those of some instances that are structure."""
+        query = "SELECT id FROM instances WHERE id IN ({}) AND structure IS NOT NULL"
+        return [int(n) for part, marks in batches(ids) for (n,) in self._connection.rows(query.format(marks), part)]
 
-    def aliases(self) -> dict[int, int]:
-        """Every retired id and the id it was merged into."""
-        return {r[0]: r[1] for r in self._rows("SELECT id, instance FROM aliases ORDER BY id")}
-
-    def aliases_of(self, instance_id: int) -> list[int]:
-        """Retired ids that stand for an instance (no alias) today, ascending."""
-        older: dict[int, list[int]] = {}
-        for old, new in self.aliases().items():
-            older.setdefault(new, []).append(old)
-        found, waiting = set[int](), [instance_id]
-        while waiting:
-            fresh = [n for n in older.get(waiting.pop(), []) if n not in found]
-            found.update(fresh)
-            waiting += fresh
-        return sorted(found)
+    # ------------------------------------------------------------------ by place
 
     def ids_in_box(self, lower: ArrayLike, upper: ArrayLike) -> list[int]:
-        """Ids whose axis-aligned boxes meet the box, from the R*Tree. World coordinates, shape (3,) each."""
-        low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-        query = (
-            "SELECT id FROM instance_boxes WHERE max_x >= ? AND min_x <= ? AND max_y >= ? AND min_y <= ?"
-            " AND max_z >= ? AND min_z <= ? ORDER BY id"
-        )
-        arguments = tuple(float(x) for pair in zip(low, high, strict=True) for x in pair)
-        return [r[0] for r in self._rows(query, arguments)]
+        """Return the ids whose axis-aligned boxes meet the box, from the R*Tree. World coordinates, shape (3,) each."""
+        query = f"SELECT id FROM instance_boxes WHERE {_MEETS} ORDER BY id"
+        return [r[0] for r in self._connection.rows(query, _bounds_of(lower, upper))]
 
     def boxes_in_box(
         self,
@@ -145,36 +154,46 @@ class InstanceVerbs(EmbeddingVerbs):
         component: int | None = None,
         limit: int = -1,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Ids (N,) and boxes (N, 2, 3) of the instances whose boxes meet a box, at most `limit`, in no order.
+        """Return ids (N,) and boxes (N, 2, 3) of the instances whose boxes meet a box, at most `limit`, in no order.
 
         The boxes are those of the R*Tree: single precision, rounded outward. Without `structure` things only.
         """
-        low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-        arguments: list[float | int | str] = [float(x) for pair in zip(low, high, strict=True) for x in pair]
-        clauses = ""
-        if not structure:
-            clauses += " AND i.structure IS NULL"
-        if min_confidence > 0.0:
-            clauses, arguments = f"{clauses} AND i.confidence >= ?", [*arguments, min_confidence]
-        if state is not None:
-            clauses, arguments = f"{clauses} AND i.state = ?", [*arguments, state]
-        if component is not None:
-            clauses, arguments = f"{clauses} AND i.component = ?", [*arguments, component]
+        arguments: list[float | int | str] = [*_bounds_of(lower, upper)]
+        clauses = "" if structure else " AND i.structure IS NULL"
+        wanted = (("confidence >=", min_confidence or None), ("state =", state), ("component =", component))
+        for condition, value in wanted:
+            if value is not None:
+                clauses, arguments = f"{clauses} AND i.{condition} ?", [*arguments, value]
         join = " CROSS JOIN instances i ON i.id = b.id" if clauses else ""
         query = (
-            f"SELECT b.id, b.min_x, b.min_y, b.min_z, b.max_x, b.max_y, b.max_z FROM instance_boxes b{join}"
-            " WHERE b.max_x >= ? AND b.min_x <= ? AND b.max_y >= ? AND b.min_y <= ? AND b.max_z >= ? AND b.min_z <= ?"
+            f"SELECT b.id, min_x, min_y, min_z, max_x, max_y, max_z FROM instance_boxes b{join} WHERE {_MEETS}"
             f"{clauses} LIMIT ?"
         )
-        rows = np.array(self._rows(query, (*arguments, limit)), dtype=np.float64).reshape(-1, 7)
+        rows = np.array(self._connection.rows(query, (*arguments, limit)), dtype=np.float64).reshape(-1, 7)
         return rows[:, 0].astype(np.int64), rows[:, 1:].reshape(-1, 2, 3)
 
-    def world_bounds(self) -> NDArray[np.float64] | None:
-        """Box around the boxes of all instances, read off the root of the R*Tree; None without any. Shape (2, 3)."""
-        rows = self._rows("SELECT data FROM instance_boxes_node WHERE nodeno = 1")
-        if not rows or len(rows[0][0]) < 4:
-            return None
-        return _bounds(rows[0][0])
+    def bounds(self) -> NDArray[np.float64] | None:
+        """Return the box round the boxes of all instances, from the root of the R*Tree; None without any. (2, 3)."""
+        rows = self._connection.rows("SELECT data FROM instance_boxes_node WHERE nodeno = 1")
+        return _bounds(rows[0][0]) if rows and len(rows[0][0]) >= 4 else None
+
+    def index_boxes(self) -> None:
+        """Fill the R*Tree anew from the instances."""
+        rows = self._connection.rows("SELECT id, geometry FROM instances ORDER BY id")
+        self._connection.execute("DELETE FROM instance_boxes")
+        self._put_boxes((n, np.frombuffer(g, "<f8")[3:9].reshape(2, 3)) for n, g in rows)
+
+    def _put_boxes(self, boxes: Iterable[tuple[int, Array]]) -> None:
+        statement = "INSERT OR REPLACE INTO instance_boxes VALUES (?, ?, ?, ?, ?, ?, ?)"
+        self._connection.execute_many(statement, [(n, *map(float, aabb.T.ravel())) for n, aabb in boxes])
+
+
+_MEETS = "max_x >= ? AND min_x <= ? AND max_y >= ? AND min_y <= ? AND max_z >= ? AND min_z <= ?"
+
+
+def _bounds_of(lower: ArrayLike, upper: ArrayLike) -> tuple[float, ...]:
+    low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    return tuple(float(x) for pair in zip(low, high, strict=True) for x in pair)
 
 
 @lru_cache(maxsize=16)

@@ -6,25 +6,21 @@ as a whole.
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.store.codec import pack_sim3, raw_array, unpack_sim3
+from list3r.memory.records import Shape
+from list3r.memory.store.columns import Columns, joined, nested
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.lock import WriterLock
+from list3r.memory.store.table import Table, batches
 
 Key = tuple[int, int]
 """(chunk id, local id)."""
-_BATCH = 500
-"""Rows asked for by id in one statement."""
-PASSING = ("settled", "overlaps", "members", "anchors")
-"""The tables of this page."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +29,14 @@ class SettledRow:
 
     component: int
     S_graph_chunk: Sim3
-    extent: NDArray[np.float64]
+    extent: Annotated[NDArray[np.float64], Shape((2, 3))]
     """Box round its points in the frame of the graph, grown by half of what lies near. Shape (2, 3)."""
+
+
+@dataclass(frozen=True)
+class _OfChunk:
+    chunk_id: int
+    settled: SettledRow
 
 
 @dataclass(frozen=True)
@@ -46,51 +48,63 @@ class Anchor:
     """World, as its row was written: from where the chunk is settled to where it lies."""
 
 
-class LibraryVerbs(Connection):
-    """Reading and writing it. Writing verbs are called inside `transaction()`."""
+@dataclass(frozen=True)
+class Overlap:
+    """How the local instances of two chunks overlap."""
 
-    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
-        super().__init__(path, database, lock)
-        self._settled_rows: dict[int, SettledRow] | None = None
-        self._settled_version = (-1, -1)
+    u: int
+    """Chunk id."""
+    v: int
+    """Chunk id, v >= u."""
+    scores: bytes
+    """Packed, see `memory.overlap.pair_scores`."""
 
-    def forget_library(self) -> None:
-        """Drop all of it, so that the library is derived as a whole next time."""
-        for name in PASSING:
-            self._database.execute(f"DELETE FROM {name}")
-        self._database.execute("DELETE FROM memory WHERE key = 'library'")
-        self._settled_rows = None
 
-    def _roll_back(self) -> None:
-        super()._roll_back()
-        self._settled_rows = None
+@dataclass(frozen=True)
+class Member:
+    """A local instance in its group, which is named by its first member."""
 
-    # ------------------------------------------------------------------ where chunks settled
+    key: Key
+    first: Key
+    shown: bool
 
-    def settled(self) -> Mapping[int, SettledRow]:
-        """All settled chunks by id; not to be changed."""
-        version = int(self._rows("PRAGMA data_version")[0][0]), self.unsettled
-        if self._settled_rows is None or version != self._settled_version:
-            query = "SELECT chunk_id, component, S_graph_chunk, extent FROM settled ORDER BY chunk_id"
-            self._settled_rows = {
-                k: SettledRow(c, unpack_sim3(S), raw_array(x, "<f8", (2, 3), f"the extent of chunk {k}").copy())
-                for k, c, S, x in self._rows(query)
-            }
-            self._settled_version = version
-        return self._settled_rows
 
-    def put_settled(self, rows: Mapping[int, SettledRow]) -> None:
+_KEY = joined(("chunk_id", "local_id"), ("key",), tuple, lambda *key: (key,))
+_FIRST = joined(("first_chunk", "first_local"), ("first",), tuple, lambda *key: (key,))
+
+
+class Settled:
+    """The table of where chunks settled. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        columns = Columns(_OfChunk, nested("settled", Columns(SettledRow)))
+        self._rows = Table(connection, "settled", columns, "chunk_id")
+        self._known: dict[int, SettledRow] | None = None
+        self._version = -1
+        connection.on_forget(self.forget)
+
+    def all(self) -> Mapping[int, SettledRow]:
+        """Return all settled chunks by id; not to be changed."""
+        version = self._connection.data_version
+        if self._known is None or version != self._version:
+            self._known, self._version = {row.chunk_id: row.settled for row in self._rows.all()}, version
+        return self._known
+
+    def put(self, rows: Mapping[int, SettledRow]) -> None:
         """Settle chunks, or settle them anew; which of their points were dropped is forgotten."""
-        known = {**self.settled(), **rows}
-        self._database.executemany(
-            "INSERT OR REPLACE INTO settled VALUES (?, ?, ?, ?, x'')",
-            [(k, r.component, pack_sim3(r.S_graph_chunk), r.extent.astype("<f8").tobytes()) for k, r in rows.items()],
-        )
-        self._settled_rows = dict(sorted(known.items()))
+        known = {**self.all(), **rows}
+        self._rows.put((_OfChunk(k, row) for k, row in rows.items()), dropped=b"")
+        self._known = dict(sorted(known.items()))
+
+    def drop(self, chunk_id: int) -> None:
+        """Forget where a chunk settled."""
+        if self._rows.delete("chunk_id = ?", (int(chunk_id),)):
+            self.forget()
 
     def dropped(self, chunk_id: int, count: int) -> NDArray[np.bool_]:
-        """Which of a chunk's representative points belong to something else. Shape (count,)."""
-        rows = self._rows("SELECT dropped FROM settled WHERE chunk_id = ?", (chunk_id,))
+        """Return which of a chunk's representative points belong to something else. Shape (count,)."""
+        rows = self._connection.rows("SELECT dropped FROM settled WHERE chunk_id = ?", (chunk_id,))
         bits = np.frombuffer(rows[0][0], np.uint8) if rows else np.zeros(0, np.uint8)
         out = np.zeros(count, dtype=bool)
         found = np.unpackbits(bits)[:count].astype(bool)
@@ -100,95 +114,138 @@ class LibraryVerbs(Connection):
     def set_dropped(self, dropped: Mapping[int, NDArray[np.bool_]]) -> None:
         """Say which representative points of chunks belong to something else."""
         packed = [(np.packbits(v).tobytes() if v.any() else b"", k) for k, v in dropped.items()]
-        self._database.executemany("UPDATE settled SET dropped = ? WHERE chunk_id = ?", packed)
+        self._connection.execute_many("UPDATE settled SET dropped = ? WHERE chunk_id = ?", packed)
 
-    # ------------------------------------------------------------------ how chunks overlap
+    def forget(self) -> None:
+        """Read the rows again when they are next asked for."""
+        self._known = None
 
-    def overlaps(self, chunk_ids: Sequence[int] | None = None) -> dict[tuple[int, int], bytes]:
-        """How the local instances of pairs of chunks overlap (u <= v), of which one is among these, or of all."""
+
+class Overlaps:
+    """The table of how pairs of chunks overlap. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._rows = Table(connection, "overlaps", Columns(Overlap), "u, v")
+
+    def all(self, chunk_ids: Sequence[int] | None = None) -> dict[Key, bytes]:
+        """Return how pairs of chunks (u <= v) overlap, those of which one is among these, or all, in order."""
         if chunk_ids is None:
-            return {(u, v): blob for u, v, blob in self._rows("SELECT u, v, scores FROM overlaps ORDER BY u, v")}
-        out: dict[tuple[int, int], bytes] = {}
-        for start in range(0, len(chunk_ids), _BATCH):
-            part = tuple(int(k) for k in chunk_ids[start : start + _BATCH])
-            marks = ",".join("?" * len(part))
-            for column in ("u", "v"):
-                query = f"SELECT u, v, scores FROM overlaps WHERE {column} IN ({marks})"
-                out |= {(u, v): blob for u, v, blob in self._rows(query, part)}
-        return dict(sorted(out.items()))
+            rows = self._rows.all()
+        else:
+            rows = [row for column in ("u", "v") for row in self._rows.among(column, chunk_ids)]
+        return dict(sorted(((row.u, row.v), row.scores) for row in rows))
 
-    def overlapping(self, chunk_ids: Sequence[int]) -> list[tuple[int, int]]:
-        """Pairs of chunks (u <= v) that overlap, of which one is among these."""
-        out: set[tuple[int, int]] = set()
-        for start in range(0, len(chunk_ids), _BATCH):
-            part = tuple(int(k) for k in chunk_ids[start : start + _BATCH])
-            marks = ",".join("?" * len(part))
+    def pairs(self, chunk_ids: Sequence[int]) -> list[Key]:
+        """Return the pairs of chunks (u <= v) that overlap, of which one is among these."""
+        out: set[Key] = set()
+        for part, marks in batches(chunk_ids):
             for column in ("u", "v"):
-                out.update(self._rows(f"SELECT u, v FROM overlaps WHERE {column} IN ({marks})", part))  # type: ignore[arg-type]
+                found = self._connection.rows(f"SELECT u, v FROM overlaps WHERE {column} IN ({marks})", part)
+                out.update((u, v) for u, v in found)
         return sorted(out)
 
-    def overlap(self, pair: tuple[int, int]) -> bytes:
-        """How the local instances of one pair of chunks overlap, which must be known."""
-        return bytes(self._rows("SELECT scores FROM overlaps WHERE u = ? AND v = ?", pair)[0][0])
+    def get(self, pair: Key) -> bytes:
+        """Return how one pair of chunks overlaps, which must be known."""
+        return bytes(self._rows.values("scores", "u = ? AND v = ?", pair)[0])
 
-    def put_overlaps(self, overlaps: Mapping[tuple[int, int], bytes]) -> None:
+    def put(self, overlaps: Mapping[Key, bytes]) -> None:
         """Write how pairs of chunks overlap."""
-        rows = [(u, v, blob) for (u, v), blob in overlaps.items()]
-        self._database.executemany("INSERT OR REPLACE INTO overlaps VALUES (?, ?, ?)", rows)
+        self._rows.put(Overlap(*pair, scores) for pair, scores in overlaps.items())
 
-    def drop_overlaps(self, pairs: Iterable[tuple[int, int]]) -> None:
+    def drop(self, pairs: Iterable[Key]) -> None:
         """Forget pairs of chunks."""
-        self._database.executemany("DELETE FROM overlaps WHERE u = ? AND v = ?", list(pairs))
+        self._connection.execute_many("DELETE FROM overlaps WHERE u = ? AND v = ?", list(pairs))
 
-    # ------------------------------------------------------------------ who is grouped
 
-    def members_in(self, chunk_ids: Sequence[int]) -> dict[Key, tuple[Key, bool]]:
-        """First member of the group of each local instance of some chunks, and whether the group is shown."""
-        out: dict[Key, tuple[Key, bool]] = {}
-        for start in range(0, len(chunk_ids), _BATCH):
-            part = tuple(int(k) for k in chunk_ids[start : start + _BATCH])
-            query = (
-                "SELECT chunk_id, local_id, first_chunk, first_local, shown FROM members WHERE chunk_id IN"
-                f" ({','.join('?' * len(part))})"
-            )
-            out |= {(k, n): ((a, b), bool(shown)) for k, n, a, b, shown in self._rows(query, part)}
-        return out
+class Members:
+    """The table of which local instances are grouped. What writes is called inside `transaction()`."""
 
-    def group_of(self, first: Key) -> list[Key]:
-        """All members of a group, in order; none where there is no such group."""
-        query = "SELECT chunk_id, local_id FROM members WHERE first_chunk = ? AND first_local = ? ORDER BY 1, 2"
-        return [(k, n) for k, n in self._rows(query, first)]
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._rows = Table(connection, "members", Columns(Member, _KEY, _FIRST), "chunk_id, local_id")
+
+    def of(self, chunk_ids: Sequence[int]) -> dict[Key, Member]:
+        """Return the local instances of some chunks, by key."""
+        return {row.key: row for row in self._rows.among("chunk_id", chunk_ids)}
+
+    def group(self, first: Key) -> list[Key]:
+        """Return all members of a group, in order; none where there is no such group."""
+        return [row.key for row in self._rows.all("first_chunk = ? AND first_local = ?", first)]
+
+    def put(self, members: Iterable[Member]) -> None:
+        """Write of local instances which group they are in; they leave those that they were in."""
+        self._rows.put(members)
 
     def put_groups(self, groups: Iterable[tuple[Sequence[Key], bool]]) -> None:
-        """Write groups, each with whether it is shown; their members leave the groups that they were in."""
-        self.put_members((key, group[0], shown) for group, shown in groups for key in group)
-
-    def put_members(self, members: Iterable[tuple[Key, Key, bool]]) -> None:
-        """Write of local instances the first member of their group, and whether it is shown."""
-        self._database.executemany(
-            "INSERT OR REPLACE INTO members VALUES (?, ?, ?, ?, ?)",
-            [(*key, *first, int(shown)) for key, first, shown in members],
-        )
+        """Write groups, each with whether it is shown."""
+        self.put(Member(key, group[0], shown) for group, shown in groups for key in group)
 
     def hidden_groups(self) -> int:
-        """How many groups are not shown."""
-        query = "SELECT count(*) FROM members WHERE shown = 0 AND chunk_id = first_chunk AND local_id = first_local"
-        return int(self._rows(query)[0][0])
+        """Return how many groups are not shown."""
+        return self._rows.count("shown = 0 AND chunk_id = first_chunk AND local_id = first_local")
 
-    # ------------------------------------------------------------------ what instances hang on
 
-    def put_anchors(self, anchors: Mapping[int, Anchor]) -> None:
+@dataclass(frozen=True)
+class _AnchorRow:
+    instance: int
+    chunk_id: int
+    S_exact_settled: Sim3
+
+
+class Anchors:
+    """The table of which chunks instances hang on. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._rows = Table(connection, "anchors", Columns(_AnchorRow), "instance")
+
+    def put(self, anchors: Mapping[int, Anchor]) -> None:
         """Say which chunk instances hang on, by id."""
-        rows = [(n, a.chunk_id, pack_sim3(a.S_exact_settled)) for n, a in anchors.items()]
-        self._database.executemany("INSERT OR REPLACE INTO anchors VALUES (?, ?, ?)", rows)
+        self._rows.put(_AnchorRow(n, a.chunk_id, a.S_exact_settled) for n, a in anchors.items())
 
-    def anchors(self, ids: Sequence[int] | None = None) -> dict[int, Anchor]:
-        """The anchors of some instances, or of all."""
-        if ids is None:
-            rows = self._rows("SELECT instance, chunk_id, S_exact_settled FROM anchors ORDER BY instance")
-            return {n: Anchor(k, unpack_sim3(S)) for n, k, S in rows}
-        out: dict[int, Anchor] = {}
-        for n in ids:
-            for k, S in self._rows("SELECT chunk_id, S_exact_settled FROM anchors WHERE instance = ?", (int(n),)):
-                out[int(n)] = Anchor(k, unpack_sim3(S))
-        return out
+    def all(self, ids: Sequence[int] | None = None) -> dict[int, Anchor]:
+        """Return the anchors of some instances, or of all, by id."""
+        rows = self._rows.all() if ids is None else self._rows.among("instance", ids)
+        return {row.instance: Anchor(row.chunk_id, row.S_exact_settled) for row in rows}
+
+    def drop(self, instance_id: int) -> None:
+        """Forget which chunk an instance hangs on."""
+        self._rows.delete("instance = ?", (instance_id,))
+
+
+class LibraryState:
+    """The four tables, and which chunks the library does not know yet."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self.settled = Settled(connection)
+        self.overlaps = Overlaps(connection)
+        self.members = Members(connection)
+        self.anchors = Anchors(connection)
+        self.touched: set[int] | None = None
+        """Chunks that were placed or measured anew since the library was derived; None where that is not known."""
+        connection.on_forget(self._forget)
+
+    def touch(self, chunk_ids: Iterable[int]) -> None:
+        """Note that chunks were placed or measured anew."""
+        if self.touched is not None:
+            self.touched.update(chunk_ids)
+
+    def unsettle(self, chunk_id: int) -> None:
+        """Note that what was derived from a chunk does not hold any more: it was measured anew."""
+        self.settled.drop(chunk_id)
+        self.touch([chunk_id])
+
+    def forget(self) -> None:
+        """Drop all of it, so that the library is derived as a whole next time."""
+        for name in PASSING:
+            self._connection.execute(f"DELETE FROM {name}")
+        self._connection.execute("DELETE FROM memory WHERE key = 'library'")
+        self.settled.forget()
+
+    def _forget(self) -> None:
+        self.touched = None
+
+
+PASSING = ("settled", "overlaps", "members", "anchors")
+"""The tables of this page."""

@@ -1,36 +1,21 @@
-"""Local instances: what one chunk measured of one thing."""
+"""Local instances: what one chunk measured of one thing, and its surface."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.records import (
-    LocalInstance,
-    MaskTrack,
-    MotionTrack,
-    Support,
-)
-from list3r.memory.store.codec import (
-    checksum,
-    dequantise,
-    pack,
-    quantise,
-    raw_array,
-    unpack,
-)
-from list3r.memory.store.rows import (
-    f8,
-    read_motion,
-    read_track,
-    track_arrays,
-)
-from list3r.memory.store.tables.frames import FrameVerbs
+from list3r.memory.records import Feature, LocalInstance, MaskTrack, MotionTrack, Plane, Support
+from list3r.memory.store.codec import dequantise, pack, quantise, raw_array, unpack
+from list3r.memory.store.columns import Columns, joined, nested
+from list3r.memory.store.connection import Connection
+from list3r.memory.store.table import Table
+from list3r.memory.store.tables.library import LibraryState
 
 
 @dataclass(frozen=True)
@@ -43,9 +28,9 @@ class LocalNode:
     stability: float
     structure: bool
     dynamic: bool
-    plane: NDArray[np.float64] | None
+    plane: Plane | None
     """Chunk coordinates. Shape (4,)."""
-    feature: NDArray[np.float32]
+    feature: Feature
     """Shape (D,)."""
     support: Support
     """Chunk coordinates."""
@@ -59,129 +44,166 @@ class LocalNode:
     """Shape (V,)."""
 
 
-class LocalVerbs(FrameVerbs):
-    """Writing and reading local instances. Writing verbs are called inside `transaction()`."""
+@dataclass(frozen=True)
+class LocalSupport:
+    """The surface of a local instance."""
 
-    def add_local_instance(self, chunk_id: int, instance: LocalInstance) -> None:
+    chunk_id: int
+    local_id: int
+    support: Support
+    """Chunk coordinates."""
+
+
+@dataclass(frozen=True)
+class _LocalRow:
+    chunk_id: int
+    instance: LocalInstance
+
+
+def _support_columns(support: Support) -> tuple[int, bytes, bytes, bytes, bytes]:
+    grid, points = quantise(support.points)
+    confidence = np.round(np.clip(support.confidence, 0, 1) * 255).astype(np.uint8).tobytes()
+    return len(support.points), grid, points, confidence, support.rgb.astype(np.uint8).tobytes()
+
+
+def _support(count: int, grid: bytes, points: bytes, confidence: bytes, rgb: bytes) -> tuple[Support]:
+    support = Support(
+        dequantise(grid, points, count, "the surface"),
+        raw_array(confidence, "u1", (count,), "the confidence").astype(np.float32) / 255.0,
+        raw_array(rgb, "u1", (count, 3), "the colours").copy(),
+    )
+    return (support,)
+
+
+def _track_column(track: MaskTrack) -> tuple[bytes]:
+    lengths = np.array([len(m) for m in track.masks], dtype=np.int32)
+    runs = np.concatenate(track.masks) if track.masks else np.zeros(0, np.uint32)
+    arrays: dict[str, NDArray[Any]] = {
+        "frames": track.frames,
+        "boxes_xyxy": track.boxes_xyxy.astype(np.float32),
+        "centers_xy": track.centers_xy.astype(np.float32),
+        "areas_px": track.areas_px.astype(np.int32),
+        "visible_fraction": track.visible_fraction.astype(np.float32),
+        "image_size": np.asarray(track.image_size, dtype=np.int32),
+        "lengths": lengths,
+        "runs": runs.astype(np.uint32),
+    }
+    return (pack(arrays),)
+
+
+def _track(blob: bytes) -> tuple[MaskTrack]:
+    held: dict[str, Any] = unpack(blob, "the masks")
+    runs, lengths, size = (held.pop(name) for name in ("runs", "lengths", "image_size"))
+    masks = tuple(np.split(runs, np.cumsum(lengths)[:-1])) if len(lengths) else ()
+    height, width = (int(n) for n in size)
+    return (MaskTrack(**held, masks=masks, image_size=(height, width)),)
+
+
+_OF_TRACK = ("frames", "boxes_xyxy", "areas_px", "visible_fraction")
+
+
+def _sightings(blob: bytes) -> list[Any]:
+    held = unpack(blob, "the masks")
+    return [held[name] for name in _OF_TRACK]
+
+
+_SUPPORT = joined(("count", "grid", "points", "confidence", "rgb"), ("support",), _support_columns, _support)
+_INSTANCE = Columns(LocalInstance, joined(("track",), ("track",), _track_column, _track), omit=("support", "names"))
+_NODE = Columns(LocalNode, _SUPPORT, joined(("track",), _OF_TRACK, lambda *_: (), _sightings))
+
+
+_ONE = "chunk_id = ? AND local_id = ?"
+
+
+class Supports:
+    """The table of surfaces of local instances. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection) -> None:
+        order, columns = "chunk_id, local_id", Columns(LocalSupport, _SUPPORT)
+        self._rows = Table(connection, "supports", columns, order)
+        of_instances = "observations JOIN supports USING (chunk_id, local_id)"
+        self._observed = Table(
+            connection, "supports", columns, order, source=of_instances, parts=("observations", "supports")
+        )
+
+    def add(self, chunk_id: int, local_id: int, support: Support) -> None:
+        """Store the surface of a local instance, chunk coordinates."""
+        self._rows.add(LocalSupport(chunk_id, local_id, support))
+
+    def get(self, chunk_id: int, local_id: int) -> Support | None:
+        """Return the surface of a local instance, chunk coordinates."""
+        found = self._rows.first("chunk_id = ? AND local_id = ?", (chunk_id, local_id))
+        return None if found is None else found.support
+
+    def of(self, instance_id: int) -> list[LocalSupport]:
+        """Return the surfaces of all local instances of an instance (no alias)."""
+        return self._observed.all("instance = ?", (int(instance_id),))
+
+
+class LocalInstances:
+    """The table of local instances. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection, supports: Supports, library: LibraryState) -> None:
+        self._connection = connection
+        self._supports = supports
+        self._library = library
+        order = "chunk_id, local_id"
+        columns = Columns(_LocalRow, nested("instance", _INSTANCE))
+        self._rows = Table(connection, "local_instances", columns, order)
+        self._measured = Table(connection, "local_instances", _INSTANCE, order)
+        nodes = "local_instances JOIN chunks USING (chunk_id) JOIN supports USING (chunk_id, local_id)"
+        self._nodes = Table(
+            connection, "local_instances", _NODE, order, source=nodes, parts=("local_instances", "supports")
+        )
+
+    def add(self, chunk_id: int, instance: LocalInstance) -> None:
         """Store one more local instance of a chunk, under a local id that the chunk does not have yet."""
-        self.unsettle(chunk_id)
-        track = pack(track_arrays(instance.track))
-        feature = instance.feature.astype("<f4").tobytes()
-        plane = None if instance.plane is None else f8(instance.plane)
-        motion = None if instance.motion is None else pack(asdict(instance.motion))
-        self._database.execute(
-            "INSERT INTO local_instances (chunk_id, local_id, stability, structure, plane, feature, track, crc,"
-            " dynamic, motion) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                chunk_id,
-                instance.local_id,
-                float(instance.stability),
-                int(instance.structure),
-                plane,
-                feature,
-                track,
-                checksum(feature, track),
-                int(instance.dynamic),
-                motion,
-            ),
-        )
-        grid, points = quantise(instance.support.points)
-        confidence = np.round(np.clip(instance.support.confidence, 0, 1) * 255).astype(np.uint8).tobytes()
-        rgb = instance.support.rgb.astype(np.uint8).tobytes()
-        self._database.execute(
-            "INSERT INTO supports VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                chunk_id,
-                instance.local_id,
-                len(instance.support.points),
-                grid,
-                points,
-                confidence,
-                rgb,
-                checksum(grid, points, confidence, rgb),
-            ),
-        )
+        self._library.unsettle(chunk_id)
+        self._rows.add(_LocalRow(chunk_id, instance))
+        self._supports.add(chunk_id, instance.local_id, instance.support)
 
-    def local_nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]:
-        """Local instances without masks, of some chunks or of all, in the order of (chunk, local id)."""
-        where = "" if chunk_ids is None else f"WHERE l.chunk_id IN ({','.join('?' * len(chunk_ids))})"
-        query = (
-            "SELECT l.chunk_id, l.local_id, c.session_id, l.stability, l.structure, l.dynamic, l.plane, l.feature,"
-            " l.track, s.count, s.grid, s.points, s.confidence, s.rgb FROM local_instances l"
-            " JOIN chunks c USING (chunk_id) JOIN supports s USING (chunk_id, local_id)"
-            f" {where} ORDER BY l.chunk_id, l.local_id"
-        )
-        rows = self._rows(query, tuple(chunk_ids or ()))
-        for table in ("local_instances", "supports"):
-            self._sound(table, (row[0] for row in rows))
-        return [_local_node(row) for row in rows]
+    def nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]:
+        """Return local instances without masks, of some chunks or of all, in the order of (chunk, local id)."""
+        if chunk_ids is None:
+            return self._nodes.all()
+        return self._nodes.all(f"chunk_id IN ({','.join('?' * len(chunk_ids))})", tuple(chunk_ids))
 
     def mask_track(self, chunk_id: int, local_id: int) -> MaskTrack:
-        """The masks of one local instance. Raises `MemoryFileError` when it is not there."""
-        self._sound("local_instances", [chunk_id])
-        rows = self._rows("SELECT track FROM local_instances WHERE chunk_id = ? AND local_id = ?", (chunk_id, local_id))
-        if not rows:
-            raise MemoryFileError(f"{self.path} has no local instance {local_id} in chunk {chunk_id}")
-        return read_track(unpack(rows[0][0], f"the masks of local instance {chunk_id}:{local_id}"))
+        """Return the masks of one local instance. Raises `MemoryFileError` when it is not there."""
+        self._connection.sound("local_instances", [chunk_id])
+        found: list[MaskTrack] = self._measured.values("track", _ONE, (chunk_id, local_id))
+        if not found:
+            raise MemoryFileError(f"{self._connection.path} has no local instance {local_id} in chunk {chunk_id}")
+        return found[0]
+
+    def motion_track(self, chunk_id: int, local_id: int) -> MotionTrack | None:
+        """Return where a moving local instance was, chunk coordinates; None for one that does not move."""
+        self._connection.sound("local_instances", [chunk_id])
+        found: list[MotionTrack | None] = self._measured.values("motion", _ONE, (chunk_id, local_id))
+        return found[0] if found else None
 
     def flag_dynamic(self, chunk_id: int, motions: Mapping[int, MotionTrack | None]) -> None:
         """Say of local instances, by local id, that they move, and where they were."""
-        self._database.executemany(
+        (packed,) = _INSTANCE.column("motion").write(list(motions.values())) if motions else ((),)
+        self._connection.execute_many(
             "UPDATE local_instances SET dynamic = 1, motion = coalesce(?, motion) WHERE chunk_id = ? AND local_id = ?",
-            [(None if m is None else pack(asdict(m)), chunk_id, n) for n, m in motions.items()],
+            [(motion, chunk_id, n) for n, motion in zip(motions, packed, strict=True)],
         )
         if motions:
-            self.unsettle(chunk_id)
+            self._library.unsettle(chunk_id)
 
-    def dynamic_locals(self, chunk_id: int) -> list[int]:
-        """Local ids of a chunk's instances that move."""
-        self._sound("local_instances", [chunk_id])
+    def dynamic(self, chunk_id: int) -> list[int]:
+        """Return the local ids of a chunk's instances that move."""
+        self._connection.sound("local_instances", [chunk_id])
         query = "SELECT local_id FROM local_instances WHERE chunk_id = ? AND dynamic ORDER BY local_id"
-        return [int(n) for (n,) in self._rows(query, (chunk_id,))]
+        return [int(n) for (n,) in self._connection.rows(query, (chunk_id,))]
 
-    def motion_track(self, chunk_id: int, local_id: int) -> MotionTrack | None:
-        """Where a moving local instance was, chunk coordinates; None for one that does not move."""
-        self._sound("local_instances", [chunk_id])
-        query = "SELECT motion FROM local_instances WHERE chunk_id = ? AND local_id = ?"
-        rows = self._rows(query, (chunk_id, local_id))
-        return read_motion(rows[0][0], f"the motion of local instance {chunk_id}:{local_id}") if rows else None
+    def any_dynamic(self) -> bool:
+        """Return whether any local instance was seen moving."""
+        return bool(self._connection.rows("SELECT 1 FROM local_instances WHERE dynamic LIMIT 1"))
 
-    def cannot_links(self, chunk_id: int) -> NDArray[np.int32]:
-        """Pairs of local ids of a chunk that are two things. Shape (P, 2)."""
-        blob = self._rows("SELECT cannot_link FROM chunks WHERE chunk_id = ?", (chunk_id,))[0][0]
-        return np.frombuffer(blob, "<i4").reshape(-1, 2).astype(np.int32)
-
-    def add_cannot_links(self, chunk_id: int, pairs: Sequence[tuple[int, int]]) -> None:
-        """Say of pairs of a chunk's local instances that they are two things; call inside `transaction()`."""
-        rows = self._rows("SELECT cannot_link, overlap FROM chunks WHERE chunk_id = ?", (chunk_id,))
-        links = rows[0][0] + np.array(pairs, "<i4").reshape(-1, 2).tobytes()
-        crc = checksum(links, rows[0][1])
-        self._database.execute("UPDATE chunks SET cannot_link = ?, crc = ? WHERE chunk_id = ?", (links, crc, chunk_id))
-        self._crcs = None
-
-
-def _local_node(row: tuple[Any, ...]) -> LocalNode:
-    chunk_id, local_id, session_id, stability, structure, dynamic, plane, feature, track, *support_row = row
-    count, grid, points, weight, rgb = support_row
-    where = f"local instance {chunk_id}:{local_id}"
-    arrays = unpack(track, where)
-    support = Support(
-        dequantise(grid, points, count, where),
-        raw_array(weight, "u1", (count,), where).astype(np.float32) / 255.0,
-        raw_array(rgb, "u1", (count, 3), where).copy(),
-    )
-    return LocalNode(
-        chunk_id=chunk_id,
-        local_id=local_id,
-        session_id=session_id,
-        stability=stability,
-        structure=bool(structure),
-        dynamic=bool(dynamic),
-        plane=None if plane is None else raw_array(plane, "<f8", (4,), where).copy(),
-        feature=np.frombuffer(feature, "<f4").astype(np.float32),
-        support=support,
-        frames=arrays["frames"],
-        boxes_xyxy=arrays["boxes_xyxy"],
-        areas_px=arrays["areas_px"],
-        visible_fraction=arrays["visible_fraction"],
-    )
+    def signature(self, chunk_id: int) -> tuple[object, ...]:
+        """Return what changes when local instances of a chunk come in or are seen to move."""
+        query = "SELECT local_id, length(motion) FROM local_instances WHERE dynamic AND chunk_id = ? ORDER BY local_id"
+        count = self._connection.rows("SELECT count(*) FROM local_instances WHERE chunk_id = ?", (chunk_id,))
+        return count[0][0], *self._connection.rows(query, (chunk_id,))
