@@ -14,7 +14,7 @@ def main() -> None:
     folder = Path(sys.argv[2] if len(sys.argv) > 2 else "out/examples")
     folder.mkdir(parents=True, exist_ok=True)
     with list3r.open(source) as memory:
-        for name, suffix in (("json", "json"), ("usd", "usda"), ("plan", "png"), ("ply", "ply"), ("tum", "txt")):
+        for name, suffix in (("json", "json"), ("usd", "usdc"), ("plan", "png"), ("ply", "ply"), ("tum", "txt")):
             memory.export(name, folder / f"rooms.{suffix}")
             print(folder / f"rooms.{suffix}")
 

@@ -122,7 +122,10 @@ def test_unknown_format_names_those_there_are() -> None:
 
 
 def test_a_suffix_that_lies_is_refused(make_memory: Callable[..., Path], tmp_path: Path) -> None:
-    with Store.open(make_memory()) as store, pytest.raises(OptionError, match=r"\.usda or \.usdc or \.usd file"):
+    with (
+        Store.open(make_memory()) as store,
+        pytest.raises(OptionError, match=r"\.usdc or \.usd or \.usda or \.usdz file"),
+    ):
         export(store, "usd", tmp_path / "scene.glb")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ pytest.importorskip("pxr")
 from pxr import Gf, Usd, UsdGeom, UsdUtils
 
 from list3r.exporters.palette import linear_from_srgb
-from list3r.exporters.usd.stage import UsdSettings, class_token, usd_stage, write_usd
+from list3r.exporters.usd.stage import UsdSettings, class_token, set_colors, usd_stage, write_usd
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from tests.conftest import instance
@@ -56,7 +57,7 @@ def test_the_stage_says_what_it_is(stage: Usd.Stage) -> None:
     assert dict(stage.GetRootLayer().customLayerData)["list3r"]["units"] == "m"
 
 
-@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usd"])
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usd", ".usdz"])
 def test_every_suffix_opens_with_the_same_prims(suffix: str, room: Store, tmp_path: Path, stage: Usd.Stage) -> None:
     write_usd(room, tmp_path / f"again{suffix}")
     again = Usd.Stage.Open(str(tmp_path / f"again{suffix}"))
@@ -75,7 +76,9 @@ def test_points_lie_where_the_store_has_them(stage: Usd.Stage, room: Store) -> N
         prim = stage.GetPrimAtPath(f"/World/{group}/instance_{thing.id}/points")
         support = room.surfaces.of(thing.id)
         assert np.allclose(world_points(prim), support.points, atol=1e-5)
-        colors = np.array(UsdGeom.Points(prim).GetDisplayColorAttr().Get())
+        primvar = UsdGeom.Points(prim).GetDisplayColorPrimvar()
+        colors = np.array(primvar.ComputeFlattened())
+        assert len(primvar.Get()) == len(np.unique(support.rgb, axis=0)) and primvar.IsIndexed()
         assert np.allclose(colors, linear_from_srgb(support.rgb), atol=1e-6)
 
 
@@ -105,6 +108,34 @@ def test_extents_hold_the_points(stage: Usd.Stage, room: Store) -> None:
 def _surface(size: np.ndarray) -> float:
     a, b, c = size
     return float(2 * (a * b + b * c + a * c))
+
+
+def test_widths_are_those_of_the_points(stage: Usd.Stage) -> None:
+    for prim in (p for p in stage.Traverse() if p.IsA(UsdGeom.Points)):
+        points = UsdGeom.Points(prim)
+        assert points.GetWidthsInterpolation() == UsdGeom.Tokens.vertex
+        assert len(points.GetWidthsAttr().Get()) == len(points.GetPointsAttr().Get())
+
+
+def test_colours_that_do_not_repeat_have_no_indices(tmp_path: Path) -> None:
+    shades = np.arange(30, dtype=np.uint8).reshape(10, 3)
+    stage = Usd.Stage.CreateInMemory()
+    prim = UsdGeom.Points.Define(stage, "/p")
+    set_colors(prim, shades)
+    assert not prim.GetDisplayColorPrimvar().IsIndexed()
+    assert np.allclose(np.array(prim.GetDisplayColorPrimvar().Get()), linear_from_srgb(shades), atol=1e-6)
+
+
+def test_things_are_documented_and_known_classes_are_coco(room: Store, tmp_path: Path) -> None:
+    named = replace(instance(9, (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (9, 9, 9)), label="Potted plant")
+    with Store.create(tmp_path / "named.l3r") as store, store.transaction():
+        store.put_instances([named])
+        stage = usd_stage(store)
+        plant = stage.GetPrimAtPath("/World/Instances/instance_9")
+        assert plant.GetAttribute("semantics:labels:coco").Get() == ["potted plant"]
+    stage = usd_stage(room)
+    mug = stage.GetPrimAtPath("/World/Instances/instance_3")
+    assert mug.GetDocumentation() == "mug" and not mug.GetAttribute("semantics:labels:coco")
 
 
 def test_points_are_thinned_to_the_cap(room: Store) -> None:

@@ -33,7 +33,9 @@ class Format:
 
 FORMATS: dict[str, Format] = {
     "json": Format("scene_json", "write_scene_json", (".json",), True, "instances and relations, fixed schema"),
-    "usd": Format("usd.stage", "write_usd", (".usda", ".usdc", ".usd"), False, "OpenUSD stage: points, boxes, camera"),
+    "usd": Format(
+        "usd.stage", "write_usd", (".usdc", ".usd", ".usda", ".usdz"), False, "OpenUSD: points, boxes, camera"
+    ),
     "ply": Format("ply", "write_ply", (".ply",), False, "points coloured by instance"),
     "glb": Format("glb", "write_glb", (".glb",), False, "boxes and points for any glTF viewer"),
     "tum": Format("tum", "write_tum", (".txt", ".tum"), True, "camera trajectory, one line a frame"),

@@ -15,7 +15,7 @@ from list3r.cli.terminal import say
 from list3r.memory.errors import OptionError
 from list3r.pipeline.request import BuildRequest, RunOptions
 
-EXPORTS = (("json", "json"), ("usd", "usda"), ("plan", "png"), ("glb", "glb"), ("ply", "ply"), ("tum", "txt"))
+EXPORTS = (("json", "json"), ("usd", "usdc"), ("plan", "png"), ("glb", "glb"), ("ply", "ply"), ("tum", "txt"))
 
 
 def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, quiet: bool) -> dict[str, Any]:

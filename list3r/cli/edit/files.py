@@ -31,7 +31,7 @@ def export(
     """Write a memory in another format: scene JSON, USD, coloured points, boxes, trajectory, plan picture, or a pack
     for a language model: text within a budget of tokens, maps, marked views and crops.
 
-    Example: list3r export house.l3r --to usd --out house.usda
+    Example: list3r export house.l3r --to usd --out house.usdc
     """
     with open_memory(memory) as scene:
         written = scene.export(to, out, tokens=tokens, question=question)

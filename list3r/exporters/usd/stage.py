@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
 from list3r.exporters.components import Component, has_box, point_spacing, read_components, thinned_support
 from list3r.exporters.output import replacing, units
@@ -19,6 +20,7 @@ from list3r.memory.errors import ExportError, OptionError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.records import Instance, Support
 from list3r.memory.store.store import Store
+from list3r.semantics.coco import COCO_80
 
 
 @dataclass(frozen=True)
@@ -36,17 +38,30 @@ class UsdSettings:
 
 
 def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = None) -> tuple[Path, ...]:
-    """Write `usd_stage` to a .usda, .usdc or .usd file. Returns the file written."""
+    """Write `usd_stage` to a .usdc, .usd (the same, binary), .usda (text) or .usdz file (a package of one .usdc).
+    Returns the file written.
+    """
     path = Path(path)
     with replacing(path) as temporary:
         stage = usd_stage(store, settings)
         try:
-            saved = stage.GetRootLayer().Export(str(temporary))
+            saved = _save(stage, temporary, path.stem)
         except Tf.ErrorException as error:
             raise ExportError(f"{path} cannot be written; is the disk full?") from error
         if not saved:
             raise ExportError(f"{path} cannot be written; is the disk full?")
     return (path,)
+
+
+def _save(stage: Usd.Stage, path: Path, name: str) -> bool:
+    if path.suffix.lower() != ".usdz":
+        return bool(stage.GetRootLayer().Export(str(path)))
+    with tempfile.TemporaryDirectory() as folder:
+        layer = Path(folder) / f"{Tf.MakeValidIdentifier(name)}.usdc"
+        if not stage.GetRootLayer().Export(str(layer)):
+            return False
+        path.unlink(missing_ok=True)
+        return bool(UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(path)))
 
 
 def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
@@ -118,7 +133,8 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
     Usd.ModelAPI(prim).SetKind("component")
     Usd.ModelAPI(group.GetPrim()).SetKind("group")
     prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'thing'} #{instance.id}")
-    _set_label(prim, instance)
+    _set_labels(prim, instance)
+    prim.SetDocumentation(instance.description or class_token(instance))
     _set_facts(prim, instance)
     T_world_object = Sim3.identity()
     if has_box(instance):
@@ -159,25 +175,41 @@ def _add_points(stage: Usd.Stage, path: Sdf.Path, points_object: NDArray[np.floa
     width = point_spacing(points)
     prim = UsdGeom.Points.Define(stage, path.AppendChild("points"))
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    prim.CreateWidthsAttr([width])
-    prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+    prim.CreateWidthsAttr(Vt.FloatArray(len(points), width))
+    prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
     low, high = points.min(axis=0) - width / 2, points.max(axis=0) + width / 2
     prim.CreateExtentAttr([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())])
-    colors = np.ascontiguousarray(linear_from_srgb(rgb), dtype=np.float32)
-    prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
+    set_colors(prim, rgb)
 
 
-def _set_label(prim: Usd.Prim, instance: Instance) -> None:
-    """Set the semantic label in the taxonomy `class`; by hand where this build of USD has no `UsdSemantics`."""
-    token = class_token(instance)
+def set_colors(prim: UsdGeom.Points, rgb: NDArray[np.uint8]) -> None:
+    """Set the colour of each point; each colour once with indices, where that is less."""
+    distinct, index = np.unique(rgb, axis=0, return_inverse=True)
+    primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    indexed = len(distinct) < len(rgb)
+    colors = np.ascontiguousarray(linear_from_srgb(distinct if indexed else rgb), dtype=np.float32)
+    primvar.Set(Vt.Vec3fArray.FromNumpy(colors))
+    if indexed:
+        primvar.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(index.ravel(), dtype=np.int32)))
+
+
+def _set_labels(prim: Usd.Prim, instance: Instance) -> None:
+    """Set the semantic label in the taxonomy `class`, and in `coco` where the label is one of its 80."""
+    _set_token(prim, "class", class_token(instance))
+    if (instance.label or "").lower() in COCO_80:
+        _set_token(prim, "coco", str(instance.label).lower())
+
+
+def _set_token(prim: Usd.Prim, taxonomy: str, token: str) -> None:
+    """Set one label; by hand where this build of USD has no `UsdSemantics`."""
     try:
         from pxr import UsdSemantics
     except ImportError:
-        prim.AddAppliedSchema("SemanticsLabelsAPI:class")
-        attribute = prim.CreateAttribute("semantics:labels:class", Sdf.ValueTypeNames.TokenArray, custom=False)
-        attribute.Set([token])
+        prim.AddAppliedSchema(f"SemanticsLabelsAPI:{taxonomy}")
+        name = f"semantics:labels:{taxonomy}"
+        prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, custom=False).Set([token])
         return
-    UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([token])
+    UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([token])
 
 
 def class_token(instance: Instance) -> str:
