@@ -27,7 +27,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_only_list3r_is_in_it(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"list3r", "list3r-0.1.0.dist-info"}
-    assert "list3r/exporters/scene.schema.json" in names
+    assert {"list3r/exporters/scene.schema.json", "list3r/py.typed"} <= set(names)
     assert not [name for name in names if "test" in name]
 
 

@@ -222,7 +222,8 @@ def _described(
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")
     seconds = dict(clock.seconds)
     clock.seconds.clear()
-    return _result(task, frames, reconstruction, library, samples, bad, seconds, keyframes)
+    made = _result(task, frames, reconstruction, library, samples, keyframes)
+    return replace(made, bad_frames=bad, seconds=seconds)
 
 
 def _result(
@@ -231,8 +232,6 @@ def _result(
     reconstruction: Reconstruction,
     library: LocalLibrary,
     samples: FrameSamples,
-    bad: tuple[tuple[int, str], ...],
-    seconds: dict[str, float],
     keyframes: tuple[Keyframe, ...],
 ) -> ChunkResult:
     camera = reconstruction.camera
@@ -249,8 +248,8 @@ def _result(
         keyframes=keyframes,
         samples=samples,
         library=library,
-        bad_frames=bad,
-        seconds=seconds,
+        bad_frames=(),
+        seconds={},
     )
 
 
@@ -274,7 +273,7 @@ def _without_geometry(
         keyframes=np.zeros(0, np.int64),
     )
     library = LocalLibrary((), np.zeros((0, 2), np.int32), FEATURE_SPACE)
-    return _result(task, frames, empty, library, FrameSamples.empty(), bad, seconds, ())
+    return replace(_result(task, frames, empty, library, FrameSamples.empty(), ()), bad_frames=bad, seconds=seconds)
 
 
 def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:

@@ -90,8 +90,7 @@ def precompute(
                 continue
         piece = read_piece(path)
         posed.update(piece.frames[np.isfinite(piece.T_world_cam).all(axis=(1, 2))].tolist())
-        if watch.progress is not None:
-            watch.progress(span.stop, info.frame_count)
+        watch.show(span.stop, info.frame_count)
     check_bad_share(len(bad), info.frame_count, next(iter(bad.values()), ""))
     files = sorted(out.glob("chunk-*.npz"))
     if not files:

@@ -156,6 +156,11 @@ class Watch:
             for line in notes:
                 self.note(line)
 
+    def show(self, done: int, total: int) -> None:
+        """Hand on how many frames are done, of all."""
+        if self.progress is not None:
+            self.progress(done, total)
+
     def looking(self, what: str) -> Progress | None:
         """Return who hears of the progress in looking for something."""
         look = self.look

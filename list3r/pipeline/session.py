@@ -129,7 +129,7 @@ def add_chunks(
     watch: Watch,
     *,
     library: bool = True,
-    added: Callable[[ChunkResult], None] | None = None,
+    added: Callable[[ChunkResult], None] = lambda part: None,
 ) -> None:
     """Work on the chunks side by side and add them in order, with one thread, so that sums are those of any machine.
 
@@ -140,8 +140,7 @@ def add_chunks(
         return
     first, session, count = plan.tasks[0], plan.session, job.info.frame_count
     bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
-    if watch.progress is not None:
-        watch.progress(len(store.frames.all(session)), count)
+    watch.show(len(store.frames.all(session)), count)
     known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
     workers = min(job.run.workers or usual_workers(job.settings), len(plan.tasks))
@@ -154,10 +153,8 @@ def add_chunks(
             for part in (p for p in results if p.index not in known):
                 add_chunk(store, session, part, joint, how, library=library, debug_dir=watch.debug_dir)
                 _note_lost(store, session, part)
-                if added is not None:
-                    added(part)
-            if watch.progress is not None:
-                watch.progress(task.span.stop, count)
+                added(part)
+            watch.show(task.span.stop, count)
 
 
 MOST_DEPTH_EVERY = 8

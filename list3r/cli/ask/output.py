@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 Count = Annotated[int, typer.Option("-k", help="How many at most.")]
 MinConfidence = Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")]
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
-Label = Annotated[str | None, typer.Option("--label", metavar="WORDS", help="Only what label or description bear.")]
+Label = Annotated[
+    str | None,
+    typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these words."),
+]
 Color = Annotated[str | None, typer.Option("--color", help="Only things of this colour.")]
 MinSize = Annotated[float | None, typer.Option("--min-size", help="Longest edge at least this.")]
 MaxSize = Annotated[float | None, typer.Option("--max-size", help="Longest edge at most this.")]

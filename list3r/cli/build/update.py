@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 def register(app: typer.Typer) -> None:
     """Add the commands to the program, after those of `query`."""
     app.command("update")(update)
-    for group in app.registered_groups:
-        if group.name == "query" and group.typer_instance is not None:
-            group.typer_instance.command("changes")(changes)
-            for command in group.typer_instance.registered_commands:
-                if command.callback is not None:
-                    command.callback = with_at(command.callback)
+    query = next(g.typer_instance for g in app.registered_groups if g.name == "query")
+    assert query is not None
+    query.command("changes")(changes)
+    for command in query.registered_commands:
+        if command.callback is not None:
+            command.callback = with_at(command.callback)
 
 
 @spread

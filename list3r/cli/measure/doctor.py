@@ -100,7 +100,7 @@ def _model(card: ModelCard) -> tuple[str, str, str]:
         state.append("weights not fetched")
     first = card.weights[0] if card.weights else None
     licences = f"code {card.code.name}" + (f", weights {first.licence.name}" if first else "")
-    marks = ("" if card.commercial else "; not for any use") + ("; gated" if first is not None and first.gated else "")
+    marks = ("" if card.commercial else "; restricted") + ("; gated" if first is not None and first.gated else "")
     return f"{card.part}: {card.name}", "; ".join(state), licences + marks
 
 

@@ -1,6 +1,6 @@
 """How long a unit is: metric where a sensor or given poses say so, anchored where an operator knows one length.
 
-Otherwise it is relative, and nobody knows.
+Otherwise it is relative: the length of a unit is unknown.
 
 An anchor is kept as an edit, in metres per unit of one chunk, which nothing changes: whatever later chunks, loops and
 sessions do to the graph, the world is scaled so that lengths in that chunk stay what the operator said.

@@ -193,7 +193,7 @@ class _Worker:
 _BOOT = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[4])
-from list3r.pipeline.worker_process import serve
+from list3r.pipeline.workers.process import serve
 serve(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3])
 """
 

@@ -1,4 +1,4 @@
-"""What runs in a process of `workers.OrderedPool`: take a task from the parent, work on it, hand the result back."""
+"""What runs in a process of an `OrderedPool`: take a task from the parent, work on it, hand the result back."""
 
 from __future__ import annotations
 
