@@ -129,7 +129,7 @@ def test_colours_that_do_not_repeat_have_no_indices(tmp_path: Path) -> None:
 def test_things_are_documented_and_known_classes_are_coco(room: Store, tmp_path: Path) -> None:
     named = replace(instance(9, (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (9, 9, 9)), label="Potted plant")
     with Store.create(tmp_path / "named.l3r") as store, store.transaction():
-        store.put_instances([named])
+        store.instances.put([named])
         stage = usd_stage(store)
         plant = stage.GetPrimAtPath("/World/Instances/instance_9")
         assert plant.GetAttribute("semantics:labels:coco").Get() == ["potted plant"]
