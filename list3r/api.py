@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import functools
+import sqlite3
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.registry import export as export_memory
 from list3r.exporters.tables import Table, Value, records_of
-from list3r.memory.errors import OptionError, naming_extras
+from list3r.memory.errors import List3rError, OptionError, naming_extras
 from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance.as_of import store_at
 from list3r.memory.maintenance.editing import MemoryEdits
@@ -25,6 +27,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, find
 from list3r.queries.free_words import WordEncoder
+from list3r.queries.info import describe_counts, info
 from list3r.queries.match import FilterOptions, Match, Matches
 from list3r.queries.measure import InstanceDistance, measure
 from list3r.queries.nearest import nearest
@@ -137,6 +140,37 @@ class SceneMemory(MemoryEdits):
     def __init__(self, store: Store) -> None:
         self.store = store
         self._lock = threading.RLock()
+
+    def __repr__(self) -> str:
+        try:
+            told = f"{self.path.name!r}: {describe_counts(self.store)}"
+        except (List3rError, sqlite3.Error):
+            told = f"{self.path.name!r}, closed"
+        return f"<SceneMemory {told}>"
+
+    def __len__(self) -> int:
+        return len(self.instances())
+
+    def __bool__(self) -> bool:
+        return True  # also where it holds nothing yet
+
+    def __iter__(self) -> Iterator[Instance]:
+        return iter(self.instances())
+
+    def __contains__(self, instance_id: object) -> bool:
+        return isinstance(instance_id, int | np.integer) and any(
+            i.id == instance_id for i in self.instances(structure=None)
+        )
+
+    @_alone
+    def info(self) -> dict[str, Any]:
+        """What the memory is, as plain values: sessions, frames, scale, gravity, counts. As `list3r info --json`."""
+        return info(self.store)
+
+    def _repr_png_(self) -> bytes:
+        """The plan, for notebooks."""
+        with tempfile.TemporaryDirectory() as folder:
+            return self.export("plan", Path(folder) / "plan.png")[0].read_bytes()
 
     @property
     def path(self) -> Path:

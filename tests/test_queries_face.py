@@ -146,3 +146,17 @@ def test_an_answer_sees_one_state_of_the_file(room: Path, tmp_path: Path, monkey
             before = {m.instance.id for m in memory.within(center=(2.0, 0.0, 0.7), radius=0.5)}
         after = {m.instance.id for m in memory.within(center=(2.0, 0.0, 0.7), radius=0.5)}
         assert TWIN in before and after == before - {TWIN}
+
+
+def test_a_memory_says_what_it_holds(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    with list3r.open(make_memory()) as memory:
+        assert repr(memory) == "<SceneMemory 'room.l3r': 4 instances, 2 of structure, 1 session, metric, z up>"
+        assert len(memory) == 4 and [i.id for i in memory] == [2, 3, 4, 5]
+        assert 3 in memory and 1 in memory and 99 not in memory and "mug" not in memory
+        told = memory.info()
+        assert (told["instances"], told["structure"], told["relations"], told["units"]) == (4, 2, 4, "m")
+        assert memory._repr_png_().startswith(b"\x89PNG")
+    assert repr(memory) == "<SceneMemory 'room.l3r', closed>"
+    Store.create(tmp_path / "empty.l3r").close()
+    with list3r.open(tmp_path / "empty.l3r") as empty:
+        assert empty and len(empty) == 0 and "0 instances" in repr(empty)

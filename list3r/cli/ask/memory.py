@@ -12,7 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_jso
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
-    from list3r.api import SceneMemory
     from list3r.memory.records import DetectedLabel, Instance
 
 
@@ -40,7 +39,7 @@ def info(
     from list3r.cli.ask.loops import loop_report, print_loop_report
 
     with open_memory(memory) as scene:
-        report = memory_report(scene)
+        report = scene.info()
         chunks = loop_report(scene.store) if loops else {}
         units = scene.units
     if json:
@@ -53,38 +52,6 @@ def info(
         say(f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}")
     if loops:
         print_loop_report(chunks, units)
-
-
-def memory_report(scene: SceneMemory) -> dict[str, Any]:
-    """The facts of a memory."""
-    store = scene.store
-    frames, chunks, edges = store.frames.all(), store.chunks.all(), store.edges.all()
-    states = {state: sum(f.state == state for f in frames) for state in ("posed", "lost", "bad")}
-    return {
-        "memory": str(scene.path),
-        "size_mb": round(scene.path.stat().st_size / 1e6, 2),
-        "beside": store.beside(),
-        "created_by": store.facts.created_by,
-        "scale": store.facts.scale_kind,
-        "scale_source": store.facts.scale_source,
-        "units": scene.units,
-        "gravity": scene.gravity,
-        "frames": len(frames),
-        **states,
-        "chunks": len(chunks),
-        "components": len({c.component for c in chunks}),
-        "loops": sum(e.kind == "loop" and e.accepted for e in edges),
-        "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
-        "instances": len(store.instances.all(structure=False)),
-        "structure": len(store.instances.all(structure=True)),
-        "relations": len(store.relations.all()),
-        "aliases": len(store.ids.aliases()),
-        "embedding_spaces": store.embeddings.spaces(),
-        "sessions": [
-            {"id": s.session_id, "source": s.source, "frames": s.frame_count, "state": s.state}
-            for s in store.sessions.all()
-        ],
-    }
 
 
 def list_instances(

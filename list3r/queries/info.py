@@ -1,0 +1,50 @@
+"""What a memory is: sessions, frames, scale, gravity, counts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from list3r.memory.store.store import Store
+
+
+def info(store: Store) -> dict[str, Any]:
+    """Return the facts of a memory as plain values."""
+    frames, chunks, edges = store.frames.all(), store.chunks.all(), store.edges.all()
+    states = {state: sum(f.state == state for f in frames) for state in ("posed", "lost", "bad")}
+    return {
+        "memory": str(store.path),
+        "size_mb": round(store.path.stat().st_size / 1e6, 2),
+        "beside": store.beside(),
+        "created_by": store.facts.created_by,
+        "scale": store.facts.scale_kind,
+        "scale_source": store.facts.scale_source,
+        "units": "unit" if store.facts.scale_kind == "relative" else "m",
+        "gravity": store.facts.gravity,
+        "frames": len(frames),
+        **states,
+        "chunks": len(chunks),
+        "components": len({c.component for c in chunks}),
+        "loops": sum(e.kind == "loop" and e.accepted for e in edges),
+        "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
+        "instances": len(store.instances.all(structure=False)),
+        "structure": len(store.instances.all(structure=True)),
+        "relations": len(store.relations.all()),
+        "aliases": len(store.ids.aliases()),
+        "embedding_spaces": store.embeddings.spaces(),
+        "sessions": [
+            {"id": s.session_id, "source": s.source, "frames": s.frame_count, "state": s.state}
+            for s in store.sessions.all()
+        ],
+    }
+
+
+def describe_counts(store: Store) -> str:
+    """Return one line on what a memory holds: instances, structure, sessions, scale and gravity."""
+    things, structure = len(store.instances.all(structure=False)), len(store.instances.all(structure=True))
+    sessions = len(store.sessions.all())
+    scale = "no scale" if store.facts.scale_kind == "relative" else "metric"
+    up = "up unknown" if store.facts.gravity == "unknown" else "z up"
+    counts = (
+        f"{things} instance{'s' * (things != 1)}, {structure} of structure, {sessions} session{'s' * (sessions != 1)}"
+    )
+    return f"{counts}, {scale}, {up}"
