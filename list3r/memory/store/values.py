@@ -69,7 +69,10 @@ def _bytes(each: int, words: str) -> Rule:
     return Rule(f"typeof({{}}) = 'blob' AND length({{}}) % {each} = 0", words)
 
 
-_FLAG, _SHARE, _LENGTH = _integer(0, 1), _number(0.0, 1.0), _number(0.0, _MOST_LENGTH)
+_FLAG, _SHARE = _integer(0, 1), _number(0.0, 1.0)
+_ANY = Rule("typeof({}) IN ('integer', 'real')", "a number")
+"""It may be infinite, where nothing is known."""
+_LENGTH = Rule(f"{_ANY.condition} AND {{}} >= 0", "a number from 0 on")
 _CHUNK, _LOCAL, _FRAME = _integer(0), _integer(-1), _integer(0)
 _SIM3 = _checked("list3r_sim3", "a similarity")
 _ARCHIVE = Rule("typeof({}) = 'blob'", "arrays")
@@ -112,7 +115,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         **{name: _integer(-1) for name in ("frame_u", "frame_v")},
         "S_v_u": _SIM3,
         "confidence": _SHARE,
-        "weight": _number(0.0, 1e9),
+        "weight": _LENGTH,
         "inliers": _integer(0),
         "residual_m": _LENGTH,
         "accepted": _FLAG,
@@ -141,7 +144,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
     "local_instances": {
         "chunk_id": _CHUNK,
         "local_id": _LOCAL,
-        "stability": _number(-1e9, 1e9),
+        "stability": _ANY,
         "structure": _FLAG,
         "plane": _maybe(_checked("list3r_plane", "four finite numbers")),
         "feature": _bytes(4, "numbers"),
@@ -165,8 +168,8 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "geometry": _checked("list3r_geometry", "a finite box"),
         "confidence": _SHARE,
         "observations": _integer(0),
-        "first_seen_s": _number(-_TIME_S, _TIME_S),
-        "last_seen_s": _number(-_TIME_S, _TIME_S),
+        "first_seen_s": _ANY,
+        "last_seen_s": _ANY,
         "state": _text(60),
         "structure": _maybe(_text(60)),
         "color_rgb": _integer(0, 2**24 - 1),
@@ -176,7 +179,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "view_frame": Rule("view_session IS NULL OR (typeof({}) = 'integer' AND {} >= 0)", "a frame"),
         "view_box": Rule("view_session IS NULL OR (typeof({}) = 'blob' AND list3r_box({}))", "a box in a picture"),
         "dynamic": _FLAG,
-        "position_sigma_m": _maybe(_number(0.0, 1e12)),
+        "position_sigma_m": _maybe(_LENGTH),
     },
     "observations": {"chunk_id": _CHUNK, "local_id": _LOCAL, "instance": _integer(1)},
     "embeddings": {
@@ -189,7 +192,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "predicate": _text(60),
         "object": _integer(1),
         "confidence": _SHARE,
-        "margin": _number(-_MOST_LENGTH, _MOST_LENGTH),
+        "margin": _ANY,
     },
     "merges": {
         "entry": _integer(1),
