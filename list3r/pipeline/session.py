@@ -28,7 +28,8 @@ from list3r.pipeline.choice import check_beside, settings_asked, settings_beside
 from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.finishing import check_run
 from list3r.pipeline.joint_windows import joint_windows
-from list3r.pipeline.mapping import add_chunk, place_chunks
+from list3r.pipeline.mapping import add_chunk
+from list3r.pipeline.placing import place_chunks
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.pipeline.settings import AssociationSettings, BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
