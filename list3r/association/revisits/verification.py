@@ -19,7 +19,7 @@ from list3r.memory.records import Edge, Keyframe
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.local import FeaturePose, match, relative_pose
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.rgbd.registration import Anchors, FrameRegistration, Samples, register
+from list3r.reconstruction.rgbd.registration import FrameRegistration, KnownFeatures, Samples, register
 from list3r.reconstruction.rgbd.settings import RegistrationSettings
 from list3r.reconstruction.rgbd.view import WorkingFrame, surface
 
@@ -141,7 +141,7 @@ def _refine(
         settings.features.gate_sigmas * settings.noise.sigma(np.maximum(a[:, 2], b[:, 2])),
     )
     agree = off < gate
-    anchors = Anchors(a[agree], b[agree, :2] / b[agree, 2:])
+    anchors = KnownFeatures(a[agree], b[agree, :2] / b[agree, 2:])
     return register(side_u.samples, side_v.view, T, settings.registration, settings.noise, anchors)
 
 

@@ -33,7 +33,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Anchors:
+class KnownFeatures:
     """Local features of the view that are known in the model: they hold what bare surfaces leave open."""
 
     points: Floats
@@ -78,7 +78,7 @@ def register(
     T_model_cam: NDArray[np.float64],
     settings: RegistrationSettings,
     noise: SensorNoise,
-    anchors: Anchors | None = None,
+    anchors: KnownFeatures | None = None,
 ) -> FrameRegistration | None:
     """Refine `T_model_cam`; None when too few points meet."""
     frame = _Frame(view, noise)
@@ -286,7 +286,7 @@ def _spread(error: Floats, least: float) -> float:
 
 
 def _anchored(
-    anchors: Anchors, T: NDArray[np.float64], focal_px: float
+    anchors: KnownFeatures, T: NDArray[np.float64], focal_px: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of the reprojection errors of known features, in pixels of the view."""
     p = ((anchors.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
