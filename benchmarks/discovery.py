@@ -29,6 +29,7 @@ from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_vie
 from list3r.instances.library import select_prompts
 from list3r.instances.settings import InstanceSettings
 from list3r.memory.geometry import OrientedBox, upright_box
+from list3r.reconstruction.base import backproject
 from training.samples import chunk_settings
 from training.worlds.film import Film, FilmSettings, frames_of, make_film, reconstruction_of
 
@@ -150,7 +151,9 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
         )
         points = view.points @ frame.T
         mine, theirs = np.where(np.isin(ids, list(structural)), -1, ids - 1), np.where(flat, -1, identity)
-        true.add(points, mine, view.confirmed)
+        true.add(
+            _true_points(film, views, proposals.position) @ frame.T, mine, views.small_depth(proposals.position) > 0
+        )
         told.add(points, theirs, view.confirmed)
         pairs.append(np.stack([mine[view.confirmed], theirs[view.confirmed]], axis=1))
     wanted, faint = true.boxes(MIN_PX)
@@ -167,6 +170,14 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
             out |= {"duplicates": errors.duplicates, "merged": errors.merged_pairs}
             out |= {"small": len(small), "small_found": sum(k in hit for k in small)}
     return out | _by_masks(np.concatenate(pairs), true.large(MIN_PX))
+
+
+def _true_points(film: Film, views: ChunkViews, position: int) -> NDArray[np.float32]:
+    """The true surface in a view, in the chunk's frame; readings that fly at outlines stretch boxes. (h, w, 3)."""
+    T = views.reconstruction.T_chunk_cam[0] @ np.linalg.inv(film.T_world_cam[0]) @ film.T_world_cam[position]
+    depth = np.ascontiguousarray(film.true_depth[position][:: views.stride, :: views.stride])
+    points = backproject(depth, views.camera) @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(points, np.float32)
 
 
 def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
@@ -198,7 +209,7 @@ class _Gathered:
         rows = np.flatnonzero(labels.ravel() >= 0)
         order = rows[np.argsort(labels.ravel()[rows], kind="stable")]
         values, start = np.unique(labels.ravel()[order], return_index=True)
-        for value, mine in zip(values.tolist(), np.split(order, start[1:]), strict=True):
+        for value, mine in zip(values.tolist(), np.split(order, start[1:]) if len(order) else [], strict=True):
             self._most[value] = max(self._most.get(value, 0), len(mine))
             sure = mine[confirmed.ravel()[mine]]
             self._points.setdefault(value, []).append(points.reshape(-1, 3)[sure])

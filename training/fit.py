@@ -54,7 +54,7 @@ def fit(
         for k, row in enumerate(order.tolist()):
             done = (epoch * len(lessons) + k) / steps
             for group in optimiser.param_groups:
-                group["lr"] = settings.rate * min(1.0, done * 30 + 0.05) * 0.5 * (1 + np.cos(np.pi * done))
+                group["lr"] = float(settings.rate * min(1.0, done * 30 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
             losses.append(_step(network, optimiser, lessons[row], settings))
         entry = {"epoch": epoch + 1, **_means(losses), "s": round(time.monotonic() - began, 1), **score(network, held)}
         with (folder / "log.jsonl").open("a") as log:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ class Film:
     """RGB. Shape (F, H, W, 3)."""
     depth: NDArray[np.float32]
     """As read, metres, 0 where unknown. Shape (F, H, W)."""
+    true_depth: NDArray[np.float32]
+    """Without noise and holes, metres. Shape (F, H, W)."""
     ids: NDArray[np.uint16]
     """True thing of each pixel, 0 for none. Shape (F, H, W)."""
     things: tuple[Truth, ...]
@@ -76,7 +78,7 @@ def make_film(settings: FilmSettings) -> Film:
     stops = _stops(world, rng, settings.frames, settings.every)
     time_s, poses = camera_path(stops, settings.frames, speed, settings.seed)
     renderer = world_renderer(world.things, world.size, camera, settings.seed)
-    color, depth, ids = [], [], []
+    color, depth, true_depth, ids = [], [], [], []
     drift = drift_field((h, w), rng)
     for pose in poses:
         picture = renderer.render(pose)
@@ -84,9 +86,11 @@ def make_film(settings: FilmSettings) -> Film:
         reading = read(picture, sensor, rng, drift)
         color.append(reading.color)
         depth.append(reading.depth)
+        true_depth.append(picture.depth)
         ids.append(picture.ids.astype(np.uint16))
     things = tuple(_truth(t) for t in world.things)
-    return Film(camera, sensor, time_s, poses, np.stack(color), np.stack(depth), np.stack(ids), things)
+    images = [np.stack(part) for part in (color, depth, true_depth, ids)]
+    return Film(camera, sensor, time_s, poses, images[0], images[1], images[2], images[3], things)
 
 
 def _truth(thing: Placed) -> Truth:
@@ -155,16 +159,3 @@ def reconstruction_of(film: Film, drift_m: float = 0.006, drift_deg: float = 0.1
 def frames_of(film: Film) -> list[Frame]:
     """Return the frames as a source hands them out."""
     return [Frame(k, float(t), film.color[k], film.depth[k], None) for k, t in enumerate(film.time_s.tolist())]
-
-
-def part_of(film: Film, start: int, stop: int) -> Film:
-    """Return some frames of a film."""
-    s = slice(start, stop)
-    return replace(
-        film,
-        time_s=film.time_s[s],
-        T_world_cam=film.T_world_cam[s],
-        color=film.color[s],
-        depth=film.depth[s],
-        ids=film.ids[s],
-    )

@@ -116,9 +116,10 @@ def film_house(folder: Path, seed: int, sensor: str, frames: int = 30, every: in
     for pose in poses:
         picture = renderer.render(pose)
         drift = (0.985 * drift + 0.17 * drift_field((240, 320), rng)).astype(np.float32)
-        shown.append((picture.ids.astype(np.uint16), read(picture, sensor, rng, drift)))
+        shown.append((picture, read(picture, sensor, rng, drift)))
     color, depth = np.stack([r.color for _, r in shown]), np.stack([r.depth for _, r in shown])
-    return Film(camera, sensor, time_s, poses, color, depth, np.stack([i for i, _ in shown]), tuple(house.things))
+    true_depth, ids = np.stack([p.depth for p, _ in shown]), np.stack([p.ids.astype(np.uint16) for p, _ in shown])
+    return Film(camera, sensor, time_s, poses, color, depth, true_depth, ids, tuple(house.things))
 
 
 def _stops(house: _House, caster: Caster, rng: np.random.Generator) -> tuple[Stop, ...]:

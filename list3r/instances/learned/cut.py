@@ -41,6 +41,12 @@ class CloudCut:
     features: Float
     """What its confidence is told from, see `thing_features`. Shape (T, THING_FEATURES)."""
 
+    def only(self, kept: NDArray[np.bool_]) -> CloudCut:
+        """Return the cut with only the things that are `kept` (T,); the voxels of the others are of none."""
+        number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+        labels = np.asarray(number[self.labels], np.int32)
+        return CloudCut(labels, self.structure[kept], self.names[kept], self.features[kept])
+
 
 THING_FEATURES = 8
 
@@ -67,7 +73,7 @@ def make_parts(
     g = pieces.graph
     own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, sure)
     labels = pieces.joined(own)
-    graph = piece_graph(cloud, views, labels, pieces.pairs, around)
+    graph = piece_graph(cloud, views, labels, pieces.pairs, around, FAR)
     count = len(graph.nodes)
     size = np.bincount(pieces.labels[pieces.labels >= 0], minlength=len(own)).astype(np.float64)
     total = np.maximum(np.bincount(own, size, minlength=count), 1.0)
@@ -82,6 +88,9 @@ def make_parts(
     return labels, full
 
 
+FAR = 3
+"""Doublings of the voxel's size at which parts are neighbours: legs end up to 16 cm below what they carry, where a view
+from above hides their top."""
 EXTRA_NODES = 34
 """Columns that `make_parts` adds to the features of pieces: 32 of the first network's, structure, number of pieces."""
 EXTRA_EDGES = 4

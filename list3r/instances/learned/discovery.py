@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from list3r.instances.geometric.planes import find_planes
 from list3r.instances.geometric.segments import Segment, Segmentation
 from list3r.instances.geometric.surfaces import estimate_up
 from list3r.instances.geometric.views import ChunkViews
-from list3r.instances.learned.cut import CloudCut, cut_cloud
+from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
 from list3r.instances.learned.graph import Surroundings
 from list3r.instances.learned.network import Weights
 from list3r.instances.learned.weights import load_weights
@@ -24,11 +25,27 @@ FLAT = 0.85
 """Share of a thing's voxels near its plane from which it is a flat surface."""
 
 
+@dataclass(frozen=True)
+class LearnedSettings:
+    """What is listed, and where agglomeration stops."""
+
+    least_confidence: float = 0.35
+    """Things that are less probably one whole are scraps and not proposed; chosen on worlds for training, where recall
+    and precision meet near it."""
+    cut: CutSettings = field(default_factory=CutSettings)
+
+
 class LearnedDiscoverer(GeometricDiscoverer):
     """Proposes the things of the chunk's fused cloud as masks on an anchor, cut by the trained networks."""
 
-    def __init__(self, settings: InstanceSettings | None = None, weights: Path | None = None) -> None:
+    def __init__(
+        self,
+        settings: InstanceSettings | None = None,
+        weights: Path | None = None,
+        learned: LearnedSettings | None = None,
+    ) -> None:
         super().__init__(settings)
+        self._learned = learned or LearnedSettings()
         self._weights: Weights = load_weights(weights)
 
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
@@ -39,8 +56,10 @@ class LearnedDiscoverer(GeometricDiscoverer):
         up = estimate_up(find_planes(cloud, settings.plane_area_m2 * views.unit**2, views.unit), poses)
         height = float(np.median(poses[:, :3, 3] @ up))
         around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
-        cut = cut_cloud(cloud, shown, around, self._weights)
-        labels, segments, features = _described(cloud, cut, confidence(cut, self._weights), up, views.unit)
+        cut = cut_cloud(cloud, shown, around, self._weights, self._learned.cut)
+        sure = confidence(cut, self._weights)
+        listed = (sure >= self._learned.least_confidence) | (cut.structure > 0.5)
+        labels, segments, features = _described(cloud, cut.only(listed), sure[listed], up, views.unit)
         return cloud, Segmentation(labels, tuple(segments), up), features
 
 

@@ -69,12 +69,16 @@ def piece_graph(
     labels: NDArray[np.int32],
     pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
     around: Surroundings,
+    doublings: int = 1,
 ) -> PieceGraph:
-    """Return the graph of pieces; `labels` (N,) is each voxel's piece, -1 for none, `pairs` neighbouring voxels."""
+    """Return the graph of pieces; `labels` (N,) is each voxel's piece, -1 for none, `pairs` neighbouring voxels.
+
+    Pieces are neighbours over gaps, too, that depth edges leave: within two cells of the voxel's size doubled so often.
+    """
     count = int(labels.max(initial=-1)) + 1
     stats = _Pieces(cloud, labels, count, around)
     touching = _touching(labels, pairs, count)
-    codes = np.union1d(np.unique(touching.code), _near_codes(cloud, labels, count))
+    codes = np.union1d(np.unique(touching.code), _near_codes(cloud, labels, count, doublings))
     left, right = codes // count, codes % count
     contact = _contact(cloud, labels, pairs, touching, codes, around)
     seen = _seen(cloud, views, labels, codes, count)
@@ -179,10 +183,10 @@ def _touching(labels: NDArray[np.int32], pairs: tuple[NDArray[np.int64], NDArray
     return _Touching(row, np.minimum(a, b) * count + np.maximum(a, b), a > b)
 
 
-def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int) -> NDArray[np.int64]:
-    """Codes of pieces that come within two cells of twice the voxel: over gaps that depth edges leave."""
+def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: int) -> NDArray[np.int64]:
+    """Codes of pieces that come within two cells of a coarser grid: over gaps that depth edges leave."""
     known = np.flatnonzero(labels >= 0)
-    cell = pack(unpack(cloud.keys[known]) >> 1)
+    cell = pack(unpack(cloud.keys[known]) >> doublings)
     order = np.lexsort((labels[known], cell))
     key, own = cell[order], labels[known][order].astype(np.int64)
     fresh = np.flatnonzero((np.diff(key, prepend=-1) != 0) | (np.diff(own, prepend=-1) != 0))
