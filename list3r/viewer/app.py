@@ -46,6 +46,8 @@ class Viewer:
         self._asked: list[ViewState] = []
         self._measuring: list[tuple[int, NDArray[np.float64]]] | None = None
         self._detail_at: NDArray[np.float64] | None = None
+        self._drawn_world: ShownWorld | None = None
+        self._drawn: tuple[object, ...] = ()
         self.state = ViewState()
         self.path = read_path(memory)
         self.world = self._read()
@@ -103,13 +105,16 @@ class Viewer:
         """Draw everything and say what is selected."""
         with self._lock, self.server.atomic():
             s, world, unit = self.state, self.world, unit_of(self.world)
-            self._layers.points(world, s.colors, s.selected, structure=s.structure, visible=s.points)
+            drawn = (s.colors, s.structure, s.points)
+            if world is not self._drawn_world or drawn != self._drawn:
+                self._layers.points(world, s.colors, structure=s.structure, visible=s.points)
+                self._drawn_world, self._drawn, self._detail_at = world, drawn, None
+            self._layers.highlight(world, s.colors, s.selected, visible=s.points)
             self._layers.boxes(world, s.colors, s.selected, structure=s.structure, visible=s.boxes)
             self._layers.labels(world, s.selected, visible=s.labels)
             self._layers.path(self.path, s.session, visible=s.path, unit=unit)
             self._layers.changes(world, visible=s.colors == "changes")
             self._layers.clear("relations")
-            self._detail_at = None
             if s.selected is not None:
                 self._tell(s.selected)
             else:
@@ -202,7 +207,7 @@ class Viewer:
             far = self._detail_at is None or np.linalg.norm(place - self._detail_at) > _MOVED_SHARE * reach
             if far and self.state.points:
                 self._detail_at = place
-                self._layers.detail(self.world, self.state.colors, self.state.selected, place)
+                self._layers.detail(self.world, self.state.colors, place)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64)

@@ -28,6 +28,8 @@ class LayerSettings:
     """Points that are always there."""
     detail_points: int = 1_500_000
     """Points that come besides near the camera."""
+    selected_points: int = 100_000
+    """Points of the selected thing that are tinted, at most."""
     most_labels: int = 60
     """The things seen most have labels."""
     frustums: int = 40
@@ -49,7 +51,7 @@ class Layers:
         for node in self._nodes.pop(layer, []):
             node.remove()
 
-    def points(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
+    def points(self, world: ShownWorld, mode: str, *, structure: bool, visible: bool) -> None:
         """Draw the overview of the points."""
         cloud = world.cloud
         solid = {n for n, i in world.instances.items() if structure or i.structure is None}
@@ -60,17 +62,24 @@ class Layers:
             if visible
             else cloud.part(np.zeros(len(cloud.points), bool))
         )
-        self._draw_cloud("points", world, self.shown, mode, selected)
+        self._draw_cloud("points", world, self.shown, mode, None)
         self.clear("detail")
 
-    def detail(self, world: ShownWorld, mode: str, selected: int | None, place: NDArray[np.float64]) -> None:
+    def detail(self, world: ShownWorld, mode: str, place: NDArray[np.float64]) -> None:
         """Draw the points that the overview leaves out of the instances near a place; structure is not among them."""
         hidden = ~overview(world.cloud, self._settings.overview_points)
         solid = [n for n, i in world.instances.items() if i.structure is None]
         hidden &= np.isin(world.cloud.owner, solid)
         if hidden.any():
             chosen = close_by(world, hidden, place, self._settings.detail_points)
-            self._draw_cloud("detail", world, world.cloud.part(chosen), mode, selected)
+            self._draw_cloud("detail", world, world.cloud.part(chosen), mode, None)
+
+    def highlight(self, world: ShownWorld, mode: str, selected: int | None, *, visible: bool) -> None:
+        """Draw the points of the selected instance once more, tinted and larger, so that the others can stay."""
+        self.clear("selected")
+        if selected is not None and visible:
+            mine = (world.cloud.owner == selected) & (world.cloud.rank < self._settings.selected_points)
+            self._draw_cloud("selected", world, world.cloud.part(mine), mode, selected)
 
     def _draw_cloud(self, layer: str, world: ShownWorld, cloud: Cloud, mode: str, selected: int | None) -> None:
         self.clear(layer)
@@ -81,7 +90,7 @@ class Layers:
             f"/{layer}",
             cloud.points - middle,
             colors(world, cloud, mode, selected),
-            point_size=0.012 * unit_of(world),
+            point_size=(0.012 if selected is None else 0.016) * unit_of(world),
             point_shape="circle",
             position=middle.astype(np.float64),
         )
