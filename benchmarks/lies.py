@@ -32,7 +32,7 @@ import numpy as np
 
 from list3r.cli.app import run
 from list3r.memory.store.checksums import OWN_CRC, summed_tables, write_all
-from list3r.memory.store.codec import pack, unpack
+from list3r.memory.store.rows.codec import pack, unpack
 from list3r.memory.store.word_index import write_words
 
 LONGEST_S = 10.0

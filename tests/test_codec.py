@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.masks import decode_mask, encode_mask
-from list3r.memory.store.codec import dequantise, pack, pack_sim3, quantise, raw_array, unpack, unpack_sim3
+from list3r.memory.store.rows.codec import dequantise, pack, pack_sim3, quantise, raw_array, unpack, unpack_sim3
 
 
 @given(arrays(np.bool_, array_shapes(min_dims=2, max_dims=2, max_side=20)))

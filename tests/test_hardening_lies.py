@@ -17,8 +17,8 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance import edits
 from list3r.memory.maintenance.repair import repair
 from list3r.memory.records import Edge
+from list3r.memory.store.rows.values import RULES, bad_references, bad_values
 from list3r.memory.store.store import Store
-from list3r.memory.store.values import RULES, bad_references, bad_values
 from tests.conftest import write_small_room
 
 Make = Callable[..., Path]

@@ -18,7 +18,7 @@ import pytest
 
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.codec import pack, unpack
+from list3r.memory.store.rows.codec import pack, unpack
 from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk

@@ -11,7 +11,7 @@ import pytest
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.rules import ConsolidationSettings, settings_of
 from list3r.memory.settings import from_plain, stored_settings
-from list3r.memory.store.codec import to_json
+from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import AssociationSettings, BuildSettings, session_settings
 

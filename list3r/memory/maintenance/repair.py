@@ -25,7 +25,6 @@ from list3r.memory.store.checksums import (
     summed_tables,
     write_part,
 )
-from list3r.memory.store.codec import checksum, unpack
 from list3r.memory.store.file import (
     check_beside,
     check_schema,
@@ -37,9 +36,10 @@ from list3r.memory.store.file import (
 )
 from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
+from list3r.memory.store.rows.codec import checksum, unpack
+from list3r.memory.store.rows.values import bad_values
 from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
 from list3r.memory.store.store import Store
-from list3r.memory.store.values import bad_values
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
 """Tables that consolidation writes; a row lost there is written anew."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.codec import unpack
+from list3r.memory.store.rows.codec import unpack
 
 if TYPE_CHECKING:
     import faiss

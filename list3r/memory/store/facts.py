@@ -14,9 +14,9 @@ from typing import Any, Generic, Self, TypeVar, overload
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import UpEstimate
-from list3r.memory.store.codec import to_json
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.json_values import plain, typed
+from list3r.memory.store.rows.codec import to_json
+from list3r.memory.store.rows.json_values import plain, typed
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.checksums import SUMS_SINCE, bad_rows, write_all
-from list3r.memory.store.codec import MAX_BLOB_BYTES
+from list3r.memory.store.rows.codec import MAX_BLOB_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
 from list3r.memory.store.word_index import write_words
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, bad_rows_of_part, own_crc_wrong, row_crc, summed_tables
-from list3r.memory.store.values import bad_references, bad_values
+from list3r.memory.store.rows.values import bad_references, bad_values
 from list3r.memory.store.word_index import expected_words, up_to_date
 
 WHOLE_BYTES = 128 * 2**20

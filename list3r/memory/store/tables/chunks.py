@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, ChunkRow, Covariance, FrameSamples, Shape
-from list3r.memory.store.columns import Columns, arrays, joined
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.columns import Columns, arrays, joined
+from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.frames import Frames, Keyframes
 from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.local_instances import LocalInstances

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from list3r.memory.bends import Bend
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Edge
-from list3r.memory.store.columns import Columns, joined
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.columns import Columns, joined
+from list3r.memory.store.rows.table import Table
 
 _NO_FRAMES = (-1, -1)
 _FRAMES = joined(

@@ -9,11 +9,11 @@ from typing import Any
 
 from list3r.memory.constraints import Constraints, Edit, Key
 from list3r.memory.records import MergeDecision
-from list3r.memory.store.codec import to_json
-from list3r.memory.store.columns import Columns, joined, nested
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.json_values import plain
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.codec import to_json
+from list3r.memory.store.rows.columns import Columns, joined, nested
+from list3r.memory.store.rows.json_values import plain
+from list3r.memory.store.rows.table import Table
 
 EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "undo")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import batches
+from list3r.memory.store.rows.table import batches
 
 
 class Embeddings:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, Keyframe
-from list3r.memory.store.codec import pack, unpack
-from list3r.memory.store.columns import Columns, joined, nested
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.codec import pack, unpack
+from list3r.memory.store.rows.columns import Columns, joined, nested
+from list3r.memory.store.rows.table import Table
 
 _NOWHERE = np.full((4, 4), np.nan)
 _FEATURES = {

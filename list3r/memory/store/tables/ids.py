@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from list3r.memory.constraints import standing
 from list3r.memory.errors import UnknownIdError
-from list3r.memory.store.columns import Columns
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.facts import Facts
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.columns import Columns
+from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.edits import Edits
 
 

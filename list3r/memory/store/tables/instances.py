@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import BestView, Instance
-from list3r.memory.store.codec import raw_array
-from list3r.memory.store.columns import Columns, joined
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table, batches
+from list3r.memory.store.rows.codec import raw_array
+from list3r.memory.store.rows.columns import Columns, joined
+from list3r.memory.store.rows.table import Table, batches
 from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids

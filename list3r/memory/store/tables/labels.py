@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from list3r.memory.records import DetectedLabel, Votes
-from list3r.memory.store.columns import Columns, nested
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.columns import Columns, nested
+from list3r.memory.store.rows.table import Table
 
 
 @dataclass(frozen=True)

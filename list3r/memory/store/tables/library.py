@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Shape
-from list3r.memory.store.columns import Columns, joined, nested
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table, batches
+from list3r.memory.store.rows.columns import Columns, joined, nested
+from list3r.memory.store.rows.table import Table, batches
 
 Key = tuple[int, int]
 """(chunk id, local id)."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Feature, LocalInstance, MaskTrack, MotionTrack, Plane, Support
-from list3r.memory.store.codec import dequantise, pack, quantise, raw_array, unpack
-from list3r.memory.store.columns import Columns, joined, nested
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.codec import dequantise, pack, quantise, raw_array, unpack
+from list3r.memory.store.rows.columns import Columns, joined, nested
+from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.library import LibraryState
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from list3r.memory.records import Relation
-from list3r.memory.store.columns import Columns
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.columns import Columns
+from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.ids import Ids
 
 

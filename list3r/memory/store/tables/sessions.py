@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Session
-from list3r.memory.store.columns import Columns
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.table import Table
+from list3r.memory.store.rows.columns import Columns
+from list3r.memory.store.rows.table import Table
 
 _OF_CHUNKS = (
     ("edges", ("u", "v")),

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import Shape
-from list3r.memory.store.codec import pack, pack_sim3, raw_array, to_json, unpack, unpack_sim3
-from list3r.memory.store.json_values import plain, typed
+from list3r.memory.store.rows.codec import pack, pack_sim3, raw_array, to_json, unpack, unpack_sim3
+from list3r.memory.store.rows.json_values import plain, typed
 
 R = TypeVar("R")
 Value = str | int | float | bytes | None

@@ -7,9 +7,9 @@ from typing import Any, Generic, TypeVar
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.checksums import OWN_CRC, summed_tables
-from list3r.memory.store.codec import checksum
-from list3r.memory.store.columns import UNREADABLE, Columns, Value
 from list3r.memory.store.connection import Arguments, Connection
+from list3r.memory.store.rows.codec import checksum
+from list3r.memory.store.rows.columns import UNREADABLE, Columns, Value
 
 R = TypeVar("R")
 BATCH = 500
