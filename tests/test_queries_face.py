@@ -142,7 +142,7 @@ def test_an_answer_sees_one_state_of_the_file(room: Path, tmp_path: Path, monkey
             return found
 
         with monkeypatch.context() as patch:
-            patch.setattr(memory.store, "boxes_in_box", and_then_a_writer)
+            patch.setattr(memory.store.instances, "boxes_in_box", and_then_a_writer)
             before = {m.instance.id for m in memory.within(center=(2.0, 0.0, 0.7), radius=0.5)}
         after = {m.instance.id for m in memory.within(center=(2.0, 0.0, 0.7), radius=0.5)}
         assert TWIN in before and after == before - {TWIN}
