@@ -85,7 +85,7 @@ def name_things(
 
 def load_detector(file: Path, classes: Path | None) -> NanoDet:
     """Return a box detector with its classes, those of COCO unless a file names others. Raises `OptionError`."""
-    from list3r.semantics.coco import COCO_80
+    from list3r.memory.description.coco import COCO_80
     from list3r.semantics.nanodet import NanoDet, read_class_names
 
     return NanoDet(file, COCO_80 if classes is None else read_class_names(classes))

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.description.coco import COCO_80
 from list3r.memory.errors import OptionError
-from list3r.semantics.coco import COCO_80
 from list3r.semantics.detector import Detections
 
 _MEAN_BGR = (103.53, 116.28, 123.675)

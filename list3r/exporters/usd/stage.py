@@ -16,11 +16,11 @@ from list3r.exporters.components import Component, has_box, point_spacing, read_
 from list3r.exporters.output import replacing, units
 from list3r.exporters.palette import instance_color, linear_from_srgb
 from list3r.exporters.usd.camera import add_cameras, set_time_range
+from list3r.memory.description.coco import COCO_80
 from list3r.memory.errors import ExportError, OptionError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.records import Instance, Support
 from list3r.memory.store.store import Store
-from list3r.semantics.coco import COCO_80
 
 
 @dataclass(frozen=True)
