@@ -26,7 +26,7 @@ from list3r.memory.records import FrameRow, Instance, Session, Support
 from list3r.memory.store.store import Store
 from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, find
-from list3r.queries.free_words import WordEncoder
+from list3r.queries.finding.free_words import WordEncoder
 from list3r.queries.info import describe_counts, info
 from list3r.queries.match import FilterOptions, Match, Matches
 from list3r.queries.measure import InstanceDistance, measure

@@ -13,7 +13,7 @@ from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Relation
 from list3r.memory.store.store import Store
 from list3r.queries.find import Found, find
-from list3r.queries.grammar import parse
+from list3r.queries.finding.grammar import parse
 from tests.conftest import write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)

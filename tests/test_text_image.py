@@ -16,7 +16,7 @@ from list3r.cli.app import run
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
-from list3r.queries.free_words import named_by_vectors
+from list3r.queries.finding.free_words import named_by_vectors
 from list3r.queries.nearest import nearest
 from list3r.semantics.embedding import StoredWords, embed_memory, stored_words
 from list3r.semantics.text_image import TextImageModel, square_crop

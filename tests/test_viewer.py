@@ -27,7 +27,17 @@ from websockets.sync.client import connect
 from list3r.viewer.app import Viewer, ViewerSettings
 from list3r.viewer.layers import LayerSettings
 from list3r.viewer.link import ViewState
-from list3r.viewer.world import COLOR_MODES, Cloud, close_by, color_of, colors, overview, pick, read_path, read_world
+from list3r.viewer.world import (
+    COLOR_MODES,
+    ShownCloud,
+    close_by,
+    color_of,
+    colors,
+    overview,
+    pick,
+    read_path,
+    read_world,
+)
 from tests.browser import PROGRAM, Browser
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
@@ -62,10 +72,10 @@ def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---------------------------------------------------------------------------------------------- what is shown
 
 
-def cloud_of(counts: list[int]) -> Cloud:
+def cloud_of(counts: list[int]) -> ShownCloud:
     owner = np.repeat(np.arange(len(counts)), counts)
     rank = np.concatenate([np.arange(n) for n in counts]) if counts else np.zeros(0, int)
-    return Cloud(np.zeros((len(owner), 3), np.float32), np.zeros((len(owner), 3), np.uint8), owner, rank)
+    return ShownCloud(np.zeros((len(owner), 3), np.float32), np.zeros((len(owner), 3), np.uint8), owner, rank)
 
 
 @given(st.lists(st.integers(1, 200), min_size=1, max_size=12), st.integers(1, 500))

@@ -10,13 +10,13 @@ from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
-from list3r.queries.find_related import PhraseMatch, PhraseSearch, related
-from list3r.queries.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.grammar import SIZES, SUPERLATIVES, Phrase, parse
+from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
+from list3r.queries.finding.grammar import SIZES, SUPERLATIVES, Phrase, parse
+from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
+from list3r.queries.finding.words import STRUCTURE, not_borne
 from list3r.queries.match import Match, Matches, checked_count, checked_instance
 from list3r.queries.relations import Place, viewer_from
 from list3r.queries.views.gather import gather
-from list3r.queries.words import STRUCTURE, not_borne
 
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""

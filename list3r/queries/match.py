@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import BestView, Instance
 from list3r.memory.store.store import Store
-from list3r.queries.words import is_colored, is_named, wanted_words
+from list3r.queries.finding.words import is_colored, is_named, wanted_words
 
 STATES = ("present", "moved", "removed", "added", "unseen", "any")
 """What may be asked for; without a state all things answer but those that are known to be gone."""

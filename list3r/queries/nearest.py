@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
-from list3r.queries.free_words import WordEncoder, like, named_by_vectors
+from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
+from list3r.queries.finding.words import STRUCTURE, not_borne, wanted_words, word_score
 from list3r.queries.match import (
     FilterOptions,
     Filters,
@@ -27,7 +28,6 @@ from list3r.queries.match import (
 from list3r.queries.views.best_first import NearestSearch, box_gaps, nearest_first
 from list3r.queries.views.gather import is_large, sample
 from list3r.queries.views.surfaces import STRAY, distance_between, distance_to_point, surface_of
-from list3r.queries.words import STRUCTURE, not_borne, wanted_words, word_score
 
 _LOADED = 5_000
 """Instances that are looked at because of what they are called, in a memory that holds many."""

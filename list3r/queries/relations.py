@@ -12,11 +12,11 @@ from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.predicates import PREDICATES
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
+from list3r.queries.finding.words import not_borne, wanted_words, words_of
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera
 from list3r.queries.views.gather import is_large, sample
 from list3r.queries.views.viewpoint import VIEWPOINT, BetweenRelation, Viewpoint, between, viewed
-from list3r.queries.words import not_borne, wanted_words, words_of
 
 VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "under", "attached_to"))
 """Predicates that exist only where gravity is known or estimated."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.memory.records import Instance, Relation
-from list3r.viewer.world import CHANGE_COLORS, CameraPath, Cloud, ShownWorld, close_by, color_of, colors, overview
+from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownCloud, ShownWorld, close_by, color_of, colors, overview
 
 _EDGES = np.array([(a, a ^ bit) for a in range(8) for bit in (1, 2, 4) if a < a ^ bit])
 """Pairs of corners of `OrientedBox.corners` that an edge joins."""
@@ -41,7 +41,7 @@ class Layers:
     def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
         self._scene, self._settings = server.scene, settings
         self._nodes: dict[str, list[Any]] = {}
-        self.shown = Cloud(
+        self.shown = ShownCloud(
             np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64), np.zeros(0, np.int64)
         )
         """The points that can be picked."""
@@ -81,7 +81,7 @@ class Layers:
             mine = (world.cloud.owner == selected) & (world.cloud.rank < self._settings.selected_points)
             self._draw_cloud("selected", world, world.cloud.part(mine), mode, selected)
 
-    def _draw_cloud(self, layer: str, world: ShownWorld, cloud: Cloud, mode: str, selected: int | None) -> None:
+    def _draw_cloud(self, layer: str, world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None) -> None:
         self.clear(layer)
         if not len(cloud.points):
             return

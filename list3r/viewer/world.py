@@ -22,7 +22,7 @@ _BESIDE = 0.008
 
 
 @dataclass(frozen=True)
-class Cloud:
+class ShownCloud:
     """Surface points of many instances, of each in random order, so that any first part of them is a coarser cloud."""
 
     points: NDArray[np.float32]
@@ -34,9 +34,9 @@ class Cloud:
     rank: NDArray[np.int64]
     """Number of each point among those of its instance. Shape (N,)."""
 
-    def part(self, keep: NDArray[np.bool_]) -> Cloud:
+    def part(self, keep: NDArray[np.bool_]) -> ShownCloud:
         """Return some of the points."""
-        return Cloud(self.points[keep], self.rgb[keep], self.owner[keep], self.rank[keep])
+        return ShownCloud(self.points[keep], self.rgb[keep], self.owner[keep], self.rank[keep])
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class ShownWorld:
     """One state of the world: as it is, or as it was after a session."""
 
     instances: dict[int, Instance]
-    cloud: Cloud
+    cloud: ShownCloud
     changes: dict[int, Changed]
     """The newest change of each instance."""
 
@@ -74,7 +74,7 @@ def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
     """Return the present world of a memory; `changes` are those to colour."""
     shown = [i for i in memory.instances(structure=None) if i.state != "removed" and np.isfinite(i.aabb).all()]
     parts = [_points(memory, i) for i in shown]
-    cloud = Cloud(
+    cloud = ShownCloud(
         np.concatenate([np.zeros((0, 3), np.float32), *(p.points for p in parts)]),
         np.concatenate([np.zeros((0, 3), np.uint8), *(p.rgb for p in parts)]),
         np.concatenate([np.zeros(0, np.int64), *(p.owner for p in parts)]),
@@ -86,12 +86,12 @@ def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
     return ShownWorld({i.id: i for i in shown}, cloud, newest)
 
 
-def _points(memory: SceneMemory, instance: Instance) -> Cloud:
+def _points(memory: SceneMemory, instance: Instance) -> ShownCloud:
     support = memory.support(instance.id)
     finite = np.flatnonzero(np.isfinite(support.points).all(axis=1))
     order = np.random.default_rng(instance.id).permutation(finite)
     owner = np.full(len(order), instance.id, np.int64)
-    return Cloud(support.points[order].astype(np.float32), support.rgb[order], owner, np.arange(len(order)))
+    return ShownCloud(support.points[order].astype(np.float32), support.rgb[order], owner, np.arange(len(order)))
 
 
 def read_path(memory: SceneMemory) -> CameraPath:
@@ -109,7 +109,7 @@ def read_path(memory: SceneMemory) -> CameraPath:
 # ---------------------------------------------------------------------------------------------- level of detail
 
 
-def overview(cloud: Cloud, most: int) -> NDArray[np.bool_]:
+def overview(cloud: ShownCloud, most: int) -> NDArray[np.bool_]:
     """Return which points to show from afar, at most about `most`: of each instance as many as the square root of
     what it has allows, so that small things keep theirs. Shape (N,).
     """
@@ -140,7 +140,7 @@ def close_by(world: ShownWorld, hidden: NDArray[np.bool_], place: NDArray[np.flo
 # ---------------------------------------------------------------------------------------------- colours
 
 
-def colors(world: ShownWorld, cloud: Cloud, mode: str, selected: int | None) -> NDArray[np.uint8]:
+def colors(world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None) -> NDArray[np.uint8]:
     """Return the colour of each point. Shape (N, 3)."""
     out = cloud.rgb.copy() if mode == "own colour" else _by_owner(cloud.owner, lambda n: color_of(world, n, mode))
     if selected is not None:
@@ -167,7 +167,7 @@ def _by_owner(owner: NDArray[np.int64], color: Callable[[int], tuple[int, int, i
 
 
 def pick(
-    world: ShownWorld, shown: Cloud, origin: NDArray[np.float64], direction: NDArray[np.float64]
+    world: ShownWorld, shown: ShownCloud, origin: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> tuple[int, NDArray[np.float64]] | None:
     """Return the instance and the point that a ray meets first: a surface point near the ray, else a box.
 

@@ -21,7 +21,7 @@ from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.predicates import relations
 from list3r.memory.relations.scene import PairMeasures
 from list3r.memory.relations.structure import classify_structure, flagged_only
-from list3r.memory.store.tables.library import Anchor, Member
+from list3r.memory.store.tables.library import Anchor, GroupMember
 
 _SLACK_M = 0.05
 """Boxes in the R*Tree are rounded and lie where the chunks lie to the last digit."""
@@ -113,7 +113,7 @@ class Writer:
         """Write who is grouped with whom, where that was otherwise."""
         before, shown_before = self._g.before, self._g.shown_before
         self._store.library.members.put(
-            Member(key, g[0], show)
+            GroupMember(key, g[0], show)
             for g, show in shown.items()
             for key in g
             if key not in before or (before[key][0], shown_before[before[key]]) != (g[0], show)

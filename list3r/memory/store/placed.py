@@ -16,7 +16,7 @@ from list3r.memory.store.tables.local_instances import LocalInstances, Supports
 from list3r.memory.store.tables.observations import Observations
 
 
-class Trajectory:
+class PlacedTrajectory:
     """Where the cameras were."""
 
     def __init__(self, chunks: Chunks, frames: Frames, bends: Bends) -> None:
@@ -82,7 +82,7 @@ class Surfaces:
         )
 
 
-class Tracks:
+class PlacedTracks:
     """Where moving instances were over time."""
 
     def __init__(

@@ -14,7 +14,7 @@ from list3r.memory.store.checksums import summed_tables
 from list3r.memory.store.connection import Connection, damaged, is_ours
 from list3r.memory.store.derived import Derived
 from list3r.memory.store.facts import Facts
-from list3r.memory.store.placed import Surfaces, Tracks, Trajectory
+from list3r.memory.store.placed import PlacedTracks, PlacedTrajectory, Surfaces
 from list3r.memory.store.read_checks import BOXES, FAILURES, WORDS, damage_of
 from list3r.memory.store.tables.chunks import Chunks
 from list3r.memory.store.tables.edges import Bends, Edges
@@ -28,7 +28,7 @@ from list3r.memory.store.tables.labels import DetectedLabels, LabelVotes
 from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.local_instances import LocalInstances, Supports
 from list3r.memory.store.tables.observations import Observations
-from list3r.memory.store.tables.relations import Relations
+from list3r.memory.store.tables.relations import RelationTable
 from list3r.memory.store.tables.sessions import Sessions
 from list3r.memory.store.tables.words import Words
 
@@ -60,7 +60,7 @@ class Store:
         self.edges = Edges(connection)
         self.bends = Bends(connection)
         self.votes = LabelVotes(connection)
-        self.trajectory = Trajectory(self.chunks, self.frames, self.bends)
+        self.trajectory = PlacedTrajectory(self.chunks, self.frames, self.bends)
 
     def _add_library(self, connection: Connection) -> None:
         """What is derived from that, and what operators said of it."""
@@ -68,7 +68,7 @@ class Store:
         self.edits = Edits(connection)
         self.ids = Ids(connection, self.facts, self.edits)
         self.embeddings = Embeddings(connection)
-        self.relations = Relations(connection, self.ids)
+        self.relations = RelationTable(connection, self.ids)
         self.events = Events(connection)
         self.detected_labels = DetectedLabels(connection)
         of_instance = self.embeddings, self.relations, self.events, self.detected_labels
@@ -76,7 +76,7 @@ class Store:
         self.observations = Observations(connection, self.ids)
         self.words = Words(connection)
         self.surfaces = Surfaces(self.chunks, self.supports, self.instances, self.events)
-        self.tracks = Tracks(
+        self.tracks = PlacedTracks(
             (self.chunks, self.frames), (self.local_instances, self.supports), (self.instances, self.observations)
         )
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
-from list3r.queries.grammar import Clause, Phrase
+from list3r.queries.finding.grammar import Clause, Phrase
 from list3r.queries.match import checked_instance
 from list3r.queries.views.viewpoint import VIEWPOINT
 

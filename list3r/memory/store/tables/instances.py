@@ -21,7 +21,7 @@ from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.labels import DetectedLabels
 from list3r.memory.store.tables.library import LibraryState
-from list3r.memory.store.tables.relations import Relations
+from list3r.memory.store.tables.relations import RelationTable
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ class Instances:
         connection: Connection,
         ids: Ids,
         library: LibraryState,
-        of_instance: tuple[Embeddings, Relations, Events, DetectedLabels],
+        of_instance: tuple[Embeddings, RelationTable, Events, DetectedLabels],
     ) -> None:
         """`of_instance` are the tables whose rows go with an instance."""
         self._connection = connection

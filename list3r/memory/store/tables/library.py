@@ -61,7 +61,7 @@ class Overlap:
 
 
 @dataclass(frozen=True)
-class Member:
+class GroupMember:
     """A local instance in its group, which is named by its first member."""
 
     key: Key
@@ -158,14 +158,14 @@ class Overlaps:
         self._connection.execute_many("DELETE FROM overlaps WHERE u = ? AND v = ?", list(pairs))
 
 
-class Members:
+class GroupMembers:
     """The table of which local instances are grouped. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._rows = Table(connection, "members", Columns(Member, _KEY, _FIRST), "chunk_id, local_id")
+        self._rows = Table(connection, "members", Columns(GroupMember, _KEY, _FIRST), "chunk_id, local_id")
 
-    def of(self, chunk_ids: Sequence[int]) -> dict[Key, Member]:
+    def of(self, chunk_ids: Sequence[int]) -> dict[Key, GroupMember]:
         """Return the local instances of some chunks, by key."""
         return {row.key: row for row in self._rows.among("chunk_id", chunk_ids)}
 
@@ -173,13 +173,13 @@ class Members:
         """Return all members of a group, in order; none where there is no such group."""
         return [row.key for row in self._rows.all("first_chunk = ? AND first_local = ?", first)]
 
-    def put(self, members: Iterable[Member]) -> None:
+    def put(self, members: Iterable[GroupMember]) -> None:
         """Write of local instances which group they are in; they leave those that they were in."""
         self._rows.put(members)
 
     def put_groups(self, groups: Iterable[tuple[Sequence[Key], bool]]) -> None:
         """Write groups, each with whether it is shown."""
-        self.put(Member(key, group[0], shown) for group, shown in groups for key in group)
+        self.put(GroupMember(key, group[0], shown) for group, shown in groups for key in group)
 
     def hidden_groups(self) -> int:
         """Return how many groups are not shown."""
@@ -220,7 +220,7 @@ class LibraryState:
         self._connection = connection
         self.settled = Settled(connection)
         self.overlaps = Overlaps(connection)
-        self.members = Members(connection)
+        self.members = GroupMembers(connection)
         self.anchors = Anchors(connection)
         self.touched: set[int] | None = None
         """Chunks that were placed or measured anew since the library was derived; None where that is not known."""

@@ -11,7 +11,7 @@ from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.ids import Ids
 
 
-class Relations:
+class RelationTable:
     """The table of relations. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection, ids: Ids) -> None:

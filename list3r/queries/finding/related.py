@@ -10,8 +10,8 @@ import numpy as np
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
-from list3r.queries.free_words import WordEncoder
-from list3r.queries.grammar import Clause
+from list3r.queries.finding.free_words import WordEncoder
+from list3r.queries.finding.grammar import Clause
 from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
 from list3r.queries.views.camera import camera_of_frame
 from list3r.queries.views.gather import Gathered
