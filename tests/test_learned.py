@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from list3r.instances.geometric.cloud import Cloud, pack
+from list3r.instances.geometric.planes import find_planes
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.discovery import LearnedDiscoverer
+from list3r.instances.learned.cut import THING_FEATURES, CloudCut
+from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph
 from list3r.instances.learned.network import judge
 from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
@@ -126,3 +129,27 @@ def test_it_finds_what_stands_on_a_table() -> None:
 def most_of(labels: np.ndarray) -> int:
     """The candidate that most pixels have."""
     return int(np.bincount(labels[labels > 0]).argmax())
+
+
+def test_walls_round_a_corner_are_two() -> None:
+    grid = np.stack(np.meshgrid(np.arange(0, 1.5, 0.01), np.arange(0, 1.0, 0.01)), axis=-1).reshape(-1, 2)
+    ones = np.zeros(len(grid)) + 0.005
+    points = np.concatenate([np.column_stack([grid[:, 0], ones, grid[:, 1]]), np.column_stack([ones, grid])])
+    normals = np.repeat(np.array([[0.0, 1, 0], [1, 0, 0]]), len(grid), axis=0)
+    cloud = cloud_of(points.astype(np.float32), normals.astype(np.float32))
+    count = len(cloud.keys)
+    one = np.ones(1, np.float32)
+    cut = CloudCut(np.zeros(count, np.int32), one, one[:, None], np.zeros((1, THING_FEATURES), np.float32))
+    parted, sure = _walls_apart(cloud, cut, one, find_planes(cloud, 0.03, 1.0))
+    assert len(parted.structure) == len(sure) == 2
+    first = cloud.points[:, 1] < cloud.points[:, 0]
+    far = np.abs(cloud.points[:, 0] - cloud.points[:, 1]) > 0.05
+    assert len(np.unique(parted.labels[first & far])) == len(np.unique(parted.labels[~first & far])) == 1
+
+
+def cloud_of(points: np.ndarray, normals: np.ndarray) -> Cloud:
+    """A cloud of 1 cm with a point in each voxel."""
+    keys, row = np.unique(pack(np.floor(points / 0.01).astype(np.int64)), return_index=True)
+    fine = np.full(len(keys), 0.001, np.float32)
+    rgb = np.full((len(keys), 3), 128, np.float32)
+    return Cloud(keys, points[row], normals[row], rgb, fine, fine, np.ones_like(fine), 0.01, ())

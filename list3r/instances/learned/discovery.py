@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from list3r.instances.geometric.cloud import Cloud, build_cloud
 from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.features import object_feature
-from list3r.instances.geometric.planes import find_planes
+from list3r.instances.geometric.planes import Plane, find_planes
 from list3r.instances.geometric.segments import Segment, Segmentation
 from list3r.instances.geometric.surfaces import estimate_up
 from list3r.instances.geometric.views import ChunkViews
@@ -53,13 +54,16 @@ class LearnedDiscoverer(GeometricDiscoverer):
         shown = [views.view(p) for p in views.anchors]
         cloud = build_cloud(shown, settings.voxel_m * views.unit)
         poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
-        up = estimate_up(find_planes(cloud, settings.plane_area_m2 * views.unit**2, views.unit), poses)
+        planes = find_planes(cloud, settings.plane_area_m2 * views.unit**2, views.unit)
+        up = estimate_up(planes, poses)
         height = float(np.median(poses[:, :3, 3] @ up))
         around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
         cut = cut_cloud(cloud, shown, around, self._weights, self._learned.cut)
         sure = confidence(cut, self._weights)
         listed = (sure >= self._learned.least_confidence) | (cut.structure > 0.5)
-        labels, segments, features = _described(cloud, cut.only(listed), sure[listed], up, views.unit)
+        labels, segments, features = _described(
+            cloud, *_walls_apart(cloud, cut.only(listed), sure[listed], planes), up, views.unit
+        )
         return cloud, Segmentation(labels, tuple(segments), up), features
 
 
@@ -68,6 +72,38 @@ def confidence(cut: CloudCut, weights: Weights) -> NDArray[np.float32]:
     x = (cut.features - weights["confidence.mean"]) / weights["confidence.std"]
     full = np.concatenate([x, x**2, np.ones((len(x), 1), np.float32)], axis=1)
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(full @ weights["confidence.weight"], -20, 20))), np.float32)
+
+
+def _walls_apart(
+    cloud: Cloud, cut: CloudCut, sure: NDArray[np.float32], planes: Sequence[Plane]
+) -> tuple[CloudCut, NDArray[np.float32]]:
+    """The cut with structure of several planes (walls round a corner) as one thing for each, and their confidence."""
+    labels, origin = cut.labels.copy(), list(range(len(sure)))
+    for number in np.flatnonzero(cut.structure > 0.5).tolist():
+        mine = np.flatnonzero(cut.labels == number)
+        faces = _faces(cloud, mine, planes)
+        if len(faces) > 1:
+            height = np.stack([np.abs(cloud.points[mine] @ f[:3] + f[3]) for f in faces])
+            nearest = height.argmin(axis=0)
+            for k in range(1, len(faces)):
+                labels[mine[nearest == k]] = len(origin)
+                origin.append(number)
+    rows = np.array(origin, np.int64)
+    return CloudCut(labels, cut.structure[rows], cut.names[rows], cut.features[rows]), sure[rows]
+
+
+def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> list[NDArray[np.float64]]:
+    """Planes of which each holds a tenth of some voxels, none twice. Shape (4,) each."""
+    faces: list[NDArray[np.float64]] = []
+    for plane in sorted(planes, key=lambda p: -len(p.members)):
+        held = np.intersect1d(plane.members, mine, assume_unique=True)
+        if len(held) < 0.1 * len(mine):
+            continue
+        middle = cloud.points[held].mean(axis=0)
+        alike = [f[:3] @ plane.normal > 0.95 and abs(f[:3] @ middle + f[3]) < 10.0 * cloud.voxel for f in faces]
+        if not any(alike):
+            faces.append(plane.equation)
+    return faces
 
 
 def _described(
