@@ -21,7 +21,7 @@ from list3r.memory.constraints import standing
 from list3r.memory.store.store import Store
 
 store = Store.open(sys.argv[1], writable=True)
-while any(e.kind != "undo" for e in standing(store.edits())):
+while any(e.kind != "undo" for e in standing(store.edits.all())):
     edits.undo(store)
 while True:
     for verb in (
