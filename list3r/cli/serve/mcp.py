@@ -47,7 +47,8 @@ def mcp(
 
 def _say(address: str, token: str) -> None:
     shown = f"the token of {TOKEN_VARIABLE}" if os.environ.get(TOKEN_VARIABLE) else token
-    note(f"{address}\nAuthorization: Bearer {shown}")
+    note(address)
+    note(f"Authorization: Bearer {shown}")
 
 
 def ask_config(
