@@ -119,7 +119,7 @@ def test_ctrl_c_in_any_command_is_said_and_is_a_failure(tmp_path: Path) -> None:
     program = """
 import os, signal, sys
 import list3r.api
-list3r.api.SceneMemory.export = lambda *_: os.kill(os.getpid(), signal.SIGINT) or signal.pause()
+list3r.api.SceneMemory.export = lambda *_, **__: os.kill(os.getpid(), signal.SIGINT) or signal.pause()
 from list3r.cli import main
 main()
 """
