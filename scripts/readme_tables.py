@@ -79,6 +79,21 @@ def walks() -> str:
     )
 
 
+def discovery() -> str:
+    """Return the table of discovery: rules, the learned one and true masks, on worlds left out and in a house."""
+    found = [_read(name)["mean"] for name in ("discovery", "discovery-house")]
+    methods = {"geometric": "rules (default)", "learned": "`--discovery learned`", "true": "true masks"}
+    keys = {"boxes at IoU 0.25": ("", "0.25"), "boxes at IoU 0.5": ("", "0.5"), "masks at IoU 0.25": ("mask_", "0.25")}
+    rows = []
+    for name, (kind, iou) in keys.items():
+        cells = [
+            f"{m[k][f'{kind}recall_{iou}']:.2f}, {m[k][f'{kind}precision_{iou}']:.2f}" for m in found for k in methods
+        ]
+        rows.append([name, *cells])
+    heads = [f"{where}: {method}" for where in ("10 left-out worlds", "a house") for method in methods.values()]
+    return _table(["recall, precision of one chunk", *heads], rows)
+
+
 def association() -> str:
     """Return the table of the variants of association: mean and worst of eight seeds."""
     runs = _read("association")["runs"]
@@ -123,6 +138,7 @@ def relations() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "kitchen": kitchen,
     "walks": walks,
+    "discovery": discovery,
     "association": association,
     "changes": changes,
     "relations": relations,
