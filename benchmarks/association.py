@@ -1,7 +1,7 @@
 """Association on simulated videos with known truth: VGGT-Long's way, the paper's steps, and ours, one row each.
 
 python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FILE [--plot FILE]
-python benchmarks/association.py --quick --json FILE        # two presets, two seeds, all rows: about ten minutes
+python benchmarks/association.py --quick --json FILE        # two presets, two seeds, all rows
 
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
 model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video,
