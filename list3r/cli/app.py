@@ -6,10 +6,12 @@ it is said.
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import sys
 from types import FrameType
+from typing import Any
 
 import typer
 
@@ -87,12 +89,17 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+@functools.cache
+def commands() -> Any:
+    """Return the tree of all commands and their options; making it takes longer than many a question."""
+    return typer.main.get_command(app)
+
+
 def run(arguments: list[str]) -> int:
     """Run one command; its exit status."""
-    command = typer.main.get_command(app)
     try:
         with naming_extras():
-            status = command.main(arguments, prog_name="list3r", standalone_mode=False)
+            status = commands().main(arguments, prog_name="list3r", standalone_mode=False)
         flush()
         if status == _INTERRUPTED:
             raise KeyboardInterrupt
