@@ -105,7 +105,7 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
             pstats.Stats(watched).sort_stats("cumtime").print_stats(60)
         out = []
         for n in sizes:
-            row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instance_count())}
+            row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instances.count())}
             for key in ("placing_s", "library_s", "all_s"):
                 row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
             row["end_s"] = end(stores[n], words.sessions)
