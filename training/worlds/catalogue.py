@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from training.worlds import fitted as b
 from training.worlds import fixtures as f
 from training.worlds import seating as s
 from training.worlds import soft, storage, tables
@@ -22,13 +23,14 @@ class Kind:
     """What a person calls it, in one word or two."""
     build: Callable[[Draft], None]
     place: str
-    """wall (stands with its back to one), free, corner, floor (small things), small (on tops and shelves), desk, media,
+    """wall (stands with its back to one), fitted (the same, built in), glazing and panel (on a wall, built in), free,
+    fitted free, corner, floor (small things), small (on tops and shelves), desk, media,
     hang (on a wall), ceiling, rug, seat (on seats and beds), shoes, lean."""
     weight: float = 1.0
     """How often it is drawn among the kinds of its place."""
 
 
-HELD_OUT = ("armchair", "stool", "toy", "luggage", "kettle", "appliance", "stand", "side table")
+HELD_OUT = ("armchair", "stool", "toy", "luggage", "kettle", "appliance", "stand", "side table", "board", "island")
 """Families that no world for training shows."""
 
 _ROWS: tuple[tuple[str, str, str, Callable[[Draft], None], str, float], ...] = (
@@ -144,13 +146,36 @@ _ROWS: tuple[tuple[str, str, str, Callable[[Draft], None], str, float], ...] = (
     ("cable", "cable", "cable", f.cable, "desk", 0.4),
     ("fan", "fan", "fan", f.fan, "floor", 0.4),
     ("guitar", "guitar", "guitar", f.guitar, "lean", 0.5),
+    ("large window", "glazing", "window", b.large_window, "glazing", 2),
+    ("folding door", "glazing", "door", b.folding_door, "glazing", 1.5),
+    ("sliding door", "glazing", "door", b.sliding_door, "glazing", 1.2),
+    ("long curtain", "curtain", "curtain", b.long_curtain, "glazing", 1.2),
+    ("lamella blind", "curtain", "blind", b.lamella_blind, "glazing", 0.7),
+    ("panel", "panel", "panel", b.panel, "panel", 1.5),
+    ("board", "board", "board", b.board, "panel", 1),
+    ("large picture", "picture", "picture", b.large_picture, "panel", 1.5),
+    ("air conditioner", "air conditioner", "air conditioner", b.air_conditioner, "panel", 0.6),
+    ("built-in wardrobe", "built-in", "wardrobe", b.built_in_wardrobe, "fitted", 2),
+    ("shelf wall", "built-in", "shelf", b.shelf_wall, "fitted", 0.8),
+    ("kitchen run", "kitchen", "counter", b.kitchen_run, "fitted", 2),
+    ("island", "island", "counter", b.island, "fitted free", 1),
+    ("folding screen", "screen", "screen", b.folding_screen, "fitted free", 0.5),
 )
 
 KINDS = {row[0]: Kind(*row) for row in _ROWS}
-LOOSE = {"cushion": "cushion", "pillow": "cushion", "duvet": "cloth", "chair": "chair"}
+LOOSE = {
+    "cushion": "cushion",
+    "pillow": "cushion",
+    "duvet": "cloth",
+    "chair": "chair",
+    "cupboard": "wall storage",
+    "hood": "hood",
+}
 """Family of the things that others bring along, by label."""
+BUILT_IN = ("glazing", "panel", "fitted", "fitted free")
+"""Places of what is built in."""
 STRUCTURE = ("floor", "ceiling", "wall")
-LABELS = tuple(sorted({k.label for k in KINDS.values()} | {"pillow", "duvet", "blanket"}))
+LABELS = tuple(sorted({k.label for k in KINDS.values()} | {"pillow", "duvet", "blanket", "hood"}))
 FAMILIES = tuple(sorted({k.family for k in KINDS.values()}))
 
 

@@ -12,6 +12,7 @@ from list3r.memory.geometry import rotation_exp
 from list3r.reconstruction.base import Reconstruction
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import Stop
+from training.worlds.catalogue import BUILT_IN, KINDS
 from training.worlds.furnish import World, make_world
 from training.worlds.render import world_renderer
 from training.worlds.room import Placed, Room
@@ -57,6 +58,8 @@ class FilmSettings:
     seed: int = 0
     held_out: bool = False
     """Families, textures and sensors that training never shows appear too."""
+    fitted: bool = False
+    """Rooms with what is built in, see `make_world`."""
     frames: int = 30
     every: int = 2
     """Only every n-th frame of the walk is filmed, which is all that fusion looks at."""
@@ -67,7 +70,7 @@ class FilmSettings:
 
 def make_film(settings: FilmSettings) -> Film:
     """Return the walk of a seed through the world of that seed."""
-    world = make_world(settings.seed, held_out=settings.held_out)
+    world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted)
     rng = np.random.default_rng([settings.seed, 7])
     sensors = SENSORS if settings.held_out else tuple(s for s in SENSORS if s not in HELD_OUT_SENSORS)
     sensor = settings.sensor or str(rng.choice(sensors))
@@ -75,7 +78,7 @@ def make_film(settings: FilmSettings) -> Film:
     w, h = settings.size
     camera = Camera(w, h, focal, focal, (w - 1) / 2, (h - 1) / 2)
     speed = PathSettings(fps=float(rng.uniform(9, 15)) / settings.every, speed_m_s=float(rng.uniform(0.35, 0.7)))
-    stops = _stops(world, rng, settings.frames, settings.every)
+    stops = _stops(world, rng, settings)
     time_s, poses = camera_path(stops, settings.frames, speed, settings.seed)
     renderer = world_renderer(world.things, world.size, camera, settings.seed)
     color, depth, true_depth, ids = [], [], [], []
@@ -97,14 +100,17 @@ def _truth(thing: Placed) -> Truth:
     return Truth(thing.id, thing.kind, thing.label, thing.family, thing.structure)
 
 
-def _stops(world: World, rng: np.random.Generator, frames: int, every: int) -> tuple[Stop, ...]:
+def _stops(world: World, rng: np.random.Generator, settings: FilmSettings) -> tuple[Stop, ...]:
     """Return places to look from and at: furniture round the room, from a metre or two, some of it close."""
     room: Room = world.room
     w, deep, _ = world.size
     eyes = [(x, y) for x, y in rng.uniform(0.25, np.array([w, deep]) - 0.25, (300, 2)).tolist() if room.free_eye(x, y)]
     eyes = eyes or [(w / 2, deep / 2)]
     targets = [t for t in world.things if not t.structure]
-    count = max(3, frames * every // 14)
+    far = 2.4
+    if settings.fitted:
+        targets, far = targets + 4 * [t for t in targets if t.kind in KINDS and KINDS[t.kind].place in BUILT_IN], 3.4
+    count = max(3, settings.frames * settings.every // 14)
     start = np.array(eyes[int(rng.integers(len(eyes)))])
     bearing, stops = rng.uniform(0, 2 * np.pi), []
     heading = rng.choice([-1, 1])
@@ -120,7 +126,7 @@ def _stops(world: World, rng: np.random.Generator, frames: int, every: int) -> t
         ]
         goal = middle[int(np.argmin(angle))]
         options = [np.array(e) for e in eyes if np.linalg.norm(np.array(e) - start) < 1.0]
-        away = [abs(float(np.linalg.norm(e - goal[:2])) - rng.uniform(0.9, 2.4)) for e in options]
+        away = [abs(float(np.linalg.norm(e - goal[:2])) - rng.uniform(0.9, far)) for e in options]
         start = options[int(np.argmin(away))] if options else start
         bearing += heading * rng.uniform(0.3, 0.9)
         height = float(rng.uniform(1.1, 1.7))

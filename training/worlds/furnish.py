@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from training.worlds.catalogue import KINDS, Kind, kinds_at
 from training.worlds.draft import Draft
+from training.worlds.fitted import built_in_wardrobe, folding_door, large_window, shelf_wall, sliding_door
 from training.worlds.materials import Palette
 from training.worlds.mesh import box
 from training.worlds.room import Placed, Room, flat_pose, room_shell
 from training.worlds.settle import fill_zone
+from training.worlds.structural import Niche, build_structure
 
 
 @dataclass(frozen=True)
@@ -24,14 +26,20 @@ class World:
     room: Room
 
 
-def make_world(seed: int, *, held_out: bool = False) -> World:
-    """Return the furnished room of a seed; with `held_out` families and textures appear that training never shows."""
+def make_world(seed: int, *, held_out: bool = False, fitted: bool = False) -> World:
+    """Return the furnished room of a seed; with `held_out` families and textures appear that training never shows.
+
+    `fitted` rooms have structure that looks like things, and things that are built in.
+    """
     rng = np.random.default_rng([seed, 1 if held_out else 0])
-    size = (float(rng.uniform(2.8, 5.5)), float(rng.uniform(2.8, 5.5)), float(rng.uniform(2.35, 2.9)))
+    most = 6.5 if fitted else 5.5
+    size = (float(rng.uniform(2.8, most)), float(rng.uniform(2.8, most)), float(rng.uniform(2.35, 2.9)))
     palette = Palette(rng, held_out=held_out)
     room = Room(size, rng)
     painter = _Furnisher(room, palette, held_out)
     painter.shell()
+    if fitted:
+        painter.built_in()
     painter.openings()
     painter.groups()
     painter.along_walls()
@@ -87,6 +95,58 @@ class _Furnisher:
             for number in range(4):
                 along, across = (x, sx) if number % 2 == 0 else (y, sy)
                 self.room.wall_free(number, (along - across / 2, along + across / 2), (0, h), take=True)
+
+    def built_in(self) -> None:
+        """Build structure into the room, and what is made for its niches and walls."""
+        wall = next(t.parts[0][1] for t in self.room.things if t.label == "wall")
+        for niche in build_structure(self.room, self.palette, wall):
+            if self.rng.random() < 0.7:
+                self._fill_niche(niche)
+        for _ in range(int(self.rng.integers(2, 6))):
+            place = str(self.rng.choice(["glazing", "glazing", "panel", "fitted", "fitted"]))
+            kind = self._draw(place)
+            if place == "fitted":
+                self._against(kind, 4)
+            else:
+                floor = kind.name in ("folding door", "sliding door", "long curtain")
+                low = 0.01 if floor else self.rng.uniform(0.1, 1.1 if place == "panel" else 0.9)
+                self._hang(kind, low)
+        if self.rng.random() < 0.25:
+            self._free(self._draw("fitted free"))
+
+    def _fill_niche(self, niche: Niche) -> None:
+        """Put something into a niche that is as wide as the niche."""
+        w, h, back = niche.width - 0.02, niche.height - 0.02, 0.004
+        draft, pick = Draft(self.rng, self.palette), int(self.rng.integers(4))
+        if pick == 0:
+            depth = niche.depth - self.rng.uniform(0.0, 0.03)
+            name, back = "built-in wardrobe", depth / 2 + 0.002
+            built_in_wardrobe(draft, w, h, depth - 0.03)
+        elif pick == 1 and niche.depth > 0.2:
+            name, back = "shelf wall", niche.depth / 2
+            shelf_wall(draft, w, h, niche.depth - 0.02)
+        else:
+            name = str(self.rng.choice(["large window", "sliding door", "folding door"]))
+            {"large window": large_window, "sliding door": sliding_door, "folding door": folding_door}[name](
+                draft, w - 0.16, h - 0.12
+            )
+            back = 0.004 if niche.depth < 0.2 or self.rng.random() < 0.5 else niche.depth - 0.15
+        pose = self.room.wall_pose(niche.wall, niche.along, back, 0.01)
+        if self.room.fits(draft, pose):
+            half = niche.width / 2
+            self.room.wall_free(niche.wall, (niche.along - half, niche.along + half), (0.0, niche.height), take=True)
+            self._place(KINDS[name], draft, pose)
+
+    def _free(self, kind: Kind) -> None:
+        """Stand a thing somewhere in the room, square to it."""
+        w, deep, _ = self.room.size
+        for _ in range(6):
+            draft = self._draft(kind)
+            at = self.rng.uniform(0.7, np.array([w, deep]) - 0.7)
+            pose = flat_pose(float(at[0]), float(at[1]), float(self.rng.integers(4)) * np.pi / 2)
+            if self.room.fits(draft, pose):
+                self._place(kind, draft, pose)
+                return
 
     def _hang(
         self, kind: Kind, z: float, wall: int | None = None, along: float | None = None
