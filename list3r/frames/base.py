@@ -93,6 +93,8 @@ class SourceInfo:
     """Height and width of the frames handed out, px."""
     poses_metric: bool = True
     """Whether given poses are in metres; a model of COLMAP has a unit of its own."""
+    z_up: bool = False
+    """Whether the recorder's gravity makes z of the given poses' world point up."""
     camera_guess: Camera | None = None
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 

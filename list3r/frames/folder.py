@@ -243,6 +243,7 @@ class FolderSource:
             image_size=rig.color_size,
             camera_guess=guess,
             poses_metric=layout.poses_metric,
+            z_up=layout.z_up,
         )
 
     def _camera_guess(self) -> Camera | None:

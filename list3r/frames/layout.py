@@ -76,6 +76,8 @@ class FolderLayout:
     """Depth whose confidence is stored as less than this is unknown; None where there is no confidence."""
     poses_metric: bool = True
     """Whether given poses are in metres."""
+    z_up: bool = False
+    """Whether the recorder's gravity makes z of the given poses' world point up."""
     upright_tags: bool = True
     """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
 

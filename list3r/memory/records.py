@@ -273,7 +273,7 @@ class Edge:
     v: int
     """Chunk id."""
     kind: str
-    """adjacent or loop."""
+    """adjacent, loop, or prior (by poses that the source gives)."""
     S_v_u: Sim3
     confidence: float
     """m_uv of the paper (A.4), in [0, 1]."""

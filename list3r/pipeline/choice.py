@@ -74,7 +74,7 @@ def settings_resumed(
 
 def settings_beside(settings: BuildSettings, first: BuildSettings) -> BuildSettings:
     """Return the settings of a later session: what was asked for, with the stages of the memory's first session."""
-    own = (*MODEL_CHOICES, "poses", "chunks", "depth_every", "keep_pictures")
+    own = (*MODEL_CHOICES, "poses", "up", "chunks", "depth_every", "keep_pictures")
     return replace(first, **{name: getattr(settings, name) for name in own})
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from list3r.association.overlap.camera_edge import better_edge, camera_edge
 from list3r.association.overlap.edges import EdgeEnd, measure_edge
+from list3r.association.overlap.prior_edge import prior_edge
 from list3r.association.revisits.joint_window import JointReconstructor
 from list3r.association.revisits.overlays import write_loop
 from list3r.association.revisits.reprojection_edge import ReprojectionSettings, refine_loop
@@ -24,7 +25,7 @@ from list3r.memory.library.labels import apply_labels, put_votes, votes_of_names
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.pipeline.placing import knows_cameras, place_chunks, poses_given
-from list3r.pipeline.settings import AssociationSettings
+from list3r.pipeline.settings import AssociationSettings, session_settings
 
 
 def add_chunk(
@@ -54,6 +55,7 @@ def add_chunk(
             store.edges.add(_edge_of_given_poses(store, session_id))
         else:
             store.edges.add(_adjacent_edge(store, session_id, chosen, debug_dir))
+            store.edges.add(_prior_edge(store, session_id, result, chosen))
         if not given or len(store.sessions.all()) > 1:
             loops = find_loops(store, chunk_id, joint, chosen.revisits)
             store.edges.add(_refined(store, e, chosen.reprojection) if e.accepted else e for e in loops)
@@ -94,6 +96,15 @@ def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debu
         pictures = [k for c in (u, v) for k in store.keyframes.of(c.chunk_id)]
         write_support(found, pictures, _camera(v), debug_dir)
     return [better_edge(found.edge, by_cameras) or found.edge]
+
+
+def _prior_edge(store: Store, session_id: int, result: ChunkResult, how: AssociationSettings) -> list[Edge]:
+    """The edge to the chunk before by poses that the source gives as a prior; none where it gives none."""
+    chunks = store.chunks.all(session_id)
+    if len(chunks) < 2 or session_settings(store.sessions.get(session_id)).poses != "prior":
+        return []
+    edge = prior_edge(chunks[-2], store.frames.of(chunks[-2]), result, chunks[-1].chunk_id, how.prior)
+    return [] if edge is None else [edge]
 
 
 def _refined(store: Store, edge: Edge, settings: ReprojectionSettings) -> Edge:

@@ -50,11 +50,12 @@ def place_chunks(
     if bend:
         graph = _straightened(store, graph, chunks, metric, how)
     known = {} if store.facts.poses == "given" else graph.covariances
-    settled = store.facts.gravity == "estimated" or len(chunks) % how.up_again
+    settled = store.facts.gravity in ("known", "estimated") or len(chunks) % how.up_again
     if fitted and len(chunks) > how.up_always and settled:
         _place_fitted(store, graph, known)
         return
-    gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components)
+    stated_up = _stated_up(store, graph)
+    gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components, stated_up=stated_up)
     upright = world_from_graph(gravity)
     rows = [replace(c, component=graph.components[c.chunk_id]) for c in store.chunks.all()]
     S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
@@ -88,6 +89,17 @@ def _straightened(
         graph, bends = place_by_surfaces(store.chunks.samples, graph, bends, how.surfaces)
     store.bends.replace(bends)
     return graph
+
+
+def _stated_up(store: Store, graph: GraphResult) -> NDArray[np.float64] | None:
+    """Up in the graph's frame (3,), as chunks say whose frame has z up by their source; None where no source knows."""
+    stating = {s.session_id for s in store.sessions.all() if session_settings(s).up == "source"}
+    main = min(graph.components.values(), default=0)
+    rows = [c.chunk_id for c in store.chunks.all() if c.session_id in stating]
+    ups = [graph.S_graph_chunk[k].rotation[:, 2] for k in rows if graph.components[k] == main]
+    total = np.sum(ups, axis=0) if ups else np.zeros(3)
+    length = float(np.linalg.norm(total))
+    return None if length < 1e-6 else np.asarray(total / length)
 
 
 def _metre(chunks: Sequence[ChunkRow]) -> float:

@@ -77,7 +77,10 @@ class BuildRequest:
             "KIND[=FILE]",
         ),
     )
-    poses: str = field(default="auto", metadata=option("estimate, given or auto (given where the source has them)."))
+    poses: str = field(
+        default="auto",
+        metadata=option("estimate, given, prior (given, but corrected) or auto (given where the source has them)."),
+    )
     chunk: int | None = field(
         default=None, metadata=option("Frames in a chunk; default: 100, or what the GPU holds of a network.", "N")
     )

@@ -221,7 +221,7 @@ def _note_lost(store: Store, session: int, result: ChunkResult) -> None:
 
 def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]:
     """Where the video jumps, found once; given poses know where the camera is on either side."""
-    if job.settings.poses == "given":
+    if job.settings.poses != "estimate":
         return ()
     known = store.sessions.get(session).cuts
     if known is None:
@@ -240,13 +240,14 @@ def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings
         poses = "given" if info.has_poses else "estimate"
     if reconstruction == "auto":
         reconstruction = usual_model(info.has_depth)
-    return replace(settings, poses=poses, reconstruction=reconstruction)
+    up = "source" if info.z_up and poses != "estimate" else "planes"
+    return replace(settings, poses=poses, reconstruction=reconstruction, up=up)
 
 
 def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
     """Raise an error that names the fix when the source cannot be built with the settings."""
-    if settings.poses not in ("given", "estimate"):
-        raise OptionError(f"--poses {settings.poses} is not known; choose estimate, given or auto")
+    if settings.poses not in ("given", "prior", "estimate"):
+        raise OptionError(f"--poses {settings.poses} is not known; choose estimate, prior, given or auto")
     model, every = entry(settings.reconstruction), settings.depth_every
     if every is not None and not 1 <= every <= MOST_DEPTH_EVERY:
         raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; --every takes fewer frames at all")
@@ -262,8 +263,11 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         )
     if model.needs_camera and info.camera is None:
         raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
-    if settings.poses == "given" and not info.has_poses:
+    if settings.poses != "estimate" and not info.has_poses:
         raise OptionError(f"{info.path} has no poses; use --poses estimate")
+    if settings.poses == "prior" and not (model.follows_prior and info.poses_metric):
+        unit = "" if info.poses_metric else f" in metres, and those of {info.path} have a unit of their own"
+        raise OptionError(f"--poses prior is of rgbd, by poses{unit}; use --poses given or estimate")
     check_choice(settings.discovery, settings.tracking, settings.features)
     if settings.device not in ("auto", "cpu"):  # looking for a GPU takes seconds
         from list3r.models.pretrained import pick_device

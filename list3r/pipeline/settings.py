@@ -11,6 +11,7 @@ from list3r.association.graph.surface_graph import SurfaceSettings
 from list3r.association.overlap.camera_edge import CameraEdgeSettings
 from list3r.association.overlap.edges import EdgeSettings
 from list3r.association.overlap.motion import MotionSettings
+from list3r.association.overlap.prior_edge import PriorEdgeSettings
 from list3r.association.revisits.reprojection_edge import ReprojectionSettings
 from list3r.association.revisits.search import RevisitSettings
 from list3r.association.revisits.session_ties import TieSettings
@@ -35,6 +36,8 @@ class AssociationSettings:
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     cameras: CameraEdgeSettings = field(default_factory=CameraEdgeSettings)
     """Of edges by the cameras of two chunks, where a model knows those better than surfaces."""
+    prior: PriorEdgeSettings = field(default_factory=PriorEdgeSettings)
+    """Of edges by poses that the source gives as a prior."""
     reprojection: ReprojectionSettings = field(default_factory=ReprojectionSettings)
     """Of loops of such models."""
     ties: TieSettings = field(default_factory=TieSettings)
@@ -61,7 +64,9 @@ class BuildSettings:
     reconstruction: str = "auto"
     """The reconstruction model; auto: rgbd where the source has depth, else sfm."""
     poses: str = "estimate"
-    """given, estimate, or auto: given where the source has them."""
+    """given, prior (given, but corrected), estimate, or auto: given where the source has them."""
+    up: str = "planes"
+    """Who says which way is up: planes (level surfaces), or source (given poses of a recorder that knows gravity)."""
     device: str = "auto"
     """Where neural models run: cpu, cuda, or auto, the first GPU where there is one."""
     weights: str | None = None

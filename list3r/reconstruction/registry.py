@@ -17,7 +17,7 @@ class ModelOptions:
     """What every reconstruction model is told."""
 
     poses: str = "estimate"
-    """given or estimate."""
+    """given, prior or estimate."""
     camera_known: bool = True
     """False where the camera handed over is only a guess, which the model may better."""
     device: str = "auto"
@@ -48,12 +48,14 @@ class ModelEntry:
     """Computes depth, so that frames which show the same from nearly the same place need not all have it."""
     by_cameras: bool = False
     """Knows its cameras better than its surfaces: chunks are joined by both, loops refined by features."""
+    follows_prior: bool = False
+    """Starts from poses that are given but imperfect, and betters them."""
     reads_files: bool = False
     """Reads geometry from a folder, which takes the place of weights and says how it was cut."""
 
 
 MODELS: dict[str, ModelEntry] = {
-    "rgbd": ModelEntry("rgbd.reconstructor", needs_depth=True, needs_camera=True),
+    "rgbd": ModelEntry("rgbd.reconstructor", needs_depth=True, needs_camera=True, follows_prior=True),
     "sfm": ModelEntry("sfm.reconstructor", calibration="sfm.calibration", thins=True, by_cameras=True),
     "pi3": ModelEntry("networks.pi3"),
     "pi3x": ModelEntry("networks.pi3x"),

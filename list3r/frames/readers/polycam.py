@@ -54,7 +54,15 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if not any(f.depth for f in files):
         optics = Optics(intrinsics, intrinsics_size=size)
     return FolderLayout(
-        "polycam", files, optics, "color", intrinsics, tuple(notes), (), LEAST_CONFIDENCE, upright_tags=False
+        "polycam",
+        files,
+        optics,
+        "color",
+        intrinsics,
+        tuple(notes),
+        least_confidence=LEAST_CONFIDENCE,
+        z_up=True,
+        upright_tags=False,
     )
 
 

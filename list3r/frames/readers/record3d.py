@@ -92,7 +92,15 @@ def _layout(
     if lost:
         notes.append(f"{lost} of {len(numbers)} frames come without a pose")
     return FolderLayout(
-        "record3d", tuple(files), optics, "color", intrinsics, tuple(notes), (), LEAST_CONFIDENCE, upright_tags=False
+        "record3d",
+        tuple(files),
+        optics,
+        "color",
+        intrinsics,
+        tuple(notes),
+        least_confidence=LEAST_CONFIDENCE,
+        z_up=True,
+        upright_tags=False,
     )
 
 

@@ -116,6 +116,7 @@ class StraySource:
             depth_scale=self._rig.depth_scale if self._depth else None,
             notes=tuple(notes),
             missing=missing,
+            z_up=True,
         )
 
 

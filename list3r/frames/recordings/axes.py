@@ -22,6 +22,11 @@ def pose_of_arkit(T_world_arkit: Array) -> Array:
     return np.asarray(Z_UP_FROM_Y_UP @ T_world_arkit @ OPENGL_TO_OPENCV)
 
 
+def arkit_of_pose(T_world_cam: Array) -> Array:
+    """Return the pose as ARKit has it, the inverse of `pose_of_arkit`. Shape (4, 4)."""
+    return np.asarray(Z_UP_FROM_Y_UP.T @ T_world_cam @ OPENGL_TO_OPENCV)
+
+
 def pose_of_quaternion(translation_m: ArrayLike, quat_xyzw: ArrayLike) -> Array | None:
     """Return the pose of a translation and a quaternion, None where they are not finite or the quaternion no rotation.
 

@@ -58,7 +58,7 @@ class Facts:
     gravity_estimate = Fact[UpEstimate | None]("gravity_estimate", UpEstimate, None)
     """Which way is up and where the floor is, in the frame of the pose graph."""
     poses = Fact[str | None]("poses", str, None)
-    """given or estimate: where the camera poses of the first session come from."""
+    """given, prior or estimate: where the camera poses of the first session come from."""
     S_world_graph = Fact[Sim3]("T_world_graph", Sim3, Sim3.identity())
     """From the frame of the pose graph to the world."""
     last_id = Fact[int]("last_id", int, 0)

@@ -177,13 +177,15 @@ def estimate_gravity(
     S_graph_chunk: Mapping[int, Sim3] | None = None,
     components: Mapping[int, int] | None = None,
     settings: GravitySettings | None = None,
+    *,
+    stated_up: Array | None = None,
 ) -> Gravity:
     """Return up in the frame in which chunks lie by `S_graph_chunk` (the default: as they are placed), from the chunks
     of the first component (see `ChunkRow.component`), or 64 of them in a long memory.
 
     Call it inside a transaction; `world_from_graph` then gives what stands the chunks upright. An estimate that still
     agrees with the one before within `hysteresis_deg` gives way to that one, so that the world does not tremble with
-    every chunk.
+    every chunk. Where up is stated (3,), planes only tell the floor.
     """
     s = settings or stored_settings(store, GravitySettings, "library", "gravity")
     chunks = store.chunks.all()
@@ -200,11 +202,25 @@ def estimate_gravity(
     unit = world_unit(inside, summaries)
     if summaries.metre is not None:
         unit *= float(inside[0].S_world_chunk.scale) / float(rows[0].S_world_chunk.scale)
-    found = gravity_from_planes(planes, cameras_of(store, inside), unit, s)
+    cameras = cameras_of(store, inside)
+    if stated_up is None:
+        found = gravity_from_planes(planes, cameras, unit, s)
+    else:
+        found = _stated(stated_up, planes, cameras, unit, s)
     settled = _with_hysteresis(found, store.facts.gravity_estimate, unit, s)
     if settled is found and found.status != "unknown":
         store.facts.gravity_estimate = UpEstimate(found.up, found.floor_height)
     return settled
+
+
+def _stated(up: Array, planes: Planes, S_graph_cam: Sim3, unit: float, s: GravitySettings) -> Gravity:
+    """Return up as a recorder states it, with the floor that planes show."""
+    mean_up = -S_graph_cam.rotation[:, :, 1].mean(axis=0) if len(S_graph_cam.rotation) else up
+    cosine = float(up @ mean_up / max(float(np.linalg.norm(mean_up)), 1e-12))
+    tilt = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    known = len(planes.normal) > 0 and len(S_graph_cam.rotation) > 0
+    floor = floor_height(up, planes, S_graph_cam.translation, unit, s) if known else None
+    return Gravity("known", up, 0.0, tilt, 0.0, floor, "the recorder of the source knew gravity")
 
 
 def _with_hysteresis(found: Gravity, before: UpEstimate | None, unit: float, s: GravitySettings) -> Gravity:

@@ -20,7 +20,8 @@ from list3r.frames.base import Camera, Frame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
 from list3r.reconstruction.motion.movers import Mask, MoverMemory, find_mover, fit, without
 from list3r.reconstruction.poses import angle_deg, shows_more
-from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register
+from list3r.reconstruction.prior import given_step
+from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
 from list3r.reconstruction.rgbd.view import WorkingFrame, make_view
@@ -50,11 +51,17 @@ class CameraTracker:
         camera: Camera,
         settings: OdometrySettings,
         known: Mapping[int, Mask] | None = None,
+        *,
+        prior: bool = False,
     ) -> None:
-        """`known` are masks of any size, by position, of what is known to move: the camera is followed without it."""
+        """`known` are masks of any size, by position, of what is known to move: the camera is followed without it.
+
+        With `prior` the frames' own poses say roughly how the camera moves.
+        """
         self.frames, self.camera, self.settings = frames, camera, settings
         self.small = camera.shrunk(settings.working_width)
         self.segments: list[TrackedSegment] = []
+        self._prior = prior
         self._features: dict[int, Features] = {}
         self._views: dict[int, WorkingFrame] = {}
         self._moving: dict[int, Mask] = {}
@@ -162,7 +169,13 @@ class CameraTracker:
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
         found: list[FrameRegistration | None] = []
-        if gap_s <= self.settings.gap_s:
+        given = self._given(segment, last, position, gap_s)
+        if given is not None:
+            found.append(self._place(segment, position, given.T_model_cam, prior=given))
+            if self._doubtful(segment, found[0]) and gap_s <= self.settings.gap_s:
+                T = self._predict(segment, last, gap_s)
+                found.append(None if T is None else self._place(segment, position, T))
+        elif gap_s <= self.settings.gap_s:
             predicted = self._predict(segment, last, gap_s)
             for T in (predicted, segment.T_segment_cam[last]):
                 found.append(None if T is None else self._place(segment, position, T))
@@ -175,7 +188,7 @@ class CameraTracker:
             found.append(self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s))
         possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
         if not possible:
-            return None
+            return None if given is None else given.T_model_cam
         best = max(possible, key=lambda f: f.overlap * f.inliers)
         segment.usual_inliers = max(best.inliers, self.settings.forget * segment.usual_inliers)
         return best.T_model_cam
@@ -183,6 +196,19 @@ class CameraTracker:
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
         """Return whether much less agrees than did in the frames before, as in a false minimum."""
         return found is None or found.inliers < self.settings.doubt * segment.usual_inliers
+
+    def _given(self, segment: TrackedSegment, last: int, position: int, gap_s: float) -> PosePrior | None:
+        """Where the source's own poses put the frame; None where they say nothing or a motion that cannot be."""
+        s = self.settings
+        step = given_step(self.frames[last].T_source_cam, self.frames[position].T_source_cam) if self._prior else None
+        if step is None or angle_deg(step) > s.most_turn_deg_per_s * gap_s:
+            return None
+        length = float(np.linalg.norm(step[:3, 3]))
+        if length > s.most_speed_m_per_s * gap_s:
+            return None
+        shift_m = float(np.hypot(s.prior.shift_m, s.prior.shift_share * length))
+        turn_rad = float(np.radians(s.prior.turn_deg))
+        return PosePrior(segment.T_segment_cam[last] @ step, shift_m, turn_rad, s.prior.correlated)
 
     def _predict(self, segment: TrackedSegment, last: int, gap_s: float) -> Pose | None:
         """Constant velocity from the last two frames; None at the beginning and after a gap, where it is not known."""
@@ -201,12 +227,17 @@ class CameraTracker:
         return T_last @ moved
 
     def _place(
-        self, segment: TrackedSegment, position: int, T_guess: Pose, blind: bool = False
+        self,
+        segment: TrackedSegment,
+        position: int,
+        T_guess: Pose,
+        blind: bool = False,
+        prior: PosePrior | None = None,
     ) -> FrameRegistration | None:
         """Register the frame to the segment's model from a guess, kept only when it can be trusted."""
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         s, view = self.settings, self.view(position)
-        found = register(samples, view, T_guess, s.registration, s.noise)
+        found = register(samples, view, T_guess, s.registration, s.noise, prior=prior)
         if found is not None and not blind:
             mover = find_mover(samples, view, T_guess, found, s)
             if mover is not None and self._trusted(mover[1], samples, position, blind):

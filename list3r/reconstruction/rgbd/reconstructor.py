@@ -19,6 +19,7 @@ from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion.follow import follow_movers
 from list3r.reconstruction.motion.moving import SmallFrames, find_moving
 from list3r.reconstruction.poses import given_poses, select_keyframes
+from list3r.reconstruction.prior import source_from_chunk, stacked
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker
@@ -34,17 +35,17 @@ def make(options: ModelOptions) -> RgbdReconstructor:
 class RgbdReconstructor:
     """Poses and depth of RGB-D frames, metres.
 
-    The chunk's frame is the camera of its first posed frame where poses are estimated, and the source's own world where
-    they are given.
+    The chunk's frame is the camera of its first posed frame where poses are estimated, the source's own world where
+    they are given, and near that where they are a prior.
     """
 
     settings: RgbdSettings = field(default_factory=RgbdSettings)
     poses: str = "estimate"
-    """given or estimate."""
+    """given, prior or estimate."""
 
     def __post_init__(self) -> None:
-        if self.poses not in ("given", "estimate"):
-            raise OptionError(f"poses {self.poses!r}: choose given or estimate")
+        if self.poses not in ("given", "prior", "estimate"):
+            raise OptionError(f"poses {self.poses!r}: choose given, prior or estimate")
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
         """Reconstruct a chunk.
@@ -101,7 +102,7 @@ class RgbdReconstructor:
         self, frames: Sequence[Frame], camera: Camera, known: Mapping[int, NDArray[np.bool_]] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], Mapping[int, NDArray[np.bool_]]]:
         """Poses, which frames have one, keyframes, and what was left out of each frame; without what `known` holds."""
-        tracker = CameraTracker(frames, camera, self.settings.odometry, known)
+        tracker = CameraTracker(frames, camera, self.settings.odometry, known, prior=self.poses == "prior")
         segments = tracker.run()
         if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
             raise TrackingError(
@@ -112,6 +113,10 @@ class RgbdReconstructor:
         for position, pose in segments[0].T_segment_cam.items():
             T[position], posed[position] = pose, True
         T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
+        if self.poses == "prior":
+            given = stacked([f.T_source_cam for f in frames])
+            T_source_chunk = source_from_chunk(T, posed, given, self.settings.odometry.prior)
+            T[posed] = T[posed] if T_source_chunk is None else T_source_chunk @ T[posed]
         return T, posed, segments[0].keyframes, tracker.moving
 
 

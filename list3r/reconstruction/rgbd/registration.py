@@ -43,6 +43,32 @@ class KnownFeatures:
 
 
 @dataclass(frozen=True)
+class PosePrior:
+    """Where the view is expected, and how surely."""
+
+    T_model_cam: NDArray[np.float64]
+    """Shape (4, 4)."""
+    shift_m: float
+    """Deviation of the camera's place, metres."""
+    turn_rad: float
+    """Deviation of its direction."""
+    pairs: float
+    """So many pairs tell as much as one."""
+
+    def information(self) -> NDArray[np.float64]:
+        """Return the information of the left-hand tangent (translation, rotation), model coordinates. Shape (6, 6)."""
+        about = np.eye(6)
+        about[:3, 3:] = -skew(self.T_model_cam[:3, 3])
+        weights = np.array([1.0 / self.shift_m**2] * 3 + [1.0 / self.turn_rad**2] * 3)
+        return np.asarray(about.T @ (weights[:, None] * about))
+
+    def off(self, T_model_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the tangent from where the view is expected to where it is. Shape (6,)."""
+        step = T_model_cam @ np.linalg.inv(self.T_model_cam)
+        return np.concatenate([step[:3, 3], cv2.Rodrigues(step[:3, :3])[0].ravel()])
+
+
+@dataclass(frozen=True)
 class FrameRegistration:
     """A view placed against a model."""
 
@@ -79,6 +105,7 @@ def register(
     settings: RegistrationSettings,
     noise: SensorNoise,
     anchors: KnownFeatures | None = None,
+    prior: PosePrior | None = None,
 ) -> FrameRegistration | None:
     """Refine `T_model_cam`; None when too few points meet."""
     frame = _Frame(view, noise)
@@ -99,6 +126,10 @@ def register(
             more, slope = _anchored(anchors, T, view.camera.fx)
             information += more
             gradient += slope
+        if prior is not None:
+            more = prior.pairs * prior.information()
+            information += more
+            gradient += more @ prior.off(T)
         damped = information + 1e-9 * np.trace(information) * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
         T = _exp(step) @ T
@@ -108,6 +139,8 @@ def register(
     information = _solid_information(pairs, frame, T, settings, photometric)
     if anchors is not None:
         information += _anchored(anchors, T, view.camera.fx)[0]
+    if prior is not None:
+        information += prior.information()
     return FrameRegistration(
         T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from list3r.reconstruction.base import KeyframeSpacing, SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.motion.settings import FollowSettings, MoverSettings, MovingSurfaceSettings
+from list3r.reconstruction.prior import PriorSettings
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,8 @@ class OdometrySettings:
     fusion: SurfelSettings = field(default_factory=SurfelSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)
     movers: MoverSettings = field(default_factory=MoverSettings)
+    prior: PriorSettings = field(default_factory=PriorSettings)
+    """Of poses that the source gives as a prior."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 

@@ -1,0 +1,86 @@
+"""A phone's walk through a simulated home, built with its poses as given, as a prior, and without them.
+
+python benchmarks/given_poses.py --seeds 1,2,3,4,5 --json benchmarks/results/given_poses.json
+
+The recording is like Record3D's: depth of 256 x 192 with a LiDAR's noise and confidence, ARKit's poses with a drift of
+1 % and a jump (`simulation/phone.py`). ATE after a rigid alignment; tilt is the angle between the memory's vertical
+and the true one; instances by boxes of the truth at an overlap of 0.25 and 0.5.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, run_list3r, write_json
+
+import list3r
+from benchmarks.simulation.phone import write_phone_walk
+from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
+from list3r.evaluation.trajectory import evaluate_trajectory, read_tum
+from list3r.simulation.dataset import WalkSettings
+from list3r.simulation.walk import PathSettings
+
+PACE = PathSettings(fps=10.0, speed_m_s=1.0, turn_deg_s=70.0)
+"""A brisk walk, of which every third picture of a phone is kept."""
+MODES = ("given", "prior", "estimate")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="1,2,3,4,5")
+    parser.add_argument("--modes", default=",".join(MODES))
+    parser.add_argument("--frames", type=int, help="cut the walks short")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
+    words = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed in map(int, words.seeds.split(",")):
+            folder = (words.keep or Path(scratch)) / f"seed-{seed}"
+            if not (folder / "truth.json").exists():
+                write_phone_walk(folder, WalkSettings(seed=seed, frames=words.frames, path=PACE))
+            for mode in words.modes.split(","):
+                rows.append({"seed": seed, "poses": mode, **measured(folder, mode)})
+                print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    mean = {mode: average([r for r in rows if r["poses"] == mode]) for mode in words.modes.split(",")}
+    print(machine())
+    print(json.dumps(mean, indent=1))
+    write_json(words.json, {"mean": mean, "rows": rows})
+
+
+def measured(folder: Path, mode: str) -> dict[str, Any]:
+    """Build one memory and hold it against the truth."""
+    memory = folder / f"{mode}.l3r"
+    memory.unlink(missing_ok=True)
+    _, usage = run_list3r(
+        "build", str(folder / "walk.r3d"), "-m", str(memory), "--poses", mode, "--workers", "1", "--preset", "cpu"
+    )
+    with list3r.open(memory) as scene:
+        scene.export("json", folder / f"{mode}.json")
+        scene.export("tum", folder / f"{mode}.txt")
+    truth, estimate = read_tum(folder / "groundtruth.txt"), read_tum(folder / f"{mode}.txt")
+    errors = evaluate_trajectory(truth, estimate)
+    S_truth_scene = alignment_of(truth, estimate, with_scale=False)
+    scores = evaluate_scene(read_scene(folder / f"{mode}.json"), read_scene(folder / "truth.json"), S_truth_scene)
+    tilt = np.degrees(np.arccos(np.clip(S_truth_scene.rotation[2, 2], -1.0, 1.0)))
+    row = {"ate_cm": round(100 * errors.ate_se3_m.rmse, 2), "posed": errors.pairs, "tilt_deg": round(float(tilt), 2)}
+    for overlap in ("0.25", "0.50"):
+        found = scores[f"instances_{overlap}"]
+        row |= {f"recall_{overlap}": found["recall"], f"precision_{overlap}": found["precision"]}
+    row["duplicates"] = scores["instances_0.25"]["duplicates"]
+    return row | {"wall_s": usage["wall_s"]}
+
+
+def average(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Means of the figures over walks."""
+    return {k: round(statistics.fmean(r[k] for r in rows), 3) for k in rows[0] if k not in ("seed", "poses")}
+
+
+if __name__ == "__main__":
+    main()

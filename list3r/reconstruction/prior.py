@@ -1,0 +1,80 @@
+"""Poses that are given but imperfect: where they jump, and how a chunk lies in their world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.reconstruction.poses import angle_deg, is_rigid
+
+Poses = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """How far given poses are believed from one frame to the next."""
+
+    shift_m: float = 0.002
+    """Deviation of a step, metres; what visual-inertial odometry jitters by."""
+    shift_share: float = 0.02
+    """Deviation of a step by its length: twice the drift that ARKit is known for."""
+    turn_deg: float = 0.1
+    """Deviation of the turn of a step."""
+    correlated: float = 30.0
+    """So many of a picture's pairs tell as much as one: neighbours err alike."""
+    jump_m: float = 0.04
+    """What a pose moves against what depth shows from one frame to the next is a jump beyond this,"""
+    jump_deg: float = 1.5
+    """or beyond this turn."""
+
+
+def given_step(before: Poses | None, after: Poses | None) -> Poses | None:
+    """Return the motion T_before_after between two given poses (4, 4); None where one is missing or no rigid motion."""
+    if before is None or after is None or not (is_rigid(before) and is_rigid(after)):
+        return None
+    return np.asarray(np.linalg.inv(before) @ after)
+
+
+def steady_runs(T_chunk_cam: Poses, T_source_cam: Poses, settings: PriorSettings) -> list[NDArray[np.int64]]:
+    """Return runs of frames within which the given poses do not jump against those of the chunk.
+
+    Both have shape (F, 4, 4); frames where one is NaN belong to no run.
+    """
+    known = np.flatnonzero(np.isfinite(T_chunk_cam).all(axis=(1, 2)) & np.isfinite(T_source_cam).all(axis=(1, 2)))
+    if not len(known):
+        return []
+    T_source_chunk = T_source_cam[known] @ np.linalg.inv(T_chunk_cam[known])
+    breaks = []
+    for k in range(1, len(known)):
+        here = T_source_chunk[k] @ T_chunk_cam[known[k]]
+        held = T_source_chunk[k - 1] @ T_chunk_cam[known[k]]
+        apart = np.linalg.norm(here[:3, 3] - held[:3, 3])
+        if apart > settings.jump_m or angle_deg(np.linalg.inv(held) @ here) > settings.jump_deg:
+            breaks.append(k)
+    return [np.asarray(run, np.int64) for run in np.split(known, breaks)]
+
+
+def mean_alignment(T_chunk_cam: Poses, T_source_cam: Poses) -> Poses:
+    """Return T_source_chunk (4, 4) that lays cameras on their given poses, on average. Both have shape (F, 4, 4)."""
+    U, _, Vt = np.linalg.svd((T_source_cam[:, :3, :3] @ T_chunk_cam[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
+    out = np.eye(4)
+    out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    out[:3, 3] = T_source_cam[:, :3, 3].mean(axis=0) - out[:3, :3] @ T_chunk_cam[:, :3, 3].mean(axis=0)
+    return out
+
+
+def stacked(poses: Sequence[Poses | None]) -> Poses:
+    """Return poses as one array, NaN where one is missing or no rigid motion. Shape (F, 4, 4)."""
+    missing = np.full((4, 4), np.nan)
+    return np.stack([missing if T is None or not is_rigid(T) else T for T in poses])
+
+
+def source_from_chunk(
+    T_chunk_cam: Poses, posed: NDArray[np.bool_], T_source_cam: Poses, settings: PriorSettings
+) -> Poses | None:
+    """Return T_source_chunk (4, 4) by the frames after the last jump; None where no frame has both poses."""
+    runs = steady_runs(np.where(posed[:, None, None], T_chunk_cam, np.nan), T_source_cam, settings)
+    return mean_alignment(T_chunk_cam[runs[-1]], T_source_cam[runs[-1]]) if runs else None

@@ -1,0 +1,133 @@
+"""Poses that are given but imperfect: a start and a weight, corrected by what is seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from list3r.association.overlap.prior_edge import PriorEdgeSettings, prior_edge
+from list3r.frames.base import Frame, SourceInfo
+from list3r.memory.errors import OptionError
+from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, FrameSamples, LocalLibrary
+from list3r.pipeline.session import check_buildable, resolve_settings
+from list3r.pipeline.settings import BuildSettings
+from list3r.reconstruction.prior import PriorSettings, source_from_chunk, steady_runs
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
+from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, walk
+
+JUMP = 12
+
+
+def imperfect(truth: np.ndarray) -> np.ndarray:
+    """The poses with lengths 2 % too long and a jump of 10 cm and 4 degrees."""
+    out = truth.copy()
+    out[:, :3, 3] = truth[0, :3, 3] + 1.02 * (truth[:, :3, 3] - truth[0, :3, 3])
+    jump = np.eye(4)
+    jump[:3, :3] = rotation_exp(np.array([0.0, 0.0, np.radians(4.0)]))
+    jump[:3, 3] = 0.1, 0.0, 0.0
+    out[JUMP:] = jump @ out[JUMP:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    return walk(45)[:20]
+
+
+@pytest.fixture(scope="module")
+def frames(truth: np.ndarray) -> list[Frame]:
+    return [replace(f, T_source_cam=T) for f, T in zip(frames_along(truth), imperfect(truth), strict=True)]
+
+
+def test_what_is_seen_corrects_drift_and_jump(frames: list[Frame], truth: np.ndarray) -> None:
+    given = RgbdReconstructor(poses="given")(frames, CAMERA)
+    prior = RgbdReconstructor(poses="prior")(frames, CAMERA)
+    assert prior.posed.all()
+    assert pose_errors(prior.T_chunk_cam, truth)[0].max() < 0.01
+    assert pose_errors(given.T_chunk_cam, truth)[0].max() > 0.05
+
+
+def test_the_chunk_lies_in_the_world_that_the_source_ends_in(frames: list[Frame]) -> None:
+    made = RgbdReconstructor(poses="prior")(frames, CAMERA)
+    given = np.stack([f.T_source_cam for f in frames if f.T_source_cam is not None])
+    apart = np.linalg.norm(made.T_chunk_cam[:, :3, 3] - given[:, :3, 3], axis=1)
+    assert apart[JUMP:].max() < 0.02
+    assert apart[:JUMP].max() > 0.05
+
+
+def test_frames_that_show_nothing_follow_the_prior(truth: np.ndarray) -> None:
+    dark = [replace(black(f), depth=f.depth) if 6 <= k < 10 else f for k, f in enumerate(frames_along(truth))]
+    empty = [replace(f, depth=np.where(f.depth > 0, 1.5, 0).astype(np.float32)) if 6 <= k < 10 else f
+             for k, f in enumerate(dark) if f.depth is not None]  # fmt: skip
+    made = RgbdReconstructor(poses="prior")(empty, CAMERA)
+    assert made.posed.all()
+    assert pose_errors(made.T_chunk_cam, truth)[0].max() < 0.05
+
+
+def test_runs_end_where_poses_jump(truth: np.ndarray) -> None:
+    runs = steady_runs(truth, imperfect(truth), PriorSettings())
+    assert [run.tolist() for run in runs] == [list(range(JUMP)), list(range(JUMP, len(truth)))]
+    missing = imperfect(truth)
+    missing[3] = np.nan
+    assert 3 not in np.concatenate(steady_runs(truth, missing, PriorSettings()))
+    assert source_from_chunk(truth, np.zeros(len(truth), bool), missing, PriorSettings()) is None
+
+
+def chunk(T_chunk_cam: np.ndarray, T_source_cam: np.ndarray | None) -> ChunkResult:
+    count = len(T_chunk_cam)
+    return ChunkResult(
+        index=1,
+        frame_indices=np.arange(count),
+        times_s=np.arange(count) / 10.0,
+        posed=np.ones(count, bool),
+        T_chunk_cam=T_chunk_cam,
+        T_source_cam=T_source_cam,
+        intrinsics=(1.0, 1.0, 0.0, 0.0),
+        image_size=(2, 2),
+        scale_kind="metric",
+        keyframes=(),
+        samples=FrameSamples.empty(),
+        library=LocalLibrary((), np.zeros((0, 2), np.int32), "geometric-color@1/64"),
+    )
+
+
+def test_the_edge_of_a_prior_says_where_the_chunk_lies_and_how_far_it_may_have_drifted(truth: np.ndarray) -> None:
+    moved = np.eye(4)
+    moved[:3, 3] = 1.0, 2.0, 3.0
+    u = ChunkRow(1, 1, 0, 0, 9, 1, Sim3.identity(), (1.0, 1.0, 0.0, 0.0), (2, 2), "metric")
+    before = [FrameRow(1, k, 0.1 * k, 1, "posed", T) for k, T in enumerate(truth)]
+    edge = prior_edge(u, before, chunk(np.linalg.inv(moved) @ truth, truth), 2, PriorEdgeSettings())
+    assert edge is not None and edge.kind == "prior" and edge.covariance is not None
+    assert np.allclose(edge.S_v_u.translation, -moved[:3, 3]) and np.allclose(edge.S_v_u.rotation, np.eye(3))
+    far = truth.copy()
+    far[:, :3, 3] *= 10.0
+    loose = prior_edge(u, before, chunk(far, far), 2, PriorEdgeSettings())
+    assert loose is not None and loose.covariance is not None
+    assert np.trace(loose.covariance[:3, :3]) > np.trace(edge.covariance[:3, :3])
+    assert prior_edge(u, before, chunk(truth, None), 2, PriorEdgeSettings()) is None
+
+
+def info(**changes: object) -> SourceInfo:
+    known = {"kind": "record3d", "path": "walk.r3d", "frame_count": 9, "fps": 30.0, "camera": CAMERA, "z_up": True}
+    known |= {"has_depth": True, "has_poses": True, "scale_kind": "metric", "fingerprint": ""}
+    return SourceInfo(**(known | changes))  # type: ignore[arg-type]
+
+
+def test_the_source_says_which_way_is_up_where_its_poses_are_used() -> None:
+    used = {poses: resolve_settings(BuildSettings(poses=poses), info()).up for poses in ("given", "prior", "estimate")}
+    assert used == {"given": "source", "prior": "source", "estimate": "planes"}
+    assert resolve_settings(BuildSettings(poses="prior"), info(z_up=False)).up == "planes"
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [({"has_poses": False}, "no poses"), ({"poses_metric": False}, "unit of their own")],
+)
+def test_a_prior_that_cannot_serve_is_refused(changes: dict[str, object], why: str) -> None:
+    with pytest.raises(OptionError, match=why):
+        check_buildable(info(**changes), BuildSettings(reconstruction="rgbd", poses="prior"))
+    with pytest.raises(OptionError, match="of rgbd"):
+        check_buildable(info(), BuildSettings(reconstruction="sfm", poses="prior"))
