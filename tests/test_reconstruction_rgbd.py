@@ -139,7 +139,7 @@ def test_what_is_missing_is_named(frames: list[Frame]) -> None:
         RgbdReconstructor()([replace(f, depth=None) for f in frames[:3]], CAMERA)
     with pytest.raises(TrackingError, match="--poses estimate"):
         RgbdReconstructor(poses="given")([replace(f, T_source_cam=None) for f in frames[:3]], CAMERA)
-    with pytest.raises(OptionError, match="given or estimate"):
+    with pytest.raises(OptionError, match="given, prior or estimate"):
         RgbdReconstructor(poses="guess")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,6 @@ def put(path: Path, data: bytes | str) -> None:
     path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
-def numbers(values: NDArray[np.float64], digits: int = 9) -> str:
+def numbers(values: NDArray[Any], digits: int = 9) -> str:
     """Return numbers with spaces between."""
     return " ".join(f"{v:.{digits}g}" for v in np.ravel(values))
