@@ -12,4 +12,7 @@ processes="${LIST3R_TEST_PROCESSES:-2}"
 threads=$(($(nproc) / processes))
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-$((threads > 1 ? threads : 1))}"
 export OPENBLAS_NUM_THREADS="${OPENBLAS_NUM_THREADS:-$OMP_NUM_THREADS}"
-python -m pytest -n "$processes" "$@"
+# Compiled modules are kept, so that the hundreds of processes that tests start need not compile them again. Each process
+# of the suite takes a run of neighbouring tests, so that few fixtures of a file are made twice.
+unset PYTHONDONTWRITEBYTECODE
+python -m pytest -n "$processes" --dist worksteal "$@"

@@ -20,13 +20,14 @@ from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 
-OPTIONS = ("--chunk", "40", "--overlap", "12")
+OPTIONS = ("--chunk", "20", "--overlap", "6")
 
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short simulated walk: four chunks of forty frames."""
-    return write_walk(tmp_path_factory.mktemp("walk") / "walk", WalkSettings(seed=3, frames=120), workers=2)
+    """A short simulated walk: three chunks of twenty frames."""
+    settings = WalkSettings(seed=3, frames=48, size=(192, 144))
+    return write_walk(tmp_path_factory.mktemp("walk") / "walk", settings, workers=1)
 
 
 def start(walk: Path, memory: Path, *more: str) -> subprocess.Popen[str]:
@@ -87,7 +88,7 @@ def test_the_camera_is_followed_and_things_are_found(walk: Path, memory: Path) -
         assert store.verify() == []
         assert store.sessions.all()[0].state == "complete"
         poses = store.trajectory.poses()
-        assert len(poses) == 120
+        assert len(poses) == 48
         estimate = Trajectory(np.array([f.time_s for f, _ in poses]), np.stack([S.as_matrix() for _, S in poses]))
         assert evaluate_trajectory(read_tum(walk / "groundtruth.txt"), estimate).ate_se3_m.rmse < 0.03
         assert len(store.instances.all(structure=False)) >= 4
@@ -104,7 +105,7 @@ def test_a_killed_build_is_sound_and_resumes_to_the_same_memory(walk: Path, memo
     process.communicate()
     with Store.open(path) as store:
         assert store.verify() == []
-        assert 2 <= len(store.chunks.all()) < 4
+        assert 2 <= len(store.chunks.all()) < 3
         assert store.sessions.all()[0].state == "building"
     build(walk, path, "--poses", "estimate", "--workers", "1", "--resume")
     check_same(path, memory)
@@ -130,8 +131,8 @@ def test_the_number_of_workers_does_not_change_the_memory(walk: Path, memory: Pa
 
 
 def test_given_poses_are_kept(walk: Path, tmp_path: Path) -> None:
-    settings = list3r.BuildSettings(poses="given", chunks=ChunkSettings(40, 12))
-    with list3r.build(walk, tmp_path / "given.l3r", settings=settings) as memory:
+    settings = list3r.BuildSettings(poses="given", chunks=ChunkSettings(20, 6))
+    with list3r.build(walk, tmp_path / "given.l3r", settings=settings, workers=1) as memory:
         poses = memory.store.trajectory.poses()
         estimate = Trajectory(np.array([f.time_s for f, _ in poses]), np.stack([S.as_matrix() for _, S in poses]))
         assert evaluate_trajectory(read_tum(walk / "groundtruth.txt"), estimate).ate_se3_m.rmse < 1e-3

@@ -17,6 +17,7 @@ from list3r.cli.app import app
 from list3r.exporters.registry import FORMATS
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
+from tests.program import as_user, in_process
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +30,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: str | Path) -> str:
-    command = [sys.executable, "-m", "list3r", *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    result = in_process(*arguments)
     assert result.returncode == 0, result.stderr
     return result.stdout
 
@@ -146,8 +146,7 @@ def test_verify_ends_with_1_on_damage(room: Path, tmp_path: Path) -> None:
     damaged.write_bytes(room.read_bytes())
     with Store.open(damaged, writable=True) as store, store.transaction():
         store.connection._database.execute("UPDATE supports SET crc = crc + 1 WHERE local_id = 0")
-    command = [sys.executable, "-m", "list3r", "verify", str(damaged)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    result = as_user("verify", damaged)
     assert result.returncode == 1
     assert "supports 1:0" in result.stdout
 
@@ -173,4 +172,4 @@ def test_the_face_for_python(room: Path) -> None:
 
 
 def test_the_version_is_the_package_s() -> None:
-    assert run("--version").strip() == f"list3r {list3r.__version__}"
+    assert as_user("--version").stdout.strip() == f"list3r {list3r.__version__}"

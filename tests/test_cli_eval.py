@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from list3r.cli import app
 from list3r.evaluation.covisibility import Covisibility, write_covisibility
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Frame
@@ -25,6 +21,7 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 from list3r.memory.store.store import Store
 from tests.conftest import chunk_result, write_small_room
+from tests.program import in_process as run
 from tests.test_cli_errors import check_refused, write_frames
 
 CHUNKS = 5
@@ -32,15 +29,6 @@ LOOPS = (
     ((1, 4), (2, 33), True, "41 features agree, 63% seen by both", {"s_det": 0.82, "s_sem": 0.9, "s_rel": 0.7}),
     ((2, 4), (12, 35), False, "only 3 of 43 matched features agree on a pose", {"s_det": 0.91, "s_sem": 0.2}),
 )
-
-
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """The program without a process of its own, which would take a second to start."""
-    out, err = io.StringIO(), io.StringIO()
-    words = [str(a) for a in arguments]
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = app.run(words)
-    return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
 
 
 def write_walk_memory(path: Path, parts: int = 1) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra
-from scipy.stats import chi2
 
 from list3r.association.graph.loop_trust import NO_TRUST
 from list3r.association.graph.pose_graph import (
@@ -30,6 +29,7 @@ from list3r.association.graph.pose_graph import (
     problem_of,
 )
 from list3r.association.graph.solver import adjoint, stack, unstack
+from list3r.association.quantiles import chi2_quantile
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -75,7 +75,7 @@ def extend(
         poses = problem.solve(poses, np.ones(len(active)), 5)
     squares = problem.squares(poses)
     covariance = _hanging(placed.covariances[here], active[first], here, weights[first])
-    if len(active) > 1 and float(squares.max()) > chi2.ppf(chosen.fits_quantile, problem.size):
+    if len(active) > 1 and float(squares.max()) > chi2_quantile(chosen.fits_quantile, problem.size):
         started = replace(placed, S_graph_chunk=ChainMap({new: start}, _under(placed.S_graph_chunk)))
         moved = _moved(new, here, edges, started, metric, chosen)
         placed = replace(placed, S_graph_chunk=ChainMap(moved[0], _under(placed.S_graph_chunk)))
@@ -116,7 +116,7 @@ def _moved(
     poses = stack([poses_of[k] for k in ids])
     own = np.isin(used, mine)
     fresh = own & (loop == 1) & settings.robust
-    limit = float(chi2.ppf(settings.trust.loop_quantile, problem.size))
+    limit = chi2_quantile(settings.trust.loop_quantile, problem.size)
     trust = np.ones(len(used))
     for _ in range(3):
         poses = problem.solve(poses, trust, 1)

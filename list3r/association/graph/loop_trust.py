@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from list3r.association.graph.marginals import Marginals, marginals, variance_factors
 from list3r.association.graph.solver import GraphProblem, adjoint
+from list3r.association.quantiles import chi2_quantile
 from list3r.memory.geometry import Sim3
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ def judge(
 
 def _limits(problem: GraphProblem, loop: NDArray[np.bool_], settings: TrustSettings) -> Array:
     """Return the largest squared Mahalanobis distance at which each edge is believed. Shape (E,)."""
-    limit = chi2.ppf(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
+    limit = chi2_quantile(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
     return np.asarray(limit)
 
 
@@ -203,7 +203,7 @@ def drift_factor(
 
     Up to half of the loops may be false.
     """
-    ratio = chain_squares(problem, start, tree, loop) / chi2.ppf(0.5, problem.size)
+    ratio = chain_squares(problem, start, tree, loop) / chi2_quantile(0.5, problem.size)
     pooled = np.concatenate([ratio, np.ones(settings.prior_loops)])
     return float(np.clip(np.median(pooled), 1.0, settings.most_drift**2))
 

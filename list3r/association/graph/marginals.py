@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from list3r.association.graph.solver import GraphProblem
+from list3r.association.quantiles import chi2_quantile, f_quantile
 from list3r.memory.geometry import Sim3
 
 Array = NDArray[np.float64]
@@ -64,4 +63,4 @@ def variance_factors(
 def widening(freedom: float) -> float:
     """Return the factor on a covariance whose scale was estimated with so many degrees of freedom: F against chi^2 at
     95 %."""
-    return float(3.0 * f_distribution.ppf(0.95, 3, freedom) / chi2.ppf(0.95, 3))
+    return 3.0 * f_quantile(0.95, 3, freedom) / chi2_quantile(0.95, 3)

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from list3r.association.quantiles import chi2_quantile, f_quantile
 from list3r.memory.geometry import skew
 
 Array = NDArray[np.float64]
@@ -179,4 +178,4 @@ def _small_sample(size: int, count: int) -> float:
     the kernel's own uncertainty, are from simulation (4 to 100 groups, Gaussian noise, outliers, errors by frame).
     """
     freedom = max(size * (count - 1) / 4, 3.0)
-    return 1.1 * float(size * f_distribution.ppf(0.95, size, freedom) / chi2.ppf(0.95, size))
+    return 1.1 * size * f_quantile(0.95, size, freedom) / chi2_quantile(0.95, size)
