@@ -43,7 +43,7 @@ COMMANDS = (
     "inspect build demo info list show export verify doctor query.nearest query.within query.relations query.similar"
     " eval.trajectory eval.cloud eval.instances eval.revisits query.find query.seen query.path"
     " query.changes update merges undo merge split label delete repair"
-    " embed detect scale precompute models.list models.fetch"
+    " embed detect scale precompute models.list models.fetch batch"
 ).split()
 
 

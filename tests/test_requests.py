@@ -78,7 +78,7 @@ def test_the_sessions_of_a_memory_say_how_they_were_made(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("run", "said"),
     [
-        (RunOptions(workers=0), "--workers 0"),
+        (RunOptions(workers=-1), "--workers -1"),
         (RunOptions(resume=True, force=True), "give one of them"),
         (RunOptions(scale_anchor="long"), "long"),
         (RunOptions(detector_classes=Path("names.txt")), "--detector FILE"),

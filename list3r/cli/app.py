@@ -18,6 +18,7 @@ import typer
 from list3r.cli.ask import memory as memory_commands
 from list3r.cli.ask import picture as picture_commands
 from list3r.cli.ask import query as query_commands
+from list3r.cli.build import batch as batch_commands
 from list3r.cli.build import commands as build_commands
 from list3r.cli.build import update as update_commands
 from list3r.cli.edit import commands as edit_commands
@@ -56,6 +57,7 @@ for module in (
     model_commands,
     mcp_commands,
     view_commands,
+    batch_commands,
 ):
     module.register(app)
 

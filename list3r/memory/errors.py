@@ -71,6 +71,8 @@ EXTRA_OF_PACKAGE = {
     "open3d": "open3d",
     "mcp": "mcp",
     "viser": "view",
+    "fsspec": "batch",
+    "ray": "ray",
     "transformers": "models",
     "huggingface_hub": "models",
     "safetensors": "models",

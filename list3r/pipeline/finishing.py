@@ -28,8 +28,8 @@ class FinishingError(List3rError):
 
 def check_run(run: RunOptions) -> None:
     """Raise `OptionError` for what cannot be done, before hours are spent."""
-    if run.workers is not None and run.workers < 1:
-        raise OptionError(f"--workers {run.workers}: at least 1 process is needed")
+    if run.workers is not None and run.workers < 0:
+        raise OptionError(f"--workers {run.workers}: give how many processes to start, or 0 for none")
     if run.resume and run.force:
         raise OptionError("--resume goes on with what is there and --force gives it up; give one of them")
     if run.scale_anchor is not None:

@@ -108,7 +108,9 @@ class RunOptions:
         default="research",
         metadata=option("permissive (nothing non-commercial, gated, copyleft or of own terms), research, or any."),
     )
-    workers: int | None = field(default=None, metadata=option("Processes; default: cores, up to 4.", "N"))
+    workers: int | None = field(
+        default=None, metadata=option("Processes; 0: none beside this one; default: cores, up to 4.", "N")
+    )
     scale_anchor: str | None = field(
         default=None,
         metadata=option(

@@ -144,7 +144,8 @@ def add_chunks(
     watch.show(len(store.frames.all(session)), count)
     known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
-    workers = min(job.run.workers or usual_workers(job.settings), len(plan.tasks))
+    asked = job.run.workers
+    workers = min(usual_workers(job.settings) if asked is None else asked, len(plan.tasks))
     with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
         for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):

@@ -1,5 +1,7 @@
-"""Processes of a build: `pool` starts and ends them, `process` is what runs in one."""
+"""Processes of a build and of a batch: `pool` keeps the order of tasks, `tasks` does not, `process` runs in one."""
 
-from list3r.pipeline.workers.pool import OrderedPool, WorkerError, default_workers
+from list3r.pipeline.workers.pool import OrderedPool, default_workers
+from list3r.pipeline.workers.tasks import TaskPool
+from list3r.pipeline.workers.worker import WorkerError
 
-__all__ = ["OrderedPool", "WorkerError", "default_workers"]
+__all__ = ["OrderedPool", "TaskPool", "WorkerError", "default_workers"]

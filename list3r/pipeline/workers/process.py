@@ -66,6 +66,11 @@ def _prepare(script: str) -> None:
         os.dup2(2, 1)
     if script:
         sys.modules["__main__"] = sys.modules["__mp_main__"] = _Script(script)
+    one_thread()
+
+
+def one_thread() -> None:
+    """Let OpenCV and BLAS use one thread in this process from now on."""
     import cv2
     from threadpoolctl import threadpool_limits
 

@@ -188,6 +188,11 @@ class Chunks:
                 total[stage] = total.get(stage, 0.0) + seconds
         return total
 
+    def forget_seconds(self) -> None:
+        """Forget the seconds spent by stage, in which two builds of one video differ."""
+        self._measured.set("seconds != ?", ("{}",), seconds={})
+        self._crcs = None
+
     def _field(self, field: str, chunk_id: int) -> Any:
         return self._measured.values(field, "chunk_id = ?", (chunk_id,))[0]
 

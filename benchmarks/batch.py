@@ -1,0 +1,140 @@
+"""Many short videos: local processes and Ray make the same files; nothing is lost or built twice while processes die.
+
+python benchmarks/batch.py --videos 200 --engines local ray --worker-kills 20 --driver-kills 2
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+from list3r.batch.sealing import file_hash
+from list3r.simulation.dataset import WalkSettings, write_walk
+
+
+def main() -> None:
+    words = argparse.ArgumentParser(description=__doc__)
+    words.add_argument("--folder", type=Path, default=Path("batch-benchmark"), help="Videos, memories, result.")
+    words.add_argument("--videos", type=int, default=200)
+    words.add_argument("--frames", type=int, default=8)
+    words.add_argument("--size", type=int, nargs=2, default=(160, 120))
+    words.add_argument("--engines", nargs="+", default=["local"], choices=["local", "ray"])
+    words.add_argument("--worker-kills", type=int, default=20)
+    words.add_argument("--driver-kills", type=int, default=2)
+    words.add_argument("--seed", type=int, default=1)
+    asked = words.parse_args()
+    videos = _videos(asked.folder / "videos", asked.videos, asked.frames, tuple(asked.size))
+    result: dict[str, object] = {"videos": asked.videos, "frames": asked.frames, "size": list(asked.size)}
+    print(f"{asked.videos} videos of {asked.frames} frames and one file that is no video")
+    reference: dict[str, str] | None = None
+    for name, engine, jobs in _runs(asked.engines):
+        out = asked.folder / f"out-{name}"
+        kills = (asked.worker_kills, asked.driver_kills) if name.endswith("killed") else (0, 0)
+        with _cluster() if engine == "ray" else contextlib.nullcontext("") as address:
+            command = [sys.executable, "-m", "list3r", "batch", str(videos), "--out", str(out), "--retries", "100"]
+            command += ["--engine", engine, *(["--address", address] if address else []), *jobs]
+            found = _run(command, out, kills, random.Random(asked.seed))
+        hashes = {p.name: file_hash(p) for p in sorted(out.glob("*.l3r"))}
+        reference = reference or hashes
+        found |= {"files": len(hashes), "equal": hashes == reference, **_told(out)}
+        result[name] = found
+        print(name, json.dumps(found), flush=True)
+    (asked.folder / "batch.json").write_text(json.dumps(result, indent=2))
+
+
+def _runs(engines: list[str]) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield name, engine and further options of each run; the first is what the others are compared with."""
+    yield "one-process", "local", ["--jobs", "1"]
+    for engine in engines:
+        yield engine, engine, []
+        yield f"{engine}-killed", engine, []
+
+
+def _videos(folder: Path, count: int, frames: int, size: tuple[int, int]) -> Path:
+    for k in range(count):
+        if not (folder / f"v{k:04d}").exists():
+            write_walk(folder / f"v{k:04d}", WalkSettings(seed=k, frames=frames, size=size))
+    (folder / "poisoned.mp4").write_bytes(b"not a video")
+    return folder
+
+
+@contextlib.contextmanager
+def _cluster() -> Iterator[str]:
+    """Two Ray nodes of one core each on this machine; the address of the first."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster.add_node(num_cpus=1)
+    try:
+        yield cluster.address
+    finally:
+        cluster.shutdown()
+
+
+def _run(command: list[str], out: Path, kills: tuple[int, int], chance: random.Random) -> dict[str, object]:
+    """Run the command until it ends by itself, ending its workers and itself at random meanwhile."""
+    workers_left, drivers_left = kills
+    began, runs, first_seen, rewritten = time.monotonic(), 0, dict[str, int](), set[str]()
+    while True:
+        driver = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        runs += 1
+        started, due = time.monotonic(), time.monotonic() + chance.uniform(1, 6)
+        while driver.poll() is None:
+            time.sleep(0.05)
+            for path in out.glob("*.l3r"):
+                with contextlib.suppress(FileNotFoundError):
+                    if first_seen.setdefault(path.name, path.stat().st_ino) != path.stat().st_ino:
+                        rewritten.add(path.name)
+            if time.monotonic() < due:
+                continue
+            due = time.monotonic() + chance.uniform(0.5, 5)
+            if drivers_left and time.monotonic() - started > 15:
+                drivers_left -= 1
+                driver.kill()
+            elif workers_left and (busy := _workers(driver.pid, command)):
+                workers_left -= 1
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(chance.choice(busy), signal.SIGKILL)
+        if driver.wait() >= 0:
+            seconds = time.monotonic() - began
+            killed = {"worker_kills": kills[0] - workers_left, "driver_kills": kills[1] - drivers_left}
+            return {"status": driver.returncode, "seconds": round(seconds, 1), "runs": runs, **killed} | {
+                "rewritten": sorted(rewritten)
+            }
+
+
+def _workers(driver: int, command: list[str]) -> list[int]:
+    """Processes that work on a task now."""
+    found = []
+    with contextlib.suppress(psutil.Error):
+        if "ray" not in command:
+            found = [p.pid for p in psutil.Process(driver).children()]
+        else:
+            everyone = psutil.Process().children(recursive=True)
+            found = [p.pid for p in everyone if "ray::run_task" in " ".join(p.cmdline())]
+    return found
+
+
+def _told(out: Path) -> dict[str, object]:
+    """What the manifest says: tasks by state, and how often any was built."""
+    with contextlib.closing(sqlite3.connect(out / "batch.sqlite")) as database:
+        states = dict(database.execute("SELECT state, count(*) FROM tasks GROUP BY state").fetchall())
+        attempts = dict(database.execute("SELECT outcome, count(*) FROM attempts GROUP BY outcome").fetchall())
+        twice = database.execute("SELECT memory FROM attempts WHERE built GROUP BY memory HAVING count(*) > 1")
+        return {"states": states, "attempts": attempts, "built_twice": [name for (name,) in twice]}
+
+
+if __name__ == "__main__":
+    main()

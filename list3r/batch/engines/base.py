@@ -1,0 +1,74 @@
+"""The seam between a batch and what runs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from list3r.batch.work import BatchJob, Outcome
+from list3r.memory.errors import OptionError
+
+
+@dataclass(frozen=True)
+class TaskResources:
+    """What one task takes."""
+
+    cpus: int = 1
+    memory_gb: float | None = None
+    """GiB; None: not counted."""
+    gpus: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.cpus < 1:
+            raise OptionError(f"--cpus {self.cpus}: a task takes at least 1")
+        if self.memory_gb is not None and not self.memory_gb > 0:
+            raise OptionError(f"--task-memory {self.memory_gb}: give GiB above 0")
+        if not self.gpus >= 0:
+            raise OptionError(f"--gpus {self.gpus}: give 0 or more")
+
+
+class Engine(Protocol):
+    """Places tasks and says how they ended. A task whose process dies is `lost`; to try it again is up to the batch."""
+
+    window: int
+    """Tasks that are submitted at once, at most: more would only wait inside the engine."""
+
+    def submit(self, job: BatchJob) -> None:
+        """Take a task."""
+        ...
+
+    def as_completed(self) -> Iterator[Outcome]:
+        """Yield tasks as they end, until none is left; more may be submitted meanwhile."""
+        ...
+
+    def cancel(self) -> None:
+        """End all tasks at once and let the engine go."""
+        ...
+
+
+def make_engine(name: str, resources: TaskResources, jobs: int | None, address: str | None) -> Engine:
+    """Return the engine of a name. Raises `OptionError` for one that is not known."""
+    known: dict[str, Callable[[], Engine]] = {
+        "local": lambda: _local(resources, jobs),
+        "ray": lambda: _ray(resources, jobs, address),
+    }
+    if name not in known:
+        raise OptionError(f"--engine {name} is not known; choose one of: {', '.join(known)}")
+    if address is not None and name != "ray":
+        raise OptionError(f"--address {address} is of a Ray cluster; give it with --engine ray")
+    if jobs is not None and jobs < 1:
+        raise OptionError(f"--jobs {jobs}: at least 1 task must run")
+    return known[name]()
+
+
+def _local(resources: TaskResources, jobs: int | None) -> Engine:
+    from list3r.batch.engines.local import LocalEngine
+
+    return LocalEngine(resources, jobs)
+
+
+def _ray(resources: TaskResources, jobs: int | None, address: str | None) -> Engine:
+    from list3r.batch.engines.ray import RayEngine
+
+    return RayEngine(resources, jobs, address)

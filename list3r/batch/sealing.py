@@ -1,0 +1,53 @@
+"""A finished memory as a file that depends on the video and the settings alone, byte for byte."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from list3r.memory.errors import MemoryFileError
+from list3r.memory.store.facts import Fact
+from list3r.memory.store.store import Store
+
+BATCH_KEYS = Fact[tuple[str, ...]]("batch_keys", tuple[str, ...], ())
+"""Keys of the tasks of a batch whose videos are in a memory, in their order."""
+
+
+def seal(memory: Path, sealed: Path, keys: Sequence[str], source: str) -> str:
+    """Write a finished memory to `sealed`; return the SHA-256 of the file.
+
+    What tells runs apart is left out: the seconds that stages took, where a fetched video lay (`source` is named
+    instead, for the last session), and how SQLite laid out its pages. Raises `MemoryFileError`.
+    """
+    with Store.open(memory, writable=True) as store, store.transaction():
+        store.chunks.forget_seconds()
+        store.facts[BATCH_KEYS] = tuple(keys)
+        last = store.sessions.all()[-1]
+        if last.source != source:
+            store.sessions.put(replace(last, source=source))
+    part = sealed.with_name(f"{sealed.name}.part")
+    part.unlink(missing_ok=True)
+    try:
+        with contextlib.closing(sqlite3.connect(memory)) as database:
+            database.execute("VACUUM INTO ?", (str(part),))
+    except sqlite3.Error as error:
+        part.unlink(missing_ok=True)
+        raise MemoryFileError(f"{sealed} cannot be written: {error}") from error
+    part.replace(sealed)
+    return file_hash(sealed)
+
+
+def batch_keys(memory: Path) -> tuple[str, ...]:
+    """Return the keys of the tasks whose videos are in a published memory. Raises `MemoryFileError`."""
+    with Store.open(memory) as store:
+        return store.facts[BATCH_KEYS]
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

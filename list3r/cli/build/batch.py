@@ -1,0 +1,139 @@
+"""batch: many videos, a memory each."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.build import source_options as src
+from list3r.cli.common import JsonOption, note, only, print_json, print_table, spread
+from list3r.cli.terminal import write
+from list3r.pipeline.request import BuildRequest, RunOptions
+
+if TYPE_CHECKING:
+    from list3r.batch.runner import BatchReport
+    from list3r.batch.work import Outcome
+
+_RUN = only("licence", "scale_anchor", "detector", "detector_classes")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("batch")(batch)
+
+
+@spread
+def batch(
+    videos: Annotated[
+        str,
+        typer.Argument(
+            metavar="MANIFEST|FOLDER", help="A file with a video a line, or what holds videos.", show_default=False
+        ),
+    ],
+    out: Annotated[str, typer.Option("--out", metavar="DIR", help="Folder or URL of the memories.")],
+    *,
+    engine: Annotated[str, typer.Option("--engine", help="What runs the tasks: local or ray.")] = "local",
+    address: Annotated[str | None, typer.Option("--address", help="Of the Ray cluster; default: RAY_ADDRESS.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Tasks side by side; default: what fits.")
+    ] = None,
+    cpus: Annotated[int, typer.Option("--cpus", metavar="N", help="Cores of one task.")] = 1,
+    task_memory: Annotated[
+        float | None, typer.Option("--task-memory", metavar="GIB", help="Memory of one task; default: not counted.")
+    ] = None,
+    gpus: Annotated[float, typer.Option("--gpus", metavar="N", help="GPUs of one task, or a share of one.")] = 0.0,
+    retries: Annotated[
+        int, typer.Option("--retries", metavar="N", help="Tries again where a process was ended from outside.")
+    ] = 3,
+    scratch: Annotated[
+        Path | None, typer.Option("--scratch", metavar="DIR", help="On each machine's own disk, for what is under way.")
+    ] = None,
+    state: Annotated[
+        Path | None, typer.Option("--state", metavar="FILE", help="The manifest; default: batch.sqlite in --out.")
+    ] = None,
+    element: Annotated[
+        int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
+    ] = None,
+    script: Annotated[
+        str | None, typer.Option("--print", metavar="WHAT", help="Print a script instead: slurm, an array job.")
+    ] = None,
+    onto: Annotated[bool, typer.Option("--onto", help="Add videos to memories that no batch made.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False,
+    request: BuildRequest,
+    words: src.SourceWords,
+    run: Annotated[RunOptions, _RUN],
+    json: JsonOption = False,
+) -> None:
+    """Build the memories of many videos, one task a video; given again it does what is not done.
+
+    Example: list3r batch walks/ --out memories/
+    """
+    from list3r.batch.engines.base import TaskResources, make_engine
+    from list3r.batch.runner import BatchSettings, run_batch, run_here
+    from list3r.batch.slurm import slurm_script
+    from list3r.batch.tasks import Asked, read_tasks
+    from list3r.memory.errors import OptionError
+    from list3r.pipeline.finishing import check_run
+
+    check_run(run)
+    resources = TaskResources(cpus, task_memory, gpus)
+    settings = BatchSettings(out, scratch, state, retries, 0 if cpus == 1 else cpus, onto, force)
+    groups = read_tasks(videos, Asked(lambda fields: replace(words, **fields).options(), request, run))
+    if script is not None:
+        if script != "slurm":
+            raise OptionError(f"--print {script} is not known; slurm is")
+        write(slurm_script(_without_print(sys.argv[1:]), len(groups), resources, jobs))
+        return
+    try:
+        if element is not None:
+            if not 0 <= element < len(groups):
+                raise OptionError(f"--only {element}: the memories are numbered 0 to {len(groups) - 1}")
+            report = run_here(groups[element], settings, _told(json))
+        else:
+            report = run_batch(groups, make_engine(engine, resources, jobs, address), settings, _told(json))
+    except KeyboardInterrupt:
+        note("", "interrupted; what is done stays, give the same command again to go on")
+        raise typer.Exit(1) from None
+    _say(report, json)
+    if report.failed:
+        raise typer.Exit(1)
+
+
+def _told(quiet: bool) -> Any:
+    """Return what says how tasks end, one line each on standard error."""
+
+    def told(outcome: Outcome, settled: int, total: int) -> None:
+        o = outcome
+        result = f"{o.frames} frames, {o.instances} things" if o.built else o.reason
+        note(f"[{settled}/{total}] {o.task.memory}: {o.state}, {result} ({o.seconds:.1f} s)")
+
+    return (lambda outcome, settled, total: None) if quiet else told
+
+
+def _say(report: BatchReport, json: bool) -> None:
+    if json:
+        print_json(report.as_dict())
+        return
+    failed = [
+        [r.memory, PurePosixPath(r.source).name, r.attempts, r.reason] for r in report.tasks if r.state == "failed"
+    ]
+    note(f"{report.done} done, {report.built} of them now; {report.failed} failed")
+    if failed:
+        print_table(failed, ["memory", "video", "attempts", "why"])
+
+
+def _without_print(words: list[str]) -> list[str]:
+    """Return the words of the command that is to be run by the script."""
+    out, skip = [], False
+    for word in words:
+        if skip or word.startswith("--print="):
+            skip = False
+        elif word == "--print":
+            skip = True
+        else:
+            out.append(word)
+    return out
