@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
 from list3r.pipeline.workers.process import one_thread
-from list3r.pipeline.workers.worker import WorkerJob, Worker
+from list3r.pipeline.workers.worker import Worker, WorkerJob
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

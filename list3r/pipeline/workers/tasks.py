@@ -9,7 +9,7 @@ from multiprocessing.connection import wait
 from typing import Generic, TypeVar
 
 from list3r.pipeline.workers.pool import LIVENESS_POLL_S
-from list3r.pipeline.workers.worker import WorkerJob, Worker, WorkerError
+from list3r.pipeline.workers.worker import Worker, WorkerError, WorkerJob
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
