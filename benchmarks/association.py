@@ -3,6 +3,11 @@
 python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FILE [--plot FILE]
 python benchmarks/association.py --quick --json FILE        # two presets, two seeds, all rows
 
+A run that was ended goes on where it was when it is started again with the same `--json` and commit.
+
+The presets opposite, night, alike, moved and halls are videos in which a place is seen again but looks otherwise
+(`benchmarks.simulation.returns`), with masks as discovery makes them in homes that it never saw.
+
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
 model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video,
 chunks, descriptors and joint windows, and chunks end at cuts in all of them but the first:
@@ -16,12 +21,14 @@ chunks, descriptors and joint windows, and chunks end at cuts in all of them but
 - cwgo-paper: iasm with the paper's weights of edges in the graph;
 - graph: iasm with covariances as weights and loops that can be switched off;
 - full: + nodes within chunks, what builds use;
-- full-no-instances: full with all instance evidence off: what instances are worth is the difference of the two.
+- full-no-instances: full with all instance evidence off (no `s_sem` and `s_rel`, no layout, no kinds, no registration
+  by things): what instances are worth is the difference of the two.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import tempfile
 import time
@@ -32,13 +39,14 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from machine import machine, write_json
+from machine import STARTED_AT, machine, write_json
 from numpy.typing import NDArray
 
 from list3r.pipeline.workers import OrderedPool
 
 Array = NDArray[np.float64]
 PRESETS = ("calm", "loop", "kidnap", "dynamic", "twins", "sparse", "corridor")
+RETURNS = ("opposite", "night", "alike", "moved", "halls")
 TITLES = {
     "vggt-long": "VGGT-Long as published",
     "vggt-long-cuts": "VGGT-Long, cuts given",
@@ -70,19 +78,20 @@ def main() -> None:
     if words.quick:
         words.presets, words.seeds = "kidnap,twins", "1,2"
     presets, variants = words.presets.split(","), words.variants.split(",")
-    for given, known in ((presets, PRESETS), (variants, TITLES)):
+    for given, known in ((presets, (*PRESETS, *RETURNS)), (variants, TITLES)):
         if unknown := sorted(set(given) - set(known)):
             parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(known)}")
+    rows = _resumed(words.json)
+    done_jobs = {(r["preset"], r["seed"]) for r in rows}
     jobs = [(preset, int(seed), tuple(variants)) for seed in words.seeds.split(",") for preset in presets]
-    rows: list[dict[str, Any]] = []
+    jobs = [job for job in jobs if job[:2] not in done_jobs]
     with OrderedPool(run_video, words.workers) as pool:
         for done in pool.map(jobs):
             rows += done
             ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
             print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
-            shown = [{key: value for key, value in row.items() if key != "judgement"} for row in rows]
-            write_json(words.json, {"unfinished": True, "runs": shown})
-    judgements = [(r["preset"], r["variant"], r.pop("judgement")) for r in rows]
+            write_json(words.json, {"unfinished": True, "runs": rows})
+    judgements = [(r["preset"], r["variant"], _judgement(r.pop("judgement"))) for r in rows]
     summary = summarise(rows, presets, variants)
     print_tables(summary, presets, variants)
     revisits = revisit_table(judgements, presets, "full" if "full" in variants else variants[-1])
@@ -92,17 +101,58 @@ def main() -> None:
         plot(words.plot, rows, presets, variants)
 
 
+def _resumed(path: Path | None) -> list[dict[str, Any]]:
+    """The rows of an unfinished run of this commit."""
+    if path is None or not path.exists():
+        return []
+    found = json.loads(path.read_text(encoding="utf-8"))
+    return list(found["runs"]) if found.get("unfinished") and found.get("commit") == STARTED_AT else []
+
+
+def _plain_judgement(judged: Any) -> dict[str, Any]:
+    """What is true of the candidates of a video, for JSON."""
+    c = judged.candidates
+    return {
+        "chunks": c.chunks.tolist(),
+        "frames": c.frames.tolist(),
+        "accepted": c.accepted.tolist(),
+        "s_det": np.nan_to_num(c.scores.get("s_det", np.full(len(c.accepted), np.nan)), nan=-1.0).round(4).tolist(),
+        "frame_labels": judged.frame_labels.tolist(),
+        "chunk_labels": judged.chunk_labels.tolist(),
+        "true_pairs": sorted(judged.true_pairs),
+    }
+
+
+def _judgement(plain: dict[str, Any]) -> Any:
+    """The judgement of `_plain_judgement`."""
+    from list3r.evaluation.revisits import Candidates, RevisitJudgement
+
+    candidates = Candidates(
+        chunks=np.array(plain["chunks"], np.int64).reshape(-1, 2),
+        frames=np.array(plain["frames"], np.int64).reshape(-1, 2),
+        accepted=np.array(plain["accepted"], bool),
+        scores={"s_det": np.where(np.array(plain["s_det"]) < 0, np.nan, np.array(plain["s_det"]))},
+    )
+    labels = [np.array(plain[key], np.int8) for key in ("frame_labels", "chunk_labels")]
+    return RevisitJudgement(candidates, labels[0], labels[1], frozenset((u, v) for u, v in plain["true_pairs"]))
+
+
 def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
     """All variants on one simulated video."""
     from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
-    from benchmarks.feedforward_sim.feedforward import FeedForwardModel
+    from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
+    from benchmarks.shared_work import SharedWork
     from benchmarks.simulation.presets import make_video
+    from benchmarks.simulation.returns import make_return
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 
     preset, seed, variants = job
-    video = make_video(preset, seed)
-    model = FeedForwardModel(video, seed=seed)
-    truth = _Truth(video)
+    video = make_return(preset, seed) if preset in RETURNS else make_video(preset, seed)
+    errors = FeedForwardSettings.unseen_home(preset == "halls") if preset in RETURNS else FeedForwardSettings()
+    model = FeedForwardModel(video, errors, seed=seed)
+    truth = _Truth(video, most_deg=180.0 if preset in RETURNS else None)
+    work = SharedWork()
+    joint = work.joint(model)
     cuts = cuts_by_descriptor(model.descriptors)
     chunks: dict[Any, Any] = {}
     rows = []
@@ -112,7 +162,8 @@ def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
             if span not in chunks:
                 chunks[span] = model.chunk(span)
         started = time.process_time()
-        row = run_variant(variant, [chunks[s] for s in spans], model, truth)
+        with work.used():
+            row = run_variant(variant, [chunks[s] for s in spans], model, joint, truth)
         seconds = round(time.process_time() - started, 2)
         rows.append({"preset": preset, "seed": seed, "variant": variant, "cpu_s": seconds, **row})
     return rows
@@ -148,11 +199,12 @@ def _without_instances(revisits: Any) -> Any:
         lambda_=1.0,
         least_score=0.0,
         layout_pairs=10**6,
+        things=replace(revisits.things, enabled=False),
         window=replace(revisits.window, cross=cross),
     )
 
 
-def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth) -> dict[str, Any]:
+def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, truth: _Truth) -> dict[str, Any]:
     """Build a memory of the chunks (placed only) and measure it."""
     from benchmarks.peers.plain_alignment import plain_support
     from list3r.association.overlap.motion import flag_moving
@@ -169,7 +221,7 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth)
             store.facts.poses = "estimate"
             session = store.sessions.add("simulation", "", {}, truth.frames)
         if peer:
-            _place_as_vggt_long(store, session, results, model)
+            _place_as_vggt_long(store, session, results, model.descriptors, joint)
         for result in () if peer else results:
             chunk = result
             if settings.edges.instance_aware:
@@ -177,18 +229,18 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, truth: _Truth)
                 camera = Camera(width, height, *result.intrinsics)
                 chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
             with patch("list3r.association.overlap.edges.align_support", plain_support):
-                add_chunk(store, session, chunk, model, settings, library=False)
+                add_chunk(store, session, chunk, joint, settings, library=False)
         if not peer:
             finish_session(store, session, settings, library=False)
         return truth.measure(store)
 
 
-def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], model: Any) -> None:
+def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], descriptors: Any, joint: Any) -> None:
     """Store the chunks where VGGT-Long places them, with its loops as edges."""
     from benchmarks.peers.vggt_long import place
     from list3r.memory.records import Edge
 
-    placed, loops, _ = place(results, model.descriptors, model)
+    placed, loops, _ = place(results, descriptors, joint)
     with store.transaction():
         ids = [store.chunks.add(session, result) for result in results]
         edges = []
@@ -206,15 +258,15 @@ def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], model:
 class _Truth:
     """Measures of a memory against a simulated video."""
 
-    def __init__(self, video: Any) -> None:
-        from benchmarks.simulation.covisibility import seen_share
+    def __init__(self, video: Any, most_deg: float | None = None) -> None:
+        from benchmarks.simulation.covisibility import MOST_DEG, seen_share
         from list3r.evaluation.covisibility import Covisibility
 
         self.frames = len(video.time_s)
         self._video = video
         self._cloud = _true_cloud(video)
         rows = np.arange(0, self.frames, 10)
-        self._covisibility = Covisibility(rows, video.time_s[rows], seen_share(video, rows, rows))
+        self._covisibility = Covisibility(rows, video.time_s[rows], seen_share(video, rows, rows, most_deg or MOST_DEG))
 
     def measure(self, store: Any) -> dict[str, Any]:
         """Errors of all frames in the one frame of the memory: parts that were not joined count as they lie."""
@@ -255,7 +307,7 @@ class _Truth:
             "false_loops": int((errors_m > FALSE_M).sum()),
             "worst_loop_m": round(float(np.nanmax(errors_m, initial=0.0)), 3),
             "revisits": revisits.chunks.true,
-            "judgement": judged,
+            "judgement": _plain_judgement(judged),
         }
 
     def _loop_error(self, store: Any, edge: Any) -> float:

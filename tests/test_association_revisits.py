@@ -43,7 +43,7 @@ class Chunks:
             feature_space=lambda chunk_id: "test@1/4",
         )
         self.keyframes = SimpleNamespace(get=self._keyframe, descriptors=self._descriptors)
-        self.local_instances = SimpleNamespace(nodes=lambda chunk_ids: [])
+        self.local_instances = SimpleNamespace(nodes=lambda chunk_ids: [], signature=lambda chunk_id: (0,))
         self.edges = SimpleNamespace(all=lambda: list(known))
 
     def _all(self, session_id: int | None = None) -> list[ChunkRow]:

@@ -12,7 +12,8 @@ import pytest
 
 from benchmarks.simulation.casting import Caster
 from benchmarks.simulation.covisibility import covisibility, seen_share
-from benchmarks.simulation.presets import Shot, make_shot, make_video, preset_camera, preset_names
+from benchmarks.simulation.presets import make_shot, make_video, preset_camera, preset_names
+from benchmarks.simulation.takes import Shot
 from benchmarks.simulation.video import SimulatedVideo
 from benchmarks.simulation.walks import PresetWalk
 from list3r.frames.source import open_source

@@ -37,6 +37,10 @@ class EmbeddingSettings:
     """Length of what sets a thing apart from its twins, against unit length of what they share."""
     noise: float = 0.3
     """Length of the noise of each track's feature."""
+    side_part: float = 0.0
+    """Part of the appearance that depends on the side a thing is seen from, of unit length."""
+    light_part: float = 0.0
+    """Part that another light than the first one replaces, of unit length."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class FrameDescriptorSettings:
     """Weight of walls, floors and ceilings, which look bland, against things of the same area."""
     side_part: float = 0.5
     """Part of a thing's appearance in the arrangement that depends on the side it is seen from, of unit length."""
+    light_part: float = 0.0
+    """Part of what is seen that another light than the first one replaces, of unit length."""
 
 
 class Appearance:
@@ -78,13 +84,42 @@ class Appearance:
             )
             self.shared[k] = shared / np.linalg.norm(shared)
             self.full[k] = self.shared[k] + own_part * _unit([video.seed, 33, k], size)
+        self._size, self._seed = size, video.seed
+
+    def lit(self, vectors: Array, light: int, part: float) -> Array:
+        """Return appearances (top + 1, D) as they are in a light: another than the first replaces a part of them."""
+        if light == 0 or part == 0.0:
+            return vectors
+        fresh = {int(v): _unit([self._seed, 38, light, v], self._size) for v in set(self.looks.tolist())}
+        change = np.stack([fresh[int(v)] for v in self.looks])
+        return np.asarray(
+            np.sqrt(1 - part**2) * vectors + part * change * (np.linalg.norm(vectors, axis=1) > 0)[:, None]
+        )
+
+    def side(self, k: int, azimuth: Array) -> Array:
+        """Return what a thing shows from directions (V,), the mean over them. Shape (D,)."""
+        turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
+        return np.asarray(turns.mean(axis=0) @ _waves([self._seed, 39, int(self.looks[k])], self._size))
 
 
 def track_feature(
-    appearance: Appearance, share: dict[int, float], settings: EmbeddingSettings, rng: np.random.Generator
+    appearance: Appearance,
+    share: dict[int, float],
+    settings: EmbeddingSettings,
+    rng: np.random.Generator,
+    light: int = 0,
+    azimuth: dict[int, Array] | None = None,
 ) -> Floats:
-    """Unit-length feature of a mask track that holds things in the given shares of its area. Shape (D,)."""
-    z = sum(part * appearance.full[k] for k, part in share.items()) / max(sum(share.values()), 1e-9)
+    """Unit-length feature of a mask track that holds things in the given shares of its area. Shape (D,).
+
+    `azimuth` has the directions, radians, from which each of them was seen in the track's frames.
+    """
+    full = appearance.lit(appearance.full, light, settings.light_part)
+    seen = {k: full[k] for k in share}
+    if settings.side_part and azimuth is not None:
+        rest = np.sqrt(1 - settings.side_part**2)
+        seen = {k: rest * v + settings.side_part * appearance.side(k, azimuth[k]) for k, v in seen.items()}
+    z = sum(part * seen[k] for k, part in share.items()) / max(sum(share.values()), 1e-9)
     z = z + settings.noise * rng.standard_normal(settings.size) / np.sqrt(settings.size)
     return np.asarray(z / np.linalg.norm(z), np.float32)
 
@@ -98,8 +133,14 @@ def frame_descriptors(video: SimulatedVideo, settings: FrameDescriptorSettings, 
     structure[[t.id for t in video.world.things if t.structure is not None]] = True
     amount = np.sqrt(areas) * np.where(structure, settings.structure_weight, 1.0)
     amount[..., 0] = 0.0
-    content = _normalised(np.sqrt((amount**2).sum(axis=1)) @ looks.shared)
-    arrangement = _normalised(_arranged(video, amount, looks, settings))
+    content, arrangement = np.zeros((count, size)), np.zeros((count, size))
+    lights = video.lights()
+    azimuth = azimuths(video, looks.top)
+    for light in sorted(set(lights.tolist())):
+        rows = lights == light
+        shown = looks.lit(looks.shared, light, settings.light_part)
+        content[rows] = _normalised(np.sqrt((amount[rows] ** 2).sum(axis=1)) @ shown)
+        arrangement[rows] = _normalised(_arranged(video, amount[rows], azimuth[rows], looks, shown, settings))
     rng = np.random.default_rng([seed, video.seed, 34])
     lasting = rng.standard_normal((count, size))
     for run in runs_of(np.arange(count)):
@@ -111,17 +152,22 @@ def frame_descriptors(video: SimulatedVideo, settings: FrameDescriptorSettings, 
     return _normalised(out).astype(np.float32)
 
 
-def _arranged(video: SimulatedVideo, amount: Array, looks: Appearance, settings: FrameDescriptorSettings) -> Array:
+def _arranged(
+    video: SimulatedVideo,
+    amount: Array,
+    azimuth: Array,
+    looks: Appearance,
+    shown: Array,
+    settings: FrameDescriptorSettings,
+) -> Array:
     """Sum over things and parts of the picture of how they look from the side that is seen, mixed by part. (F, D)."""
     size, part = settings.size, settings.side_part
-    azimuth = _azimuths(video, looks.top)
-    side = np.zeros((*azimuth.shape, size), np.float32)
     seeds = sorted({int(v) for v in looks.looks})
     waves = {v: _waves([video.seed, 36, v], size) for v in seeds}
     table = np.stack([waves[int(v)] for v in looks.looks])
     turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
     side = np.einsum("ftk,tkd->ftd", turns, table)
-    seen = np.sqrt(1 - part**2) * looks.shared[None] + part * side
+    seen = np.sqrt(1 - part**2) * shown[None] + part * side
     mix = np.stack([_orthogonal([37, k], size) for k in range(amount.shape[1])])
     by_part = np.einsum("fpt,ftd->fpd", amount, seen)
     return np.asarray(np.einsum("fpd,pde->fe", by_part, mix))
@@ -142,15 +188,18 @@ def _areas(video: SimulatedVideo, top: int) -> Array:
     return out
 
 
-def _azimuths(video: SimulatedVideo, top: int) -> Array:
+def azimuths(video: SimulatedVideo, top: int) -> Array:
     """Direction from each thing to the camera in the thing's own frame, radians about its upright. (F, top + 1)."""
-    place, yaw = np.zeros((top + 1, 2)), np.zeros(top + 1)
-    round_ = np.zeros(top + 1, bool)
-    for thing in video.world.things:
-        place[thing.id], yaw[thing.id], round_[thing.id] = thing.box().center[:2], thing.yaw, thing.is_round()
-    away = video.T_world_cam[:, None, :2, 3] - place[None]
-    azimuth = np.arctan2(away[..., 1], away[..., 0]) - yaw
-    return np.asarray(np.where(round_, 0.0, azimuth))
+    parts, cut = [], video.cuts[0] if video.later is not None else len(video.time_s)
+    for world, rows in ((video.world, slice(0, cut)), (video.later or video.world, slice(cut, None))):
+        place, yaw = np.zeros((top + 1, 2)), np.zeros(top + 1)
+        round_ = np.zeros(top + 1, bool)
+        for thing in world.things:
+            place[thing.id], yaw[thing.id], round_[thing.id] = thing.box().center[:2], thing.yaw, thing.is_round()
+        away = video.T_world_cam[rows, None, :2, 3] - place[None]
+        azimuth = np.arctan2(away[..., 1], away[..., 0]) - yaw
+        parts.append(np.where(round_, 0.0, azimuth))
+    return np.concatenate(parts)
 
 
 def _waves(seed: list[int], size: int) -> Array:

@@ -25,7 +25,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.feedforward_sim.depth_errors import DepthErrorSettings, focal_factor, wrong_depth
 from benchmarks.feedforward_sim.descriptors import FrameDescriptorSettings, frame_descriptors
-from benchmarks.feedforward_sim.instances import ChunkGeometry, InstanceErrorSettings, simulate_library
+from benchmarks.feedforward_sim.instances import (
+    ChunkGeometry,
+    InstanceErrorSettings,
+    simulate_library,
+    unseen_home_errors,
+)
 from benchmarks.feedforward_sim.mover_errors import MoverErrorSettings, mover_errors
 from benchmarks.feedforward_sim.pose_errors import PoseErrorSettings, bend, jitter, placements, sides
 from benchmarks.simulation.covisibility import seen_share
@@ -55,6 +60,13 @@ class FeedForwardSettings:
     movers: MoverErrorSettings = field(default_factory=MoverErrorSettings)
     instances: InstanceErrorSettings = field(default_factory=InstanceErrorSettings)
     descriptors: FrameDescriptorSettings = field(default_factory=FrameDescriptorSettings)
+
+    @staticmethod
+    def unseen_home(bare: bool = False) -> FeedForwardSettings:
+        """Masks as discovery makes them in homes that it never saw, looks that change with the side and the light;
+        `bare` halls are mostly what all pictures share."""
+        descriptors = FrameDescriptorSettings(light_part=0.85, common=0.8 if bare else 0.4)
+        return FeedForwardSettings(instances=unseen_home_errors(), descriptors=descriptors)
 
     @staticmethod
     def exact() -> FeedForwardSettings:

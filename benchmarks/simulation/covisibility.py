@@ -34,14 +34,20 @@ def covisibility(video: SimulatedVideo, frames_a: Sequence[int], frames_b: Seque
 
 
 def seen_share(
-    video: SimulatedVideo, frames_a: Sequence[int] | NDArray[np.int64], frames_b: Sequence[int] | NDArray[np.int64]
+    video: SimulatedVideo,
+    frames_a: Sequence[int] | NDArray[np.int64],
+    frames_b: Sequence[int] | NDArray[np.int64],
+    most_deg: float = MOST_DEG,
 ) -> Floats:
-    """Share of the static pixels of each frame a whose points are seen in each frame b. Shape (A, B), in [0, 1]."""
+    """Share of the static pixels of each frame a whose points are seen in each frame b. Shape (A, B), in [0, 1].
+
+    Lines of sight to a point differ by at most `most_deg`.
+    """
     a, b = np.asarray(frames_a, dtype=np.int64), np.asarray(frames_b, dtype=np.int64)
     moving = [mover.id for mover in video.movers]
     depth_a = np.where(np.isin(video.ids[a], moving), 0, video.depth[a]) if moving else video.depth[a]
     depth_b = np.where(np.isin(video.ids[b], moving), 0, video.depth[b]) if moving else video.depth[b]
-    return shared_view(depth_a, video.T_world_cam[a], depth_b, video.T_world_cam[b], video.camera)
+    return shared_view(depth_a, video.T_world_cam[a], depth_b, video.T_world_cam[b], video.camera, most_deg)
 
 
 def shared_view(

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.simulation.buildings import Building, BuildingSettings, appearance_classes, make_building
+from benchmarks.simulation.buildings import BuildingSettings, appearance_classes, make_building
 from benchmarks.simulation.casting import Caster
 from benchmarks.simulation.covisibility import shared_view
 from benchmarks.simulation.movers import make_movers
 from benchmarks.simulation.routes import Director, FreeMap, View, mapped_view
+from benchmarks.simulation.takes import Shot, Take
 from benchmarks.simulation.video import MoverTruth, SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
-from list3r.simulation.walk import PathSettings, camera_path, looking_at
-from list3r.simulation.worlds.things import MovingThing
+from list3r.simulation.walk import PathSettings, looking_at
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
@@ -26,49 +26,6 @@ _FURNISHED = ("living room", "bedroom", "office", "kitchen", "meeting room", "st
 _FPS = 12.5
 _BEFORE_CUT = (1, 10, 20)
 """Frames before a cut whose views must share nothing with the view after it."""
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A video without pictures: where the camera is in every frame and what stands and moves there."""
-
-    preset: str
-    seed: int
-    building: Building
-    time_s: Array
-    """Seconds. Shape (F,)."""
-    T_world_cam: Array
-    """Shape (F, 4, 4)."""
-    cuts: tuple[int, ...]
-    """Frames before which the camera jumps."""
-    movers: tuple[MovingThing, ...] = ()
-
-
-@dataclass
-class _Take:
-    """A shot while it is made."""
-
-    building: Building
-    free: FreeMap
-    rng: np.random.Generator
-    path: PathSettings
-    eye_m: float
-    poses: list[Array] = field(default_factory=list)
-    """One array of shape (F, 4, 4) for each run of the camera."""
-
-    def director(self) -> Director:
-        return Director(self.building, self.free, self.rng, self.path, self.eye_m)
-
-    def shoot(self, director: Director, frames: int) -> None:
-        """Film a director's stops in a number of frames; fewer than the stops need cut them short."""
-        seed = int(self.rng.integers(1 << 31))
-        self.poses.append(camera_path(tuple(director.stops), frames, self.path, seed)[1])
-
-    def fit(self, director: Director, frames: int) -> None:
-        """Change the pace so that the stops take a number of frames."""
-        pace = director.seconds() * self.path.fps / frames
-        self.path = replace(self.path, speed_m_s=self.path.speed_m_s * pace, turn_deg_s=self.path.turn_deg_s * pace)
-        director.path = self.path
 
 
 _SOMETIMES_FAST = ("loop", "kidnap", "twins")
@@ -96,7 +53,7 @@ def make_shot(preset: str, seed: int, movers: bool = True) -> Shot:
     )
     if preset in _SOMETIMES_FAST and rng.uniform() < 0.35:
         path = replace(path, turn_deg_s=1.9 * path.turn_deg_s)
-    take = _Take(building, FreeMap(building), rng, path, float(rng.uniform(1.35, 1.6)))
+    take = Take(building, FreeMap(building), rng, path, float(rng.uniform(1.35, 1.6)))
     film(take)
     poses = np.concatenate(take.poses)
     cuts = tuple(int(c) for c in np.cumsum([len(p) for p in take.poses])[:-1])
@@ -212,7 +169,7 @@ def _long(rng: np.random.Generator) -> BuildingSettings:
 # ------------------------------------------------------------------------------------------------ ways
 
 
-def _film_calm(take: _Take) -> None:
+def _film_calm(take: Take) -> None:
     rooms = take.building.north[: int(take.rng.integers(1, 3))]
     director, frames = take.director(), int(take.rng.integers(820, 1000))
     k = 0
@@ -223,7 +180,7 @@ def _film_calm(take: _Take) -> None:
     take.shoot(director, frames)
 
 
-def _film_loop(take: _Take) -> None:
+def _film_loop(take: Take) -> None:
     """Through one row of rooms, back through the other and the corridor, then once more where the way began."""
     rows = [take.building.north, take.building.south]
     if take.rng.integers(2) and rows[1]:
@@ -246,7 +203,7 @@ def _film_loop(take: _Take) -> None:
     take.shoot(director, frames)
 
 
-def _film_kidnap(take: _Take) -> None:
+def _film_kidnap(take: Take) -> None:
     """Rooms in turn; then the picture jumps to a place that was filmed long before."""
     rooms = take.building.north + take.building.south
     rooms = tuple(rooms[k] for k in take.rng.permutation(len(rooms)))
@@ -265,7 +222,7 @@ def _film_kidnap(take: _Take) -> None:
         take.shoot(director, length)
 
 
-def _jump(take: _Take) -> Director:
+def _jump(take: Take) -> Director:
     """A director who begins near a view filmed at least 250 frames ago that shares nothing with the present view."""
     poses = np.concatenate(take.poses)
     glimpse = _Glimpse(take)
@@ -293,7 +250,7 @@ def _jump(take: _Take) -> Director:
 class _Glimpse:
     """Small pictures of a building, to tell which views overlap."""
 
-    def __init__(self, take: _Take) -> None:
+    def __init__(self, take: Take) -> None:
         self._camera = preset_camera((32, 24))
         self._caster = Caster(take.building.world.things, self._camera)
 
@@ -305,7 +262,7 @@ class _Glimpse:
         return np.minimum(forth, back.T)
 
 
-def _near_view(take: _Take, director: Director, poses: Array, frame: int) -> View | None:
+def _near_view(take: Take, director: Director, poses: Array, frame: int) -> View | None:
     """What was looked at from some frame on, from another place in that room; None in corridors and doorways."""
     room = take.building.room_at(*poses[frame, :2, 3])
     if room is None or room.kind == "corridor":
@@ -332,7 +289,7 @@ def _looked_at(pose: Array, x0: float, x1: float, y0: float, y1: float) -> tuple
     return float(point[0]), float(point[1]), float(point[2])
 
 
-def _film_dynamic(take: _Take) -> None:
+def _film_dynamic(take: Take) -> None:
     director, frames, k = take.director(), int(take.rng.integers(900, 1060)), 0
     while director.seconds() * take.path.fps < frames:
         room = take.building.north[(k // 3) % 2]
@@ -341,7 +298,7 @@ def _film_dynamic(take: _Take) -> None:
     take.shoot(director, frames)
 
 
-def _film_twins(take: _Take) -> None:
+def _film_twins(take: Take) -> None:
     """A room, its twin in the same way, the others, and truly back to the first."""
     rooms = take.building.north + take.building.south
     pairs = [(a, b) for a in rooms for b in rooms if a.twin and a.twin == b.twin and a.x0 <= b.x0 and a is not b]
@@ -363,7 +320,7 @@ def _film_twins(take: _Take) -> None:
     take.shoot(director, frames)
 
 
-def _film_sparse(take: _Take) -> None:
+def _film_sparse(take: Take) -> None:
     rooms = take.building.north if take.rng.integers(2) else take.building.north[::-1]
     director, frames = take.director(), int(take.rng.integers(860, 1060))
     k, order = 0, (0, 1, 2, 1, 0)
@@ -373,7 +330,7 @@ def _film_sparse(take: _Take) -> None:
     take.shoot(director, frames)
 
 
-def _film_corridor(take: _Take) -> None:
+def _film_corridor(take: Take) -> None:
     """Along the corridor to its end and back."""
     corridor = take.building.corridor
     y = (corridor.y0 + corridor.y1) / 2
@@ -391,7 +348,7 @@ def _film_corridor(take: _Take) -> None:
     take.shoot(director, frames)
 
 
-_Preset = tuple[Callable[[np.random.Generator], BuildingSettings], Callable[[_Take], None], PathSettings]
+_Preset = tuple[Callable[[np.random.Generator], BuildingSettings], Callable[[Take], None], PathSettings]
 _PRESETS: dict[str, _Preset] = {
     "calm": (_two_rooms, _film_calm, PathSettings(_FPS, 0.45, 30.0)),
     "loop": (_ring, _film_loop, PathSettings(_FPS, 0.8, 50.0)),

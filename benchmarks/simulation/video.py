@@ -43,3 +43,11 @@ class SimulatedVideo:
     movers: tuple[MoverTruth, ...]
     looks: dict[int, int]
     """Class of appearance of each thing: two things of one class look alike (twins)."""
+    light: NDArray[np.int64] | None = None
+    """Which light each frame was filmed in; None where it is all the same. Shape (F,)."""
+    later: SimulatedWorld | None = None
+    """The world after the first cut, where things were moved in between."""
+
+    def lights(self) -> NDArray[np.int64]:
+        """Return the light of each frame, 0 where it is all the same. Shape (F,)."""
+        return np.zeros(len(self.time_s), np.int64) if self.light is None else self.light

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.simulation.changes import Change, apply_changes
-from benchmarks.simulation.presets import Shot, make_shot
+from benchmarks.simulation.presets import make_shot
+from benchmarks.simulation.takes import Shot
 from list3r.memory.errors import OptionError
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.worlds.things import MovingThing, SimulatedThing

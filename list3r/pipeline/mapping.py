@@ -108,8 +108,8 @@ def _prior_edge(store: Store, session_id: int, result: ChunkResult, how: Associa
 
 
 def _refined(store: Store, edge: Edge, settings: ReprojectionSettings) -> Edge:
-    """A loop between chunks of structure from motion, refined by where features are seen."""
-    if edge.frames is None:
+    """A loop between chunks of structure from motion, refined by where features are seen; not one by things alone."""
+    if edge.frames is None or "things_pairs" in edge.scores:
         return edge
     owner = {c.chunk_id: c for c in store.chunks.all()}
     u, v = owner[edge.u], owner[edge.v]

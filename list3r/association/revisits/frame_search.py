@@ -121,7 +121,7 @@ def find_candidates(store: Store, chunk_id: int, settings: SearchSettings | None
     index = _index(store, [k for k in rows if k < chunk_id]).by_length.get(own.shape[1])
     if index is None:
         return []
-    allowed_chunks = [k for k, row in rows.items() if _is_revisit(rows[chunk_id], row, chosen)]
+    allowed_chunks = [k for k, row in rows.items() if is_revisit(rows[chunk_id], row, chosen)]
     allowed = np.isin(index.keys[:, 0], allowed_chunks)
     if not allowed.any():
         return []
@@ -165,7 +165,8 @@ def choose(
     return out
 
 
-def _is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bool:
+def is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bool:
+    """Tell whether what two chunks share would be a revisit: the other one came before and is no neighbour."""
     if there.chunk_id >= here.chunk_id:
         return False
     return there.session_id != here.session_id or (

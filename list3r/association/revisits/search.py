@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 
 from list3r.association.revisits.chain import ChainSettings, Prediction, Ways
+from list3r.association.revisits.constellations.search import ThingSearch, ThingSearchSettings
 from list3r.association.revisits.cross_check import Side
 from list3r.association.revisits.cues import (
     NO_CUES,
@@ -25,7 +26,7 @@ from list3r.association.revisits.cues import (
     instance_set,
     loop_score,
 )
-from list3r.association.revisits.frame_search import Candidate, SearchSettings, find_candidates
+from list3r.association.revisits.frame_search import Candidate, SearchSettings, find_candidates, is_revisit
 from list3r.association.revisits.joint_window import (
     JointReconstructor,
     Objection,
@@ -75,6 +76,8 @@ class RevisitSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     chain: ChainSettings = field(default_factory=ChainSettings)
+    things: ThingSearchSettings = field(default_factory=ThingSearchSettings)
+    """Where frames that look alike do not suffice."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,18 @@ def find_loops(
     `joint` reconstructs frames of both places together; without one, chunks are compared by their keyframes alone.
     """
     chosen = settings or RevisitSettings()
-    candidates = find_candidates(store, chunk_id, chosen.search)
-    if not candidates:
-        return []
     look = _Lookout(store, chunk_id, chosen)
+    edges = _by_frames(store, chunk_id, look, joint, chosen)
+    if chosen.things.enabled and chosen.instance_cues and chosen.verified:
+        edges = look.unambiguous([*edges, *look.by_things(edges)])
+    return edges
+
+
+def _by_frames(
+    store: Store, chunk_id: int, look: _Lookout, joint: JointReconstructor | None, chosen: RevisitSettings
+) -> list[Edge]:
+    """Find the loop edges between a chunk and those of which frames look like its own."""
+    candidates = find_candidates(store, chunk_id, chosen.search)
     edges: list[Edge] = []
     tried = 0
     for scored in _ranked(candidates, look, chosen):
@@ -191,6 +202,17 @@ class _Lookout:
 
     def _keyframes(self, c: Candidate) -> tuple[Keyframe, Keyframe]:
         return self._store.keyframes.get(c.u, c.frame_u), self._store.keyframes.get(self._id, c.frame_v)
+
+    def by_things(self, found: Sequence[Edge]) -> list[Edge]:
+        """Return loop edges by the chunks' things alone, to what frames did not join to the new chunk."""
+        joined = {k for e in found if e.accepted for k in self._ways.tied_to(e.u)}
+        revisits = [k for k, row in self._rows.items() if is_revisit(self._rows[self._id], row, self._settings.search)]
+        apart = [k for k in revisits if self._apart(k) and k not in joined]
+        tied = [] if any(e.accepted for e in found) else [k for k in revisits if not self._apart(k)]
+        if not apart and not tied:
+            return []
+        things = ThingSearch(self._store, self._rows, self._id, self._side, self._settings.things)
+        return things.edges(apart, tied, self._ways, self._settings.chain.most_deviations)
 
     def refused(self, scored: _Scored, reason: str) -> Edge:
         """Return an edge that is kept only for the record."""

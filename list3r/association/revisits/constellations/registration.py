@@ -1,0 +1,183 @@
+"""Register two chunks by their things alone, and say whether to believe it.
+
+What things match is found by `matching`, where exactly by `surface_fit`; a relation is believed by what speaks for it
+together: how many things agree and how well, that no other place fits nearly as well, how much of the surfaces meets
+and that neither chunk sees through what the other saw. The weights were chosen on simulated homes
+(docs/decisions/0053).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.graph.solver import adjoint
+from list3r.association.revisits.constellations.constellation import (
+    Constellation,
+    ConstellationSettings,
+)
+from list3r.association.revisits.constellations.matching import Match, MatchingSettings, match_constellations
+from list3r.association.revisits.constellations.surface_fit import (
+    Held,
+    SurfaceFit,
+    SurfaceFitSettings,
+    Surfaces,
+    fit_surfaces,
+)
+from list3r.association.revisits.cross_check import CrossSettings, Side, cross_check
+from list3r.memory.geometry import Sim3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """How chunks are registered by their things."""
+
+    constellation: ConstellationSettings = field(default_factory=ConstellationSettings)
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    surfaces: SurfaceFitSettings = field(default_factory=SurfaceFitSettings)
+    cross: CrossSettings = field(default_factory=CrossSettings)
+    tried: int = 3
+    """Most hypotheses that surfaces judge,"""
+    least_pairs: int = 4
+    """of those with so many things,"""
+    least_match: float = 5.0
+    """whose log odds sum up to this."""
+    believed_pairs: int = 5
+    """Things that must still agree once surfaces were brought together, for a relation to be believed,"""
+    least_support: float = 7.0
+    """and what speaks for it: their log odds, less where one chunk sees through the other's surfaces or few meet,"""
+    least_agreement: float = 0.93
+    """of which so much may not be seen through,"""
+    most_rival: float = 0.6
+    """and another relation of the same chunks must have this much less."""
+    place: float = 0.04
+    """Deviation of a thing's middle once surfaces were brought together, share of the typical depth,"""
+    most_off: float = 2.0
+    """and the deviations within which a thing agrees."""
+    enough_fitting: float = 0.3
+    """Share of a chunk's surface that meets the other's, from which on more says nothing."""
+    shift: float = 0.03
+    """Deviation of a believed relation, share of the chunk's typical depth,"""
+    turn_deg: float = 1.5
+    """of its turn,"""
+    log_scale: float = 0.03
+    """and of the logarithm of its scale."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """One chunk as registration looks at it."""
+
+    constellation: Constellation
+    surfaces: Surfaces
+    side: Side
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A supposed relation of two chunks, and all that is known of it."""
+
+    S_v_u: Sim3
+    match: Match
+    fit: SurfaceFit
+    scores: dict[str, float]
+
+
+def register(u: Place, v: Place, metric: bool, settings: RegistrationSettings) -> Registration | None:
+    """Return the likeliest relation of two chunks, None where no three things agree anywhere."""
+    cu, cv = u.constellation, v.constellation
+    matches = match_constellations(cu, cv, metric, settings.matching)
+    found: list[Registration] = []
+    likely = [m for m in matches if len(m.pairs) >= settings.least_pairs and m.score >= settings.least_match]
+    for match in likely[: settings.tried]:
+        S = _lowered(match.S_v_u, cu, cv)
+        held = Held(
+            middle_u=cu.center[match.pairs[:, 0]] @ cu.R_up_chunk,
+            middle_v=cv.center[match.pairs[:, 1]] @ cv.R_up_chunk,
+            up_u=cu.R_up_chunk[2],
+            up_v=cv.R_up_chunk[2],
+            scale=float(match.S_v_u.scale),
+        )
+        fit = fit_surfaces(S, u.surfaces, v.surfaces, held, metric, settings.surfaces)
+        if fit is not None:
+            found.append(_described(u, v, match, fit, settings))
+    if not found:
+        return None
+    found.sort(key=lambda r: -r.scores["support"])
+    best = found[0]
+    rivals = [r.scores["support"] for r in found[1:] if not _near(r.S_v_u, best.S_v_u, cu, cv)]
+    scores = best.scores | {"rival": max(rivals, default=0.0) / max(best.scores["support"], 1e-9)}
+    return Registration(best.S_v_u, best.match, best.fit, scores)
+
+
+def doubt(found: Registration, settings: RegistrationSettings) -> str | None:
+    """Return why a relation is not believed, or None."""
+    scores, s = found.scores, settings
+    if scores["agreeing"] < s.believed_pairs:
+        return f"with surfaces brought together only {scores['agreeing']:.0f} things agree"
+    if scores["agreement"] < s.least_agreement:
+        return f"{1 - scores['agreement']:.0%} of what is compared lies in space that the other chunk saw to be empty"
+    if scores["support"] < s.least_support:
+        return f"too little speaks for it ({scores['support']:.1f}, {scores['pairs']:.0f} things)"
+    if scores["rival"] > s.most_rival:
+        return f"another relation of the two chunks fits nearly as well ({scores['rival']:.0%})"
+    return None
+
+
+def _near(a: Sim3, b: Sim3, u: Constellation, v: Constellation) -> bool:
+    """Tell whether two relations put the things of u at about the same place of v."""
+    centers = u.center @ u.R_up_chunk
+    return bool(np.linalg.norm(a.apply(centers) - b.apply(centers), axis=1).mean() < 0.15 * v.unit)
+
+
+def _lowered(S: Sim3, u: Constellation, v: Constellation) -> Sim3:
+    """Return a similarity of upright frames as one of chunks."""
+    tilt_u = Sim3(np.ones(()), u.R_up_chunk, np.zeros(3))
+    tilt_v = Sim3(np.ones(()), v.R_up_chunk, np.zeros(3))
+    return tilt_v.inverse() @ S @ tilt_u
+
+
+def _described(u: Place, v: Place, match: Match, fit: SurfaceFit, settings: RegistrationSettings) -> Registration:
+    check = cross_check(fit.S_v_u, u.side, v.side, None, settings.cross)
+    cu, cv = u.constellation, v.constellation
+    a = fit.S_v_u.apply(cu.center[match.pairs[:, 0]] @ cu.R_up_chunk)
+    b = cv.center[match.pairs[:, 1]] @ cv.R_up_chunk
+    size = np.linalg.norm(cv.size[match.pairs[:, 1]], axis=1)
+    off = np.linalg.norm(a - b, axis=1) / np.hypot(settings.place * cv.unit, settings.matching.place_of_size * size)
+    tilt = float(np.degrees(np.arccos(np.clip((cv.R_up_chunk[2] @ fit.S_v_u.rotation @ cu.R_up_chunk[2]), -1, 1))))
+    moved = (fit.S_v_u.inverse() @ _lowered(match.S_v_u, cu, cv)).apply(cu.center.mean(axis=0)[None] @ cu.R_up_chunk)
+    away = float(np.linalg.norm(moved - cu.center.mean(axis=0) @ cu.R_up_chunk) / cu.unit)
+    scores = {
+        "pairs": float(len(match.pairs)),
+        "agreeing": float((off < settings.most_off).sum()),
+        "match": match.score,
+        "misfit": match.misfit,
+        "after": float(np.sqrt((np.minimum(off, 3.0) ** 2).mean())),
+        "fitting": fit.fitting,
+        "residual": fit.residual,
+        "directions": fit.spread,
+        "overlap": check.overlap,
+        "agreement": check.agreement,
+        "likeness": check.likeness if np.isfinite(check.likeness) else 0.5,
+        "tilt": tilt,
+        "away": away,
+        "support": match.score * check.agreement**4 * min(1.0, fit.fitting / settings.enough_fitting),
+    }
+    return Registration(fit.S_v_u, match, fit, scores)
+
+
+def covariance(u: Place, metric: bool, settings: RegistrationSettings) -> Array:
+    """Return the covariance of a believed relation, whose errors are about the middle of u's things.
+
+    Of x in S_true = S_v_u exp(x), u's units. Shape (7, 7).
+    """
+    c, s = u.constellation, settings
+    middle = c.center.mean(axis=0) @ c.R_up_chunk
+    log_scale = 1e-6 if metric else s.log_scale
+    deviation = np.array([s.shift * c.unit] * 3 + [np.radians(s.turn_deg)] * 3 + [log_scale])
+    moved = adjoint(Sim3(np.ones(()), np.eye(3), middle))
+    return np.asarray(moved @ np.diag(deviation**2) @ moved.T)

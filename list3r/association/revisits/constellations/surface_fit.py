@@ -1,0 +1,181 @@
+"""Bring two chunks' surfaces together from a rough similarity: floors, walls, tops, and what both saw of things."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from list3r.association.revisits.cross_check import Side
+from list3r.memory.geometry import Sim3, skew
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SurfaceFitSettings:
+    """How surfaces are brought together. Lengths are shares of the target's typical depth."""
+
+    source_points: int = 1500
+    target_points: int = 6000
+    neighbours: int = 12
+    """Points that give a surface its normal."""
+    reaches: tuple[float, ...] = (0.16, 0.11, 0.07, 0.05)
+    """Distances up to which surfaces are taken for one, one round after another."""
+    steps: int = 4
+    """Steps of each round."""
+    least_cosine: float = 0.75
+    """Between the normals, whichever side they were seen from, of one surface."""
+    anchor: float = 0.08
+    """Deviation of a thing's middle, which holds what surfaces leave open."""
+    anchor_weight: float = 0.05
+    """Weight of all things against all surfaces."""
+    upright: float = 0.065
+    """Weight of both chunks' estimates of up, which are sure to a degree or two,"""
+    scaled: float = 0.02
+    """and of the scale by the things: smaller copies fit surfaces too well."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """What is known of a relation besides surfaces."""
+
+    middle_u: Array
+    """Middles of matched things in u. Shape (P, 3)."""
+    middle_v: Array
+    """The same in v. Shape (P, 3)."""
+    up_u: Array
+    """Unit length. Shape (3,)."""
+    up_v: Array
+    """Unit length. Shape (3,)."""
+    scale: float
+    """By the things."""
+
+
+@dataclass(frozen=True)
+class SurfaceFit:
+    """What surfaces make of a similarity."""
+
+    S_v_u: Sim3
+    fitting: float
+    """Share of u's points within the last reach of a surface of v of one direction."""
+    residual: float
+    """Root mean square distance of those from the surface, share of v's typical depth."""
+    spread: float
+    """Least eigenvalue over largest of the directions of those surfaces: 0 where they leave a shift open."""
+
+
+class Surfaces:
+    """Points and normals of a chunk, looked up often."""
+
+    def __init__(self, side: Side, unit: float, settings: SurfaceFitSettings) -> None:
+        self.unit = unit
+        self._settings = settings
+        s = side.samples
+        sound = np.isfinite(s.points).all(axis=1) & ~np.isin(s.instance, sorted(side.moving)) & (s.confidence > 0)
+        median = float(np.median(s.confidence[sound])) if sound.any() else 0.0
+        rows = np.flatnonzero(sound & (s.confidence >= 0.3 * median))
+        pick = np.linspace(0, len(rows) - 1, min(len(rows), settings.target_points)).astype(np.int64)
+        self.points: Array = s.points[rows[pick]].astype(np.float64)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Return the points as a tree."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def normals(self) -> Array:
+        """Return the normals of the points, of either sign. Shape (N, 3)."""
+        count = min(self._settings.neighbours, len(self.points))
+        near = self.points[self.tree.query(self.points, count)[1].reshape(len(self.points), count)]
+        off = near - near.mean(axis=1, keepdims=True)
+        return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))[1][:, :, 0])
+
+
+def fit_surfaces(
+    S_v_u: Sim3,
+    u: Surfaces,
+    v: Surfaces,
+    held: Held,
+    metric: bool,
+    settings: SurfaceFitSettings | None = None,
+) -> SurfaceFit | None:
+    """Refine a similarity by distances from planes (Chen and Medioni, 1992), reweighted; None with too few points."""
+    s = settings or SurfaceFitSettings()
+    if min(len(u.points), len(v.points)) < 100:
+        return None
+    pick = np.linspace(0, len(u.points) - 1, min(len(u.points), s.source_points)).astype(np.int64)
+    points, normals = u.points[pick], u.normals[pick]
+    for reach in s.reaches:
+        for _ in range(s.steps):
+            step = _step(S_v_u, points, normals, v, held, reach * v.unit, metric, s)
+            if step is None:
+                return None
+            S_v_u = step
+    there, at, near = _pairs(S_v_u, points, normals, v, s.reaches[-1] * v.unit, s)
+    if near.sum() < 50:
+        return None
+    n = v.normals[at[near]]
+    residual = np.einsum("ni,ni->n", there[near] - v.points[at[near]], n)
+    values = np.linalg.eigvalsh(n.T @ n)
+    return SurfaceFit(
+        S_v_u=S_v_u,
+        fitting=float(near.mean()),
+        residual=float(np.sqrt((residual**2).mean()) / v.unit),
+        spread=float(values[0] / values[2]),
+    )
+
+
+def _pairs(
+    S: Sim3, points: Array, normals: Array, v: Surfaces, reach: float, s: SurfaceFitSettings
+) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+    there = S.apply(points)
+    distance, at = v.tree.query(there, distance_upper_bound=reach)
+    found = np.isfinite(distance)
+    at = np.where(found, at, 0).astype(np.int64)
+    along = np.abs(np.einsum("ni,ni->n", normals @ S.rotation.T, v.normals[at]))
+    return there, at, np.asarray(found & (along >= s.least_cosine))
+
+
+def _step(
+    S: Sim3,
+    points: Array,
+    normals: Array,
+    v: Surfaces,
+    held: Held,
+    reach: float,
+    metric: bool,
+    s: SurfaceFitSettings,
+) -> Sim3 | None:
+    """Return the similarity after one step of Gauss and Newton, about the middle of what is paired."""
+    there, at, near = _pairs(S, points, normals, v, reach, s)
+    if near.sum() < 50:
+        return None
+    p, q, n = there[near], v.points[at[near]], v.normals[at[near]]
+    middle = p.mean(axis=0)
+    r = np.einsum("ni,ni->n", q - p, n)
+    weight = (1 - np.minimum(np.abs(r) / reach, 1.0) ** 2) ** 2 / len(r)
+    arm = p - middle
+    J = np.concatenate([n, np.cross(arm, n), np.einsum("ni,ni->n", arm, n)[:, None]], axis=1)
+    A, b = (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r
+    things = S.apply(held.middle_u)
+    arm = things - middle
+    J_a = np.concatenate([np.tile(np.eye(3), (len(things), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
+    off = held.middle_v - things
+    weight_a = s.anchor_weight / (1 + (np.linalg.norm(off, axis=1) / (s.anchor * v.unit)) ** 2) / len(things)
+    A += np.einsum("p,pki,pkj->ij", weight_a, J_a, J_a)
+    b += np.einsum("p,pki,pk->i", weight_a, J_a, off)
+    lean = s.upright * v.unit**2
+    A[3:6, 3:6] += lean * (np.eye(3) - np.outer(held.up_v, held.up_v))
+    b[3:6] += lean * np.cross(S.rotation @ held.up_u, held.up_v)
+    A[6, 6] += s.scaled * v.unit**2
+    b[6] += s.scaled * v.unit**2 * (np.log(held.scale) - float(np.log(S.scale)))
+    free = 6 if metric else 7
+    x = np.zeros(7)
+    x[:free] = np.linalg.solve(A[:free, :free] + 1e-9 * np.trace(A) * np.eye(free), b[:free])
+    turn = Sim3.exp(np.r_[np.zeros(3), x[3:]])
+    about = Sim3(turn.scale, turn.rotation, middle + x[:3] - turn.scale * turn.rotation @ middle)
+    return about @ S

@@ -1,0 +1,81 @@
+"""Registration of two chunks by their things alone: what a constellation determines, and when nothing is claimed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from list3r.association.revisits.constellations.constellation import Constellation
+from list3r.association.revisits.constellations.matching import MatchingSettings, likeness, match_constellations
+from list3r.memory.geometry import Sim3, rotation_exp
+
+
+def constellation(seed: int, count: int = 9) -> Constellation:
+    rng = np.random.default_rng(seed)
+    feature = rng.standard_normal((count, 16))
+    return Constellation(
+        local_id=np.arange(count),
+        feature=feature / np.linalg.norm(feature, axis=1, keepdims=True),
+        center=np.c_[rng.uniform(-3, 3, (count, 2)), rng.uniform(0, 1.5, count)],
+        size=rng.uniform(0.2, 0.8, (count, 3)),
+        color=rng.uniform(0.2, 0.45, (count, 2)),
+        R_up_chunk=np.eye(3),
+        unit=2.5,
+        space="looks@1/16",
+    )
+
+
+def seen_elsewhere(c: Constellation, S: Sim3, order: np.ndarray) -> Constellation:
+    """The same things in another gauge and another order."""
+    scale = float(S.scale)
+    return replace(
+        c,
+        local_id=c.local_id,
+        feature=c.feature[order],
+        center=S.apply(c.center)[order],
+        size=scale * c.size[order],
+        color=c.color[order],
+        unit=scale * c.unit,
+    )
+
+
+@pytest.mark.parametrize("yaw", [0.3, 3.1])
+def test_a_constellation_fixes_yaw_scale_and_shift(yaw: float) -> None:
+    u = constellation(1)
+    S = Sim3(np.asarray(1.7), rotation_exp(np.array([0.0, 0.0, yaw])), np.array([4.0, -2.0, 0.5]))
+    order = np.random.default_rng(2).permutation(len(u.local_id))
+    best = match_constellations(u, seen_elsewhere(u, S, order), metric=False)[0]
+    assert len(best.pairs) == len(u.local_id)
+    assert {(int(i), int(order[j])) for i, j in best.pairs} == {(k, k) for k in range(len(u.local_id))}
+    assert np.abs((best.S_v_u.inverse() @ S).log()).max() < 1e-6
+
+
+def test_a_metric_pair_keeps_its_scale() -> None:
+    u = constellation(3)
+    S = Sim3(np.ones(()), rotation_exp(np.array([0.0, 0.0, 2.0])), np.array([1.0, 0.0, 0.0]))
+    best = match_constellations(u, seen_elsewhere(u, S, np.arange(9)), metric=True)[0]
+    assert float(best.S_v_u.scale) == 1.0
+    assert np.abs((best.S_v_u.inverse() @ S).log()).max() < 1e-6
+
+
+def test_half_of_the_things_moved_still_leaves_the_other_half() -> None:
+    u = constellation(4, count=10)
+    S = Sim3(np.asarray(0.8), rotation_exp(np.array([0.0, 0.0, -1.0])), np.zeros(3))
+    v = seen_elsewhere(u, S, np.arange(10))
+    v.center[:5] += np.random.default_rng(5).uniform(0.8, 1.6, (5, 3)) * [1, -1, 0.2]
+    best = match_constellations(u, v, metric=False)[0]
+    assert {int(i) for i, _ in best.pairs} >= {5, 6, 7, 8, 9}
+    assert np.linalg.norm(best.S_v_u.apply(u.center[5:]) - v.center[5:], axis=1).max() < 0.1 * v.unit
+
+
+def test_features_of_two_spaces_say_nothing() -> None:
+    u = constellation(6)
+    other = replace(u, space="looks@2/16")
+    assert likeness(u, u).diagonal().min() > likeness(u, other).max()
+
+
+def test_fewer_than_three_things_claim_nothing() -> None:
+    u = constellation(7, count=2)
+    assert match_constellations(u, u, metric=False, settings=MatchingSettings()) == []
