@@ -22,7 +22,7 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance.as_of import store_at
 from list3r.memory.maintenance.editing import MemoryEdits
 from list3r.memory.maintenance.history import world_at
-from list3r.memory.records import FrameRow, Instance, Session, Support
+from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
 from list3r.memory.store.store import Store
 from list3r.queries.changes import Changed, changes
 from list3r.queries.find import Found, find
@@ -33,7 +33,7 @@ from list3r.queries.measure import InstanceDistance, measure
 from list3r.queries.nearest import nearest
 from list3r.queries.path import path
 from list3r.queries.pictures import InstancePicture, KeyframePicture, instance_picture, keyframe_pictures, keyframe_rgb
-from list3r.queries.relations import Place, Relations, relations
+from list3r.queries.relations import Place, Relations, relations, relations_of
 from list3r.queries.seen import Sightings, seen, visible
 from list3r.queries.similar import similar
 from list3r.queries.views.camera import PosedCamera, camera_at_pose, camera_at_time, camera_of_frame
@@ -401,6 +401,11 @@ class SceneMemory(MemoryEdits):
             >>> memory.relations(predicate="between", object=4, other=7)
         """
         return relations(self.store, subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
+
+    @_alone
+    def relations_of(self, instance_id: int) -> list[Relation]:
+        """The stored relations of an instance, each told once: not that it supports what is said to be on it."""
+        return relations_of(self.store, self.store.instances.get(instance_id).id)
 
     @_alone
     def measure(self, a: int, b: int) -> InstanceDistance:

@@ -36,7 +36,21 @@ def run(*arguments: str | Path) -> str:
 
 
 def ask(*arguments: str | Path) -> Any:
-    return json.loads(run(*arguments, "--json"))
+    """The matches of an answer."""
+    return answer(*arguments)["matches"]
+
+
+def answer(*arguments: str | Path) -> Any:
+    """The whole answer."""
+    told = json.loads(run(*arguments, "--json"))
+    assert told["schema"] == "list3r/answer/1" and {"units", "matches", "notes"} <= set(told)
+    return told
+
+
+def one(*arguments: str | Path) -> Any:
+    """The only match of an answer."""
+    (match,) = ask(*arguments)
+    return match
 
 
 COMMANDS = (
@@ -72,10 +86,10 @@ def options_of(command: Any) -> set[str]:
 
 
 def test_every_json_answer_names_things_alike(room: Path) -> None:
-    report = ask("info", room, "--loops")
-    assert report["memory"] == str(room) == ask("verify", room)["memory"]
+    report = one("info", room, "--loops")
+    assert report["memory"] == str(room) == one("verify", room)["memory"]
     assert report["components"] == len(report["parts"]) == 1
-    assert ask("verify", room)["sessions"] == [{"id": 1, "state": report["sessions"][0]["state"]}]
+    assert one("verify", room)["sessions"] == [{"id": 1, "state": report["sessions"][0]["state"]}]
 
 
 def test_help_is_quick_and_loads_nothing_heavy() -> None:
@@ -86,17 +100,17 @@ def test_help_is_quick_and_loads_nothing_heavy() -> None:
 
 
 def test_info_names_scale_gravity_and_frames(room: Path) -> None:
-    report = ask("info", room)
+    report = one("info", room)
     assert (report["scale"], report["gravity"], report["frames"], report["instances"]) == ("metric", "estimated", 20, 4)
     assert "sensor depth" in run("info", room)
-    assert ask("info", room, "--loops")["edges"] == []
+    assert one("info", room, "--loops")["edges"] == []
 
 
 def test_list_and_show(room: Path) -> None:
     assert [i["id"] for i in ask("list", room)] == [2, 3, 4, 5]
     assert [i["id"] for i in ask("list", room, "--structure")] == [1, 2, 3, 4, 5, 6]
     assert ask("list", room, "--min-confidence", "0.95") == []
-    mug = ask("show", room, "3")
+    mug = one("show", room, "3")
     assert mug["description"] == "mug"
     assert {(r["subject"], r["predicate"], r["object"]) for r in mug["relations"]} == {(3, "on", 2)}
     assert re.search(r"mug \(3\) on table \(2\)", run("show", room, "3"))
@@ -117,9 +131,9 @@ def test_nearest_gives_surface_and_centre_distances(room: Path) -> None:
 def test_within_relations_and_similar(room: Path) -> None:
     assert {m["id"] for m in ask("query", "within", room, "--point", "2,0,0.77", "--radius", "0.3")} >= {3, 4}
     assert {m["id"] for m in ask("query", "within", room, "--box", "1.7,0,0.7,1.9,0.2,0.9")} >= {3}
-    answer = ask("query", "relations", room, "--predicate", "on", "--object", "2")
-    assert {r["subject"] for r in answer["relations"]} == {3, 4}
-    assert answer["gravity"] == "estimated"
+    told = answer("query", "relations", room, "--predicate", "on", "--object", "2")
+    assert {r["subject"] for r in told["matches"]} == {3, 4}
+    assert (told["gravity"], told["state"], told["units"]) == ("estimated", "known", "m")
     assert len(ask("query", "similar", room, "--id", "3", "-k", "2")) == 2
     for words in (
         ("within", room, "--point", "2,0,0.77", "--radius", "0.3"),
@@ -132,12 +146,12 @@ def test_within_relations_and_similar(room: Path) -> None:
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_is_written(name: str, room: Path, tmp_path: Path) -> None:
     path = tmp_path / f"room{FORMATS[name].suffixes[0]}"
-    report = ask("export", room, "--to", name, "--out", path)
-    assert report["bytes"] == path.stat().st_size > 0
+    report = ask("export", room, "--to", name, "--out", path)[0]
+    assert report["path"] == str(path) and report["bytes"] == path.stat().st_size > 0
 
 
 def test_verify_and_doctor(room: Path) -> None:
-    assert ask("verify", room)["sound"] is True
+    assert one("verify", room)["sound"] is True
     assert {"numpy", "typer"} <= {row["part"] for row in ask("doctor")}
 
 

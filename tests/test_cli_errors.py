@@ -255,7 +255,7 @@ def test_what_is_no_ordinary_file_stays_what_it_is(command: str, place: Path, tm
 def test_verify_says_of_a_torn_file_that_it_is_damaged(place: Path) -> None:
     result = in_process("verify", place / "torn.l3r", "--json")
     assert result.returncode == 1
-    assert json.loads(result.stdout)["sound"] is False
+    assert json.loads(result.stdout)["matches"][0]["sound"] is False
     assert result.stderr == ""
 
 

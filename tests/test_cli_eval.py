@@ -109,7 +109,8 @@ def export(root: Path, name: str, file: str) -> Path:
 def ask(*words: str | Path) -> Any:
     result = run(*words, "--json")
     assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
+    (match,) = json.loads(result.stdout)["matches"]
+    return match
 
 
 def read(*words: str | Path) -> str:

@@ -46,7 +46,9 @@ def test_find(ask: Any) -> None:
     assert status == 0 and "on #2 table" in out and "2 instances match" in err
     found = json.loads(ask("find", "mug on table", "--json")[1])
     assert [m["id"] for m in found["matches"]] == [MUG, TWIN] and found["ambiguous"]
-    assert found["matches"][0]["view"]["frame"] == 3
+    assert found["total"] == 2 and found["matches"][0]["best_view"]["frame"] == 3
+    status, out, err = ask("find", "mug", "-k", 1)
+    assert json.loads(ask("find", "mug", "-k", 1, "--json")[1])["total"] == 2 and "the best 1 of 2" in err
     nothing = json.loads(ask("find", "elephant on table", "--json")[1])
     assert nothing["matches"] == [] and nothing["unknown_words"] == ["elephant"]
     assert "nothing found" in ask("find", "elephant")[1]
@@ -55,32 +57,35 @@ def test_find(ask: Any) -> None:
 def test_seen(ask: Any) -> None:
     status, out, _ = ask("seen", MUG)
     assert status == 0 and "20 frames" in out
-    assert json.loads(ask("seen", MUG, "--json")[1])["spans"] == [{"session": 1, "from_s": 0.0, "to_s": 0.633333}]
+    assert json.loads(ask("seen", MUG, "--json")[1])["matches"][0]["spans"] == [
+        {"session": 1, "from_s": 0.0, "to_s": 0.633333}
+    ]
     status, out, err = ask("seen", "--time", "0.1")
     assert status == 0 and "frame 3 of session 1, 0.10 s" in err
     at = json.loads(ask("seen", "--pose", "0,0,0.9,0.5,-0.5,0.5,-0.5", "--json")[1])
-    assert {TABLE, MUG, TWIN} <= {m["id"] for m in at}
+    assert {TABLE, MUG, TWIN} <= {m["id"] for m in at["matches"]}
 
 
 def test_within_a_view(ask: Any) -> None:
     found = json.loads(ask("within", "--view", 3, "--no-occlusion", "--structure", "--json")[1])
-    assert TABLE in [m["id"] for m in found] and all(m["view"]["frame"] == 3 for m in found)
+    assert TABLE in [m["id"] for m in found["matches"]]
+    assert all(m["view"]["frame"] == 3 for m in found["matches"]) and found["total"] == len(found["matches"])
 
 
 def test_relations_from_somewhere_and_between(ask: Any) -> None:
     found = json.loads(ask("relations", "--predicate", "left_of", "--object", TWIN, "--from", "0,0,1", "--json")[1])
-    assert found["state"] == "known" and MUG in [r["subject"] for r in found["relations"]]
+    assert found["state"] == "known" and MUG in [r["subject"] for r in found["matches"]]
     status, out, err = ask("relations", "--subject", "mug", "--from", "camera")
     assert status == 0 and "left_of" in out and "as seen from frame 19" in err
     assert (
-        json.loads(ask("relations", "--predicate", "between", "--object", MUG, "--and", TWIN, "--json")[1])["relations"]
+        json.loads(ask("relations", "--predicate", "between", "--object", MUG, "--and", TWIN, "--json")[1])["matches"]
         == []
     )
 
 
 def test_path(ask: Any) -> None:
     found = json.loads(ask("path", MUG, CHAIR, "--json")[1])
-    assert [r["predicate"] for r in found["relations"]] == ["on", "next_to"]
+    assert [r["predicate"] for r in found["matches"]] == ["on", "next_to"]
     assert "no relations connect them" in ask("path", MUG, WALL)[2]
 
 
@@ -117,8 +122,29 @@ def test_words_that_nothing_bears_are_named(ask: Any) -> None:
     for arguments in (("nearest", "zebra"), ("relations", "--subject", "zebra"), ("find", "zebra")):
         status, out, err = ask(*arguments)
         assert status == 0 and "has the word 'zebra'" in err and "zebra" not in out
-    status, out, _ = ask("nearest", "zebra", "--json")
-    assert status == 0 and json.loads(out) == []
+    status, out, err = ask("nearest", "zebra", "--json")
+    told = json.loads(out)
+    assert status == 0 and told["matches"] == [] and "has the word 'zebra'" in told["notes"][0] and err == ""
+
+
+def test_with_json_an_error_is_an_answer_too(ask: Any) -> None:
+    for arguments, kind in (
+        (("path", 3, 99), "UnknownIdError"),
+        (("find", "mug", "-k", "0"), "OptionError"),
+        (("find", "mug", "--no-such-option"), "OptionError"),
+    ):
+        status, out, err = ask(*arguments, "--json")
+        told = json.loads(out)
+        assert status == 2 and told["schema"] == "list3r/answer/1" and told["matches"] == [] and told["units"] is None
+        assert told["error"]["kind"] == kind and told["error"]["status"] == 2
+        assert err == f"error: {told['error']['message']}\n"
+
+
+def test_nearest_takes_words_that_say_more_than_names(ask: Any) -> None:
+    for words, wanted in (("mug on table", [MUG, TWIN]), ("4", [TWIN]), ("biggest thing", [TABLE])):
+        assert [m["id"] for m in json.loads(ask("nearest", words, "--json")[1])["matches"]] == wanted
+    near = json.loads(ask("nearest", "mug on table", "--point", "2.2,-0.1,0.8", "--json")[1])["matches"]
+    assert [m["id"] for m in near] == [TWIN, MUG] and near[0]["distance"] < near[1]["distance"]
 
 
 def test_a_box_has_six_numbers(ask: Any) -> None:

@@ -381,7 +381,7 @@ def test_where_a_label_comes_from_is_told(memory: Path, capsys: pytest.CaptureFi
         edits.label(store, blue, "vase", "ann")
     assert run(["show", str(memory), str(red)]) == 0 and "test-net" in capsys.readouterr().out
     assert run(["show", str(memory), str(blue), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["label_source"] == "operator"
+    assert json.loads(capsys.readouterr().out)["matches"][0]["label_source"] == "operator"
     assert run(["export", str(memory), "--to", "json", "--out", str(tmp_path / "s.json")]) == 0
     rows = {i["id"]: i for i in json.loads((tmp_path / "s.json").read_text())["instances"]}
     assert (rows[red]["label_source"], rows[blue]["label_confidence"]) == ("test-net", 1.0)

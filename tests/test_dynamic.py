@@ -246,7 +246,7 @@ def test_exports_and_commands_show_it(tmp_path: Path, capsys: pytest.CaptureFixt
         assert ("dynamic" if words[0] == "list" else "moved") in shown
     with pytest.raises(SystemExit):
         app(["show", str(path), str(person.id), "--json"])
-    assert len(json.loads(capsys.readouterr().out)["track"]) == STEP + FRAMES
+    assert len(json.loads(capsys.readouterr().out)["matches"][0]["track"]) == STEP + FRAMES
 
 
 def test_the_stage_moves_it(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_geometry_written_in_one_place_is_built_in_another(
     common = ["--reconstruction", "pi3", "--weights", str(tmp_path / "weights"), "--device", "cpu"]
     out = ["precompute", str(pictures), "--out", str(tmp_path / "files"), *common, "--chunk", "8", "--overlap", "4"]
     assert run([*out, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    (report,) = json.loads(capsys.readouterr().out)["matches"]
     assert (report["files"], report["frames"], report["posed"]) == (2, 12, 12)
     neural_scenes.forget_upstream()
     before = (tmp_path / "files" / "chunk-0000.npz").stat().st_mtime_ns
@@ -203,7 +203,7 @@ def test_an_update_and_a_resumed_build_take_the_same_options(
     options = ["--reconstruction", "pi3", "--weights", str(tmp_path / "weights"), "--device", "cpu", "--json"]
     capsys.readouterr()
     assert run(["update", str(tmp_path / "m.l3r"), str(again), *options]) == 0
-    report = json.loads(capsys.readouterr().out)
+    (report,) = json.loads(capsys.readouterr().out)["matches"]
     assert report["posed"] == 10
 
 
@@ -217,7 +217,7 @@ def test_every_part_can_be_a_network(
         folder = neural_models.save(f"{part}/{name}", tmp_path / part)
         options += [f"--{part}", name, "--weights", f"{part}={folder}"]
     assert run(arguments(tmp_path, "da3", *options, "--json")) == 0
-    assert json.loads(capsys.readouterr().out)["posed"] == 12
+    assert json.loads(capsys.readouterr().out)["matches"][0]["posed"] == 12
     with list3r.open(tmp_path / "m.l3r") as scene:
         said = scene.store.sessions.all()[0].settings
         assert [said[part] for part in parts] == list(parts.values())

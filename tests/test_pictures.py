@@ -75,7 +75,7 @@ def test_without_pictures_it_is_said(tmp_path: Path) -> None:
 def test_the_command_writes_it(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mug.png"
     assert run(["picture", str(room), str(MUG), "--out", str(out), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    (told,) = json.loads(capsys.readouterr().out)["matches"]
     assert told["frame"] == 0 and told["followed"] and told["path"] == str(out)
     assert Image.open(out).size == (30, 20)
     assert run(["picture", str(room), str(MUG), "--out", str(out), "--whole"]) == 0

@@ -221,7 +221,8 @@ def test_the_command_writes_it(memory: SceneMemory, tmp_path: Path, capsys: pyte
     arguments = ["export", str(memory.path), "--to", "prompt", "--out", str(tmp_path / "pack")]
     assert run([*arguments, "--tokens", "400", "--question", "the mug", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["bytes"] == sum(told["files"].values()) and str(tmp_path / "pack/scene.md") in told["files"]
+    sizes = {f["path"]: f["bytes"] for f in told["matches"]}
+    assert sizes[str(tmp_path / "pack/scene.md")] == (tmp_path / "pack/scene.md").stat().st_size
     assert run([*arguments, "--tokens", "5"]) == 2
     assert "too few" in capsys.readouterr().err
 

@@ -62,7 +62,7 @@ def test_a_memory_without_scale_says_so(memory: Path, capsys: pytest.CaptureFixt
         assert not any("cm" in i.description for i in scene.instances())
     assert run(["scale", str(memory)]) == 0 and "relative" in capsys.readouterr().out
     assert run(["query", "nearest", str(memory), "--point", "0,0,0", "--json"]) == 0
-    assert {m["units"] for m in json.loads(capsys.readouterr().out)} == {"unit"}
+    assert json.loads(capsys.readouterr().out)["units"] == "unit"
     assert run(["list", str(memory)]) == 0 and "center (unit)" in capsys.readouterr().out
 
 
@@ -139,7 +139,7 @@ def test_metric_memories_need_no_anchor(make_memory, capsys: pytest.CaptureFixtu
     assert run(["scale", str(path), "--anchor", "3=1m"]) == 2
     assert "metres already" in capsys.readouterr().err
     assert run(["scale", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["scale"] == "metric"
+    assert json.loads(capsys.readouterr().out)["matches"][0]["scale"] == "metric"
 
 
 def test_a_memory_that_gets_a_metric_chunk_is_metric(tmp_path: Path, chunks: list[ChunkResult]) -> None:

@@ -94,14 +94,14 @@ def test_answers_are_those_of_the_memory(room: Path) -> None:
         measured, told = memory.measure(MUG, TWIN), call(room, "measure", a=MUG, b=TWIN)
         assert told["gap"] == pytest.approx(measured.gap, abs=1e-4)
         assert told["from_a_to_b"] == [0.4, -0.2, 0.0] and told["center_distance"] == pytest.approx(0.2**0.5, abs=1e-4)
-    assert {m["id"] for m in call(room, "within", center=[2, 0, 0.7], radius=0.5)["entries"]} == {TABLE, MUG, TWIN}
+    assert {m["id"] for m in call(room, "within", center=[2, 0, 0.7], radius=0.5)["matches"]} == {TABLE, MUG, TWIN}
     on = call(room, "relations", predicate="on", object=TABLE)
-    assert [(r["subject"], r["object_name"]) for r in on["entries"]] == [(MUG, "table"), (TWIN, "table")]
+    assert [(r["subject"], r["object_name"]) for r in on["matches"]] == [(MUG, "table"), (TWIN, "table")]
     assert call(room, "between", a=MUG, b=TWIN)["state"] == "known"
     described = call(room, "describe", id=MUG)
     assert described["center"] == [1.8, 0.1, 0.77] and described["relations"][0]["predicate"] == "on"
     assert call(room, "path_of", id=MUG)["seen"][0]["session"] == 1
-    assert call(room, "changes") == {"total": 0, "entries": [], "units": "m"}
+    assert call(room, "changes") == {"units": "m", "total": 0, "matches": [], "notes": []}
 
 
 def test_a_picture_is_a_picture(room: Path) -> None:
@@ -113,9 +113,9 @@ def test_a_picture_is_a_picture(room: Path) -> None:
 
 def test_lists_come_in_pages(room: Path) -> None:
     first = call(room, "relations", limit=3)
-    assert first["total"] == 4 and len(first["entries"]) == 3 and first["next_offset"] == 3
+    assert first["total"] == 4 and len(first["matches"]) == 3 and first["next_offset"] == 3
     last = call(room, "relations", limit=3, offset=3)
-    assert len(last["entries"]) == 1 and "next_offset" not in last
+    assert len(last["matches"]) == 1 and "next_offset" not in last
     assert "less than or equal to 100" in call(room, "relations", limit=100000)
 
 

@@ -136,7 +136,7 @@ def test_known_geometry_becomes_a_memory(
 ) -> None:
     assert run(build(real, tmp_path, "--chunk", "8", "--overlap", "4")) == 0
     printed = capsys.readouterr()
-    assert json.loads(printed.out)["posed"] == 12, "packages print; standard output is for results"
+    assert json.loads(printed.out)["matches"][0]["posed"] == 12, "packages print; standard output is for results"
     assert "warn" not in printed.err.lower()
     with list3r.open(tmp_path / "m.l3r") as scene:
         chunks = scene.store.chunks.all()
@@ -150,7 +150,7 @@ def test_memory_that_runs_out_makes_shorter_windows(
 ) -> None:
     taught.most = 6
     assert run(build(real, tmp_path, "--chunk", "12")) == 0
-    assert json.loads(capsys.readouterr().out)["posed"] == 12 and taught.passes >= 4
+    assert json.loads(capsys.readouterr().out)["matches"][0]["posed"] == 12 and taught.passes >= 4
     check_trajectory(tmp_path / "m.l3r")
 
 

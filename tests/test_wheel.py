@@ -42,6 +42,6 @@ def test_installed_elsewhere_it_runs_the_demo(wheel: Path, tmp_path: Path) -> No
         command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False, timeout=300
     )
     assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
+    (report,) = json.loads(result.stdout)["matches"]
     assert report["build"]["posed"] == 60
     assert all(Path(path).stat().st_size > 0 for path in report["exports"].values())

@@ -10,11 +10,13 @@ import functools
 import os
 import signal
 import sys
+from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
 import typer
 
+from list3r.cli.answer import print_error, wants_json
 from list3r.cli.ask import memory as memory_commands
 from list3r.cli.ask import picture as picture_commands
 from list3r.cli.ask import query as query_commands
@@ -98,7 +100,8 @@ def commands() -> Any:
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command; its exit status."""
+    """Run one command; its exit status. What failed is said in one line, with `--json` in an answer as well."""
+    told = _Failures(wants_json(arguments))
     try:
         with naming_extras():
             status = commands().main(arguments, prog_name="list3r", standalone_mode=False)
@@ -107,11 +110,11 @@ def run(arguments: list[str]) -> int:
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except _USAGE_ERROR as error:
-        return _usage_error(error)
+        return told.usage(error)
     except _COMMAND_ERROR as error:
-        return _fail(error.format_message())  # type: ignore[attr-defined]
+        return told.fail("OptionError", error.format_message())  # type: ignore[attr-defined]
     except List3rError as error:
-        return _unwritten(error) if isinstance(error, OutputError) else _fail(str(error))
+        return _unwritten(error) if isinstance(error, OutputError) else told.fail(type(error).__name__, str(error))
     except (KeyboardInterrupt, typer.Abort):
         tell("", "interrupted")
         return 1
@@ -120,22 +123,46 @@ def run(arguments: list[str]) -> int:
             raise
         return _unheard()
     except (RuntimeError, OSError) as error:
-        return _fail_of_system(error)
+        return told.fail_of_system(error)
 
 
-def _fail_of_system(error: RuntimeError | OSError) -> int:
-    """What the system says, and links that lead to themselves, which Python calls no error of the system."""
-    if isinstance(error, RuntimeError):
-        if not str(error).startswith("Symlink loop"):
-            raise error
-        return _fail(f"{error}; remove one of the links")
-    where = f" {error.filename}:" if error.filename else ""
-    return _fail(f"{where} {error.strerror or error}".strip())
+@dataclass(frozen=True)
+class _Failures:
+    """How a command that fails says so."""
+
+    json: bool
+    """Whether standard output gets an answer that holds the error."""
+
+    def fail(self, kind: str, message: str) -> int:
+        """Say what is wrong with the input; exit status 2."""
+        tell(f"error: {message}")
+        if self.json:
+            print_error(kind, message, 2)
+        return 2
+
+    def fail_of_system(self, error: RuntimeError | OSError) -> int:
+        """What the system says, and links that lead to themselves, which Python calls no error of the system."""
+        if isinstance(error, RuntimeError):
+            if not str(error).startswith("Symlink loop"):
+                raise error
+            return self.fail("OSError", f"{error}; remove one of the links")
+        where = f" {error.filename}:" if error.filename else ""
+        return self.fail("OSError", f"{where} {error.strerror or error}".strip())
+
+    def usage(self, error: BaseException) -> int:
+        """What is wrong with the command line, and where its help is."""
+        context = error.ctx  # type: ignore[attr-defined]
+        message = error.format_message()  # type: ignore[attr-defined]
+        if not message or message.startswith("Usage:"):
+            tell(*(message or context.get_help()).splitlines())
+            return 2
+        path = context.command_path if context is not None else "list3r"
+        return self.fail("OptionError", f"{message.rstrip('.')}; see `{path} --help`")
 
 
 def _unwritten(error: OutputError) -> int:
     mute()
-    _fail(str(error))
+    tell(f"error: {error}")
     return 1
 
 
@@ -143,18 +170,3 @@ def _unheard() -> int:
     """Whoever read the output has heard enough, as in `list3r list house.l3r | head -1`: that is no failure."""
     mute()
     return 0
-
-
-def _usage_error(error: BaseException) -> int:
-    context = error.ctx  # type: ignore[attr-defined]
-    message = error.format_message()  # type: ignore[attr-defined]
-    if not message or message.startswith("Usage:"):
-        tell(*(message or context.get_help()).splitlines())
-        return 2
-    path = context.command_path if context is not None else "list3r"
-    return _fail(f"{message.rstrip('.')}; see `{path} --help`")
-
-
-def _fail(message: str) -> int:
-    tell(f"error: {message}")
-    return 2

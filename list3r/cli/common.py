@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 
 import typer
 
-from list3r.cli.terminal import say, tell, write
+from list3r.cli.terminal import say, tell
 from list3r.memory.description.printable import shown
 
 if TYPE_CHECKING:
@@ -136,11 +135,6 @@ def _given(group: Any, name: str, value: Any) -> Any:
     return tuple(value or ()) if several and isinstance(default, tuple) else value
 
 
-def print_json(value: object) -> None:
-    """JSON on standard output; NaN becomes null."""
-    write(json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
-
-
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
     """Left-aligned columns under a header; a word where there are no rows."""
     rows = list(rows)
@@ -160,16 +154,3 @@ def note(*lines: str) -> None:
 
 def _cell(value: object) -> str:
     return f"{value:.3f}" if isinstance(value, float) else shown(value)
-
-
-def _plain(value: Any) -> Any:
-    """Arrays to lists, NumPy numbers to Python's, NaN to null, floats to six decimals."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float):
-        return round(value, 6) if math.isfinite(value) else None
-    return value

@@ -28,9 +28,13 @@ class Found(Matches):
     """Ranked answers; `notes` name words without a match, unknown relations, and how many answers are equal."""
 
     def __init__(
-        self, matches: Iterable[Match] = (), notes: Sequence[str] = (), unknown_words: Sequence[str] = ()
+        self,
+        matches: Iterable[Match] = (),
+        notes: Sequence[str] = (),
+        unknown_words: Sequence[str] = (),
+        total: int | None = None,
     ) -> None:
-        super().__init__(matches, notes)
+        super().__init__(matches, notes, total)
         self.unknown_words = tuple(dict.fromkeys(unknown_words))
         """Words that no instance of the memory has."""
 
@@ -54,7 +58,24 @@ def find(
     text without sense and `UnknownIdError` for a number that was never an id.
     """
     k = checked_count(k)
-    phrase = parse(text)
+    found, search = meant(store, parse(text), viewpoint, encoder)
+    matches = [
+        Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "any instance") for c in found[:k]
+    ]
+    out = Found(matches, search.notes, search.unknown, len(found))
+    if out.ambiguous and len(found) > 1:
+        equal = sum(c.score > found[0].score - _EQUAL for c in found)
+        out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- phrases
+
+
+def meant(
+    store: Store, phrase: Phrase, viewpoint: Place | None = None, encoder: WordEncoder | None = None
+) -> tuple[list[PhraseMatch], PhraseSearch]:
+    """Return all that a phrase may mean, the best first, and the search with its notes and unknown words."""
     if viewpoint is not None:
         viewer_from(store, viewpoint)
     gathered = gather(store, phrase)
@@ -63,17 +84,7 @@ def find(
     search = PhraseSearch(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
     search.notes += [] if gathered is None else gathered.notes
     found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
-    matches = [
-        Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "any instance") for c in found[:k]
-    ]
-    out = Found(matches, search.notes, search.unknown)
-    if out.ambiguous and len(found) > 1:
-        equal = sum(c.score > found[0].score - _EQUAL for c in found)
-        out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
-    return out
-
-
-# ---------------------------------------------------------------------------------------------- phrases
+    return found, search
 
 
 def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:

@@ -46,10 +46,12 @@ class Match:
 class Matches(list[Match]):
     """Answers, the best first, with what can be said of the question as a whole."""
 
-    def __init__(self, matches: Iterable[Match] = (), notes: Sequence[str] = ()) -> None:
+    def __init__(self, matches: Iterable[Match] = (), notes: Sequence[str] = (), total: int | None = None) -> None:
         super().__init__(matches)
         self.notes = tuple(dict.fromkeys(notes))
         """What a reader should know, such as what was left out."""
+        self.total = total
+        """How many answer in all, those that are not in the list too; None where the question stops at the k-th."""
 
 
 class FilterOptions(TypedDict, total=False):

@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
+from list3r.queries.find import meant
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
+from list3r.queries.finding.grammar import parse
 from list3r.queries.finding.words import STRUCTURE, not_borne, wanted_words, word_score
 from list3r.queries.match import (
     FilterOptions,
@@ -48,10 +50,11 @@ def nearest(
 ) -> Matches:
     """Find the k instances nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
-    With `words` only things whose label or description bears one of them; with words alone those that they name best
-    (most words, then confidence), without distances. The words must all be found where any thing bears them all. Words
-    that name a kind of structure ("floor", "wall") ask for structure too. Words that nothing bears are compared by the
-    vectors of an `encoder` whose space the memory holds. `max_distance` bounds the distance between
+    With `words` only things whose label or description bears one of them; with words alone those that they name best,
+    then the surest, without distances. The words must all be found where any thing bears them all. Words that say more
+    than names (a relation, a size, an id: "small mug on the table") mean what they mean to `find`. Words that name a
+    kind of structure ("floor", "wall") ask for structure too. Words that nothing bears are compared by the vectors of
+    an `encoder` whose space the memory holds. `max_distance` bounds the distance between
     surfaces. What moves is taken where it was last seen; near an instance only what shares its component answers. For
     the filters see `Filters`. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that
     was never given.
@@ -72,28 +75,56 @@ def nearest(
     if words is None:
         near = _near(store, origin, place, k, max_distance, filters)
         return Matches(_match(i, distance, "", origin, place) for distance, i in near)
-    if is_large(store) and (origin is not None or place is not None) and _common(store, words):
+    if is_large(store) and (origin is not None or place is not None) and _only_common(store, words):
         filters = replace(filters, label=" ".join([*([filters.label] if filters.label else []), words]))
         near = _near(store, origin, place, k, max_distance, filters)
         return Matches(_match(i, distance, f"named {words}", origin, place) for distance, i in near)
     notes: list[str] = []
-    others = [i for i in _bearers(store, words, filters, notes) if origin is None or i.id != origin.id]
-    named = _named(others, words)
-    if not named and encoder is not None:
-        named = _alike(store, encoder, words, filters, notes)
-    if not named and (unknown := [w for w in wanted_words(words) if w not in store.words.known([w])]):
-        notes.append(not_borne(unknown, sample(store)))
+    named = _called(store, words, origin, filters, encoder, notes)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
-        return Matches((Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k]), notes)
+        best = (Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k])
+        return Matches(best, notes, len(ranked))
     bearing = [i for i, _, _ in named if origin is None or (i.id != origin.id and i.component == origin.component)]
     reasons = {i.id: reason for i, _, reason in named}
     found = _by_distance(bearing, _measure(store, origin, place), _aabb(origin, place), k, max_distance)
     return Matches((_match(i, distance, reasons[i.id], origin, place) for distance, i in found), notes)
 
 
-def _common(store: Store, words: str) -> bool:
-    """Tell whether so many bear all the words that it is better to look around for them than to look at them all."""
+def _called(
+    store: Store,
+    words: str,
+    origin: Instance | None,
+    filters: Filters,
+    encoder: WordEncoder | None,
+    notes: list[str],
+) -> list[tuple[Instance, float, str]]:
+    """Return what the words say, with how well and why: a phrase as `find` reads it, else things that bear them."""
+    if _says_more_than_names(words):
+        found, search = meant(store, parse(words), encoder=encoder)
+        notes += search.notes
+        return [(c.instance, c.score, "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
+    others = [i for i in _bearers(store, words, filters, notes) if origin is None or i.id != origin.id]
+    named = _named(others, words)
+    if not named and encoder is not None:
+        named = _alike(store, encoder, words, filters, notes)
+    if not named and (unknown := [w for w in wanted_words(words) if w not in store.words.known([w])]):
+        notes.append(not_borne(unknown, sample(store)))
+    return named
+
+
+def _says_more_than_names(words: str) -> bool:
+    try:
+        phrase = parse(words)
+    except OptionError:  # such as "mug on": a name that ends in a relation
+        return False
+    return bool(phrase.where or phrase.size or phrase.superlative or phrase.instance_id is not None)
+
+
+def _only_common(store: Store, words: str) -> bool:
+    """Tell whether the words only name, and so many bear them that it is better to look around than at all of them."""
+    if _says_more_than_names(words):
+        return False
     return len(store.words.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance, Relation
-from list3r.memory.relations.predicates import PREDICATES
+from list3r.memory.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
 from list3r.queries.finding.words import not_borne, wanted_words, words_of
@@ -83,6 +83,14 @@ def relations(
         key=lambda r: (-r.confidence, r.subject, r.predicate, r.object),
     )
     return Relations(kept, found.state, "; ".join([*([found.reason] if found.reason else []), *notes]))
+
+
+def relations_of(store: Store, instance_id: int) -> list[Relation]:
+    """Return the stored relations of an instance, each once: of two inverse ones that in which it is the subject."""
+    own = store.relations.all(instance_id, None, None)
+    told = {(r.predicate, r.object) for r in own}
+    others = store.relations.all(None, None, instance_id)
+    return [*own, *(r for r in others if (INVERSE.get(r.predicate), r.subject) not in told)]
 
 
 def viewer_from(store: Store, viewpoint: Place) -> Viewpoint | None:

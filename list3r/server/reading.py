@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import Counter
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from pydantic import Field
 
 from list3r.api import SceneMemory
 from list3r.memory.errors import OptionError
+from list3r.queries.match import Match
+from list3r.queries.relations import Relations
 from list3r.server.records import (
     MOST,
     change_record,
@@ -71,8 +74,8 @@ class ReadingTools:
         An empty answer means that nothing fits; `notes` say which words nothing bears.
         """
         found = self._memory.find(text, limit)
-        told = {"ambiguous": found.ambiguous, "unknown_words": list(found.unknown_words), "notes": list(found.notes)}
-        return {"matches": [match_record(m) for m in found], **told, "units": self._memory.units}
+        told = {"total": found.total, "ambiguous": found.ambiguous, "unknown_words": list(found.unknown_words)}
+        return {**self._matches(found, found.notes), **told}
 
     def nearest(
         self,
@@ -91,7 +94,7 @@ class ReadingTools:
         if len(given) != 1:
             raise OptionError("give one of id, point and words")
         found = self._memory.nearest(given[0], limit, max_distance=max_distance, label=label, color=color)
-        return {"matches": [match_record(m) for m in found], "notes": list(found.notes), "units": self._memory.units}
+        return self._matches(found, found.notes)
 
     def within(
         self,
@@ -104,7 +107,7 @@ class ReadingTools:
     ) -> dict[str, Any]:
         """The things in a sphere (center, radius) or in a box (lower and upper corner), the most inside first."""
         found = self._memory.within(lower=lower, upper=upper, center=center, radius=radius)
-        return {**page([match_record(m) for m in found], limit, offset), "units": self._memory.units}
+        return page([match_record(m) for m in found], self._memory.units, limit, offset)
 
     def relations(
         self,
@@ -120,16 +123,12 @@ class ReadingTools:
         cannot tell.
         """
         found = self._memory.relations(subject, predicate, object, viewpoint=viewpoint)
-        names = self._names()
-        told = {"state": found.state, "reason": found.reason}
-        return {**page([relation_record(r, names) for r in found], limit, offset), **told}
+        return self._relations(found, limit, offset)
 
     def between(self, a: Id, b: Id, limit: Limit = 20) -> dict[str, Any]:
         """The things that stand between two instances."""
         found = self._memory.relations(predicate="between", object=a, other=b)
-        names = self._names()
-        told = {"state": found.state, "reason": found.reason}
-        return {**page([relation_record(r, names) for r in found], limit, 0), **told}
+        return self._relations(found, limit, 0)
 
     def measure(self, a: Id, b: Id) -> dict[str, Any]:
         """How far two instances are apart (gap of surfaces, distance of centres) and which way b lies from a."""
@@ -152,7 +151,7 @@ class ReadingTools:
         m = self._memory
         i = m.instance(id)
         names = self._names()
-        found = [*m.relations(subject=i.id), *m.relations(object=i.id)]
+        found = m.relations_of(i.id)
         return {
             **instance_record(i),
             "label": i.label,
@@ -196,7 +195,7 @@ class ReadingTools:
     ) -> dict[str, Any]:
         """What later sessions showed to be moved, removed and added, the newest first."""
         found = self._memory.changes(since)
-        return {**page([change_record(c) for c in found], limit, offset), "units": self._memory.units}
+        return page([change_record(c) for c in found], self._memory.units, limit, offset)
 
     def path_of(self, id: Id) -> dict[str, Any]:
         """Where an instance has been: its track while it moved, its moves between sessions, when it was seen."""
@@ -215,6 +214,14 @@ class ReadingTools:
             "now": numbers(i.center),
             "units": m.units,
         }
+
+    def _matches(self, found: Sequence[Match], notes: Sequence[str]) -> dict[str, Any]:
+        return {"units": self._memory.units, "matches": [match_record(m) for m in found], "notes": list(notes)}
+
+    def _relations(self, found: Relations, limit: int, offset: int) -> dict[str, Any]:
+        names, notes = self._names(), [found.reason] if found.reason else []
+        lines = [relation_record(r, names) for r in found]
+        return {**page(lines, self._memory.units, limit, offset, notes), "state": found.state}
 
     def _names(self) -> dict[int, str]:
         return {i.id: name_of(i) for i in self._memory.instances(structure=None)}

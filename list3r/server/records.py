@@ -87,9 +87,12 @@ def change_record(change: Changed) -> dict[str, Any]:
     }
 
 
-def page(entries: Sequence[Any], limit: int, offset: int) -> dict[str, Any]:
-    """Return a page of a list with how many there are in all, and where the next page begins."""
+def page(
+    entries: Sequence[Any], units: str, limit: int = MOST, offset: int = 0, notes: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return a page of matches with unit and notes, how many there are in all, and where the next page begins."""
     limit, offset = min(max(limit, 1), MOST), max(offset, 0)
     end = offset + limit
     more = {"next_offset": end} if end < len(entries) else {}
-    return {"total": len(entries), "entries": list(entries[offset:end]), **more}
+    matches = list(entries[offset:end])
+    return {"units": units, "total": len(entries), "matches": matches, "notes": list(notes), **more}

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 
 
 def changes(
@@ -28,7 +29,7 @@ def changes(
     with open_memory(memory) as scene:
         found = find(scene.store, since, KINDS if seen_again else KINDS[:3], min_confidence)
         if json:
-            print_json([_entry(c, scene.units) for c in found])
+            print_answer((_entry(c) for c in found), scene.units)
             return
         rows = [
             [
@@ -51,18 +52,16 @@ def _place(box: Any) -> str:
     return "" if box is None else ", ".join(f"{v:.2f}" for v in box.center)
 
 
-def _entry(changed: Any, units: str) -> dict[str, Any]:
+def _entry(changed: Any) -> dict[str, Any]:
     from list3r.cli.ask.memory import instance_dict
 
     event = changed.event
     return {
         "session": event.session_id,
-        "id": event.instance_id,
         "kind": event.kind,
         "from": _box(event.from_box),
         "to": _box(event.to_box),
         "distance": changed.distance_m,
-        "units": units,
         "confidence": event.confidence,
         "reason": event.reason,
         "frames": [{"session": s, "frame": f} for s, f in event.frames],

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def info(
         chunks = loop_report(scene.store) if loops else {}
         units = scene.units
     if json:
-        print_json({**report, **chunks})
+        print_answer([{**report, **chunks}], report.pop("units"))
         return
     for key, value in report.items():
         if key != "sessions" and (key, value) != ("beside", None):
@@ -78,7 +79,7 @@ def list_instances(
         units = scene.units
     kept = [i for i in found if i.confidence >= min_confidence]
     if json:
-        print_json([instance_dict(i) for i in kept])
+        print_answer(map(instance_dict, kept), units, total=len(found))
         return
     rows = [
         [
@@ -120,7 +121,7 @@ def show(
 
     with open_memory(memory) as scene:
         instance = scene.instance(instance_id)
-        relations = scene.relations(subject=instance.id) + scene.relations(object=instance.id)
+        relations = scene.relations_of(instance.id)
         names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
         aliases = scene.store.ids.aliases_of(instance.id)
         track = scene.track(instance.id) if instance.dynamic else None
@@ -130,7 +131,7 @@ def show(
     if json:
         related = [vars(r) for r in relations]
         told = {"relations": related, "aliases": aliases, "observed_as": parts}
-        print_json({**instance_dict(instance, track), **label_source(instance, named), **told})
+        print_answer([{**instance_dict(instance, track), **label_source(instance, named), **told}], units)
         return
     say(f"{instance.id}  {instance.label or instance.description}")
     for key, value in (

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from list3r.cli.answer import print_answer
 from list3r.cli.ask.memory import instance_dict
-from list3r.cli.common import note, print_json, print_table
+from list3r.cli.common import note, print_table
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -67,18 +68,16 @@ def camera_from(
     return scene.camera(position=values[:3], quat_wxyz=values[3:], session=session)
 
 
-def match_dict(match: Match, units: str) -> dict[str, Any]:
-    """A match for machines."""
-    return {
-        "id": match.instance.id,
+def match_dict(match: Match) -> dict[str, Any]:
+    """A match for machines: the instance, and how it answers; `view` only where the question was about a frame."""
+    answer = {
         "score": match.score,
         "distance": match.distance_m,
         "center_distance": match.center_distance_m,
-        "units": units,
         "reason": match.reason,
-        "view": view_dict(match.best_view),
-        "instance": instance_dict(match.instance),
+        "view": view_dict(match.view),
     }
+    return {**instance_dict(match.instance), **answer}
 
 
 def view_dict(view: BestView | None) -> dict[str, Any] | None:
@@ -88,13 +87,15 @@ def view_dict(view: BestView | None) -> dict[str, Any] | None:
     return {"session": view.session_id, "frame": view.frame_index, "box_xyxy": list(view.box_xyxy)}
 
 
-def print_matches(matches: Sequence[Match], units: str, json: bool) -> None:
-    """Matches as a table, or as JSON; what is to be said of all of them goes to standard error."""
-    for line in getattr(matches, "notes", ()):
-        note(f"note: {line}")
+def print_matches(matches: Sequence[Match], units: str, json: bool, **facts: Any) -> None:
+    """Matches as a table, or as JSON with more facts; what is to be said of all of them goes to standard error."""
+    notes, total = getattr(matches, "notes", ()), getattr(matches, "total", None)
     if json:
-        print_json([match_dict(m, units) for m in matches])
+        print_answer(map(match_dict, matches), units, notes, **{"total": total, **facts})
         return
+    note(*(f"note: {line}" for line in notes))
+    if total is not None and total > len(matches):
+        note(f"note: the best {len(matches)} of {total}; -k {total} shows all")
     placed = any(m.distance_m is not None or m.center_distance_m is not None for m in matches)
     rows = [
         [
@@ -116,9 +117,8 @@ def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
     names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
     gravity, units = scene.gravity, scene.units
     if json:
-        entries = [vars(r) for r in found]
-        head = {"gravity": gravity, "units": units, "state": found.state, "reason": found.reason}
-        print_json({**head, "relations": entries})
+        notes = [found.reason] if found.reason else []
+        print_answer(map(vars, found), units, notes, total=len(found), state=found.state, gravity=gravity)
         return
     if found.state == "unknown":
         say(f"unknown: {found.reason}")

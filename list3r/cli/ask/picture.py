@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import say
 
 
@@ -43,6 +44,6 @@ def picture(
         Image.fromarray(found.marked() if whole else found.crop()).save(temporary, quality=92)
     if json:
         told = {"id": found.instance_id, "session": found.session_id, "frame": found.frame_index}
-        print_json({**told, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)})
+        print_answer([{**told, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)}])
     else:
         say(f"{out}  frame {found.frame_index} of session {found.session_id}, {found.visible_fraction:.0%} visible")

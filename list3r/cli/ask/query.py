@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from list3r.cli.answer import print_answer
 from list3r.cli.ask.output import (
     Color,
     Component,
@@ -23,11 +24,10 @@ from list3r.cli.ask.output import (
     Time,
     View,
     camera_from,
-    match_dict,
     print_matches,
     print_relations,
 )
-from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, parse_point, print_json, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, parse_point, print_table
 from list3r.cli.terminal import say
 
 query_app = typer.Typer(help="Ask a memory.", no_args_is_help=True, rich_markup_mode=None)
@@ -137,7 +137,8 @@ def within(
         raise OptionError("give a region: --box x,y,z,x,y,z, --point x,y,z with --radius, --view FRAME or --pose")
     with open_memory(memory) as scene:
         region["camera"] = camera_from(scene, view, None, pose, session)
-        print_matches(scene.within(**region), scene.units, json)
+        found = scene.within(**region)
+        print_matches(found, scene.units, json, total=len(found))
 
 
 def relations(
@@ -245,17 +246,7 @@ def find(
     """
     with open_memory(memory) as scene:
         found, units = scene.find(text, k, viewpoint=viewpoint), scene.units
-    if json:
-        print_json(
-            {
-                "matches": [match_dict(m, units) for m in found],
-                "ambiguous": found.ambiguous,
-                "unknown_words": list(found.unknown_words),
-                "notes": list(found.notes),
-            }
-        )
-        return
-    print_matches(found, units, json=False)
+    print_matches(found, units, json, ambiguous=found.ambiguous, unknown_words=found.unknown_words)
 
 
 def seen(
@@ -285,7 +276,7 @@ def seen(
             found = scene.visible(camera, max_depth=max_depth, structure=structure)
             if camera.frame is not None and not json:
                 note(f"frame {camera.frame.frame_index} of session {camera.session_id}, {camera.frame.time_s:.2f} s")
-            print_matches(found, scene.units, json)
+            print_matches(found, scene.units, json, total=len(found))
             return
         assert instance_id is not None
         sightings = scene.seen(instance_id)
@@ -302,7 +293,7 @@ def seen(
             }
             for f in sightings.frames
         ]
-        print_json({"id": sightings.instance_id, "spans": spans, "frames": frames})
+        print_answer([{"id": sightings.instance_id, "spans": spans, "frames": frames}])
         return
     say(f"{name.id}  {name.label or name.description}: seen in {len(sightings.frames)} frames")
     rows = []

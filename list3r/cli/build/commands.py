@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
-from list3r.cli.common import JsonOption, print_json, spread
+from list3r.cli.common import JsonOption, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import BuildRequest, RunOptions
 
@@ -61,7 +62,7 @@ def inspect(
             draw_registration(opened, temporary)
         report["overlay"] = str(overlay)
     if json:
-        print_json(report)
+        print_answer([report])
     else:
         say(*lines(report))
 
@@ -147,4 +148,4 @@ def demo(
 
     report = run_demo(out, seed=seed, frames=frames, workers=workers, quiet=json)
     if json:
-        print_json(report)
+        print_answer([report])

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import typer
 
-from list3r.cli.common import note, print_json
+from list3r.cli.answer import print_answer
+from list3r.cli.common import note
 from list3r.cli.terminal import say
 from list3r.pipeline.request import Watch
 
@@ -79,9 +80,17 @@ def say_result(
     except FinishingError as error:
         report, failure = cast(Report, error.report), error
     if json:
-        print_json({"memory": str(memory), **report.as_dict()})
+        told = {"memory": str(memory), **report.as_dict()}
+        del told["notes"]
+        failed: dict[str, Any] = {}
+        if failure is not None:
+            failed["error"] = {"kind": type(failure).__name__, "message": str(failure), "status": 2}
+        print_answer([told], notes=report.notes, **failed)
     else:
         say(*lines(memory, report))
+    if failure is not None and json:
+        note(f"error: {failure}")
+        raise typer.Exit(2)
     if failure is not None:
         raise failure
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def merges(
         edits = {e.entry: e for e in scene.store.edits.all()}
         state = states(scene.store)
     if json:
-        print_json(
+        print_answer(
             [
                 {
                     "entry": e.entry,
@@ -157,7 +158,7 @@ def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool
     with open_scene(path, writable=True) as scene:
         report = verb(scene)
     if json:
-        print_json(report.as_dict())
+        print_answer([report.as_dict()], scene.units)
         return
     say(f"{report.text} (entry {report.entry})")
     told = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
 from list3r.exporters.registry import FOLDERS, FORMATS
 
@@ -37,8 +38,7 @@ def export(
         written = scene.export(to, out, tokens=tokens, question=question)
     sizes = {str(path): path.stat().st_size for path in written}
     if json:
-        size = sizes.get(str(out), sum(sizes.values()))
-        print_json({"format": to, "path": str(out), "bytes": size, "files": sizes})
+        print_answer({"format": to, "path": path, "bytes": size} for path, size in sizes.items())
     else:
         say(*(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
 
@@ -64,7 +64,7 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         found = [f"it cannot be opened: {error.__cause__}"]
     if json:
         facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": beside}
-        print_json({**facts, "sessions": state, "chunks": chunks})
+        print_answer([{**facts, "sessions": state, "chunks": chunks}])
     elif found:
         say(*found)
         say(f"`list3r repair {memory}` saves what is sound")
@@ -105,7 +105,7 @@ def repair(
 
     report = salvage(memory, out)
     if json:
-        print_json(report.as_dict())
+        print_answer([report.as_dict()])
         return
     if not report.damage:
         where = "nothing was changed" if out is None else f"{out} is a copy"
@@ -130,7 +130,7 @@ def doctor(json: JsonOption = False) -> None:
 
     rows = findings()
     if json:
-        print_json([{"part": part, "state": state, "means": means} for part, state, means in rows])
+        print_answer({"part": part, "state": state, "means": means} for part, state, means in rows)
     else:
         print_table(rows, ["part", "state", "needed for"])
     if any(state.startswith("MISSING") for _, state, _ in rows):

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_json
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory
 from list3r.cli.edit.commands import AuthorOption
 from list3r.cli.terminal import say
 
@@ -46,7 +47,7 @@ def scale(
         units = scene.units
     if json:
         told = None if anchor is None else report.as_dict()
-        print_json({"scale": kind, "scale_source": source, "units": units, "edit": told})
+        print_answer([{"scale": kind, "scale_source": source, "edit": told}], units)
     elif kind == "relative":
         say('scale relative: the length of a unit is unknown; --anchor "ID=0.095m" makes them metres')
     else:

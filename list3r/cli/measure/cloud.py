@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from list3r.cli.common import JsonOption, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, print_table
 from list3r.cli.measure.inputs import is_memory, is_source, read_points, read_trajectory
 from list3r.cli.measure.options import (
     Estimate,
@@ -91,7 +92,7 @@ def cloud(
     if json:
         used = {"truth": true.words, "estimate": found.words, "alignment": how, "voxel_m": voxel}
         counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
-        print_json({**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)})
+        print_answer([{**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)}])
         return
     say(f"truth     {true.words}; {len(true.points):,} compared")
     say(f"estimate  {found.words}; {len(found.points):,} compared")

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from list3r.cli.common import JsonOption, open_memory, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, open_memory, print_table
 from list3r.cli.measure.cloud import cloud
 from list3r.cli.measure.inputs import align_by_path, is_memory, mask_frames, read_scene_of, read_trajectory
 from list3r.cli.measure.options import (
@@ -77,7 +78,7 @@ def trajectory(
         )
     scores = errors.as_dict()
     if json:
-        print_json(scores)
+        print_answer([scores])
         return
     covered = errors.covered
     say(f"{errors.pairs} poses associated; scale {errors.scale:.4f}; RPE over {apart}")
@@ -155,7 +156,7 @@ def instances(
             _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), plot
         )
     if json:
-        print_json(scores)
+        print_answer([scores])
         return
     if S_truth_scene is not None:
         say(f"placed by the camera's path in {align}, scale {float(S_truth_scene.scale):.4f}")

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from list3r.cli.common import JsonOption, open_memory, print_json, print_table
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, open_memory, print_table
 from list3r.cli.measure.inputs import read_covisibility_of
 from list3r.cli.measure.options import (
     EveryOption,
@@ -84,9 +85,8 @@ def revisits(
 
         save_picture(revisits_figure(found.frame, found.share, judged, f"loop candidates of {memory.name}"), plot)
     if json:
-        print_json(
-            {**scores.as_dict(), "covisible_frames": len(found.frame), "pairs_of_chunks": len(judged.true_pairs)}
-        )
+        counts = {"covisible_frames": len(found.frame), "pairs_of_chunks": len(judged.true_pairs)}
+        print_answer([{**scores.as_dict(), **counts}])
         return
     _print_revisits(scores, len(found.frame), len(chunks))
 

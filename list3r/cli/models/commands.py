@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import watching
-from list3r.cli.common import JsonOption, only, print_json, print_table, spread
+from list3r.cli.common import JsonOption, only, print_table, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import BuildRequest, RunOptions
 
@@ -47,7 +48,7 @@ def list_models(
     shown = [(c, w) for c in CARDS for w in (c.weights or (None,)) if objection(c, w, licence) is None]
     rows = [model_facts(card, weights) for card, weights in shown]
     if json:
-        print_json(rows)
+        print_answer(rows)
         return
     table = [
         (
@@ -91,7 +92,7 @@ def fetch_model(
             said = "was there" if before is not None and before.commit == cached.commit else "fetched"
             say(f"{cached.name}  {cached.size_bytes / 1e6:.1f} MB  {said}: {cached.folder}")
     if json:
-        print_json(done)
+        print_answer(done)
 
 
 @spread
@@ -119,7 +120,7 @@ def precompute(
     with watching("reconstructing", interrupted, quiet=json) as watch:
         report = write(source, out, options=options, settings=request, run=how, watch=watch)
     if json:
-        print_json({"folder": str(out), **report.as_dict()})
+        print_answer([{"folder": str(out), **report.as_dict()}])
         return
     say(f"{out}  {report.files} files, {report.bytes / 1e6:.1f} MB, {report.posed} of {report.frames} posed")
     say(*(f"note: {line}" for line in report.notes))

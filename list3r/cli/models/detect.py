@@ -9,9 +9,10 @@ from typing import Annotated
 
 import typer
 
+from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import show
-from list3r.cli.common import JsonOption, MemoryArgument, only, print_json, print_table, spread
+from list3r.cli.common import JsonOption, MemoryArgument, only, print_table, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
@@ -59,7 +60,7 @@ def detect(
     with tqdm(unit="chunk", desc="detecting", disable=json or not sys.stderr.isatty(), file=sys.stderr) as bar:
         report = name_things(memory, network, source, options, functools.partial(show, bar))
     if json:
-        print_json({"memory": str(memory), **report.as_dict()})
+        print_answer([{"memory": str(memory), **report.as_dict()}])
         return
     say(f"{report.detector} looked at {report.frames} pictures and found {report.boxes} boxes")
     print_table(sorted(report.labels.items()), ["id", "label"])

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from list3r.cli.common import JsonOption, MemoryArgument, only, print_json, spread
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, only, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
@@ -45,7 +46,7 @@ def embed(
 
         report = embed_memory(memory, weights, device, shown, model=model, licence=run.licence)
     if json:
-        print_json(vars(report))
+        print_answer([vars(report)])
         return
     say(f"{report.instances} things have a vector in {report.space}")
     if report.without_picture:

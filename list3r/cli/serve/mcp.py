@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from list3r.cli import terminal
-from list3r.cli.common import JsonOption, MemoryArgument, note, print_json
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, note
 
 TOKEN_VARIABLE = "LIST3R_MCP_TOKEN"
 
@@ -69,7 +70,7 @@ def ask_config(
     open_scene(memory).close()
     file, text = config_entry(Path(memory), client, write=write)
     if json:
-        print_json({"client": client, "file": file, "text": text})
+        print_answer([{"client": client, "file": file, "text": text}])
         return
     note(f"for {file}:")
     terminal.write(f"{text}\n")

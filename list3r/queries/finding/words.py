@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from list3r.memory.description.words import split_words
+from list3r.memory.description.words import split_words, vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 
@@ -40,19 +40,14 @@ def words_of(instance: Instance) -> set[str]:
 
 
 def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]:
-    """Return (score in [0, 1], words found): a word of the label counts fully, of the kind of structure and of the
-    description nearly so, the beginning of a word half.
+    """Return (score in [0, 1], words found): how well each word names it as `vocabulary` has it, the beginning of a
+    word half as well.
     """
-    fields = [(1.0, instance.label), (0.9, instance.structure), (0.8, instance.description.split(",")[0])]
+    borne = vocabulary(instance.label, instance.structure, instance.description, instance.color_name)
     total, hit = 0.0, []
     for word in wanted:
-        best = 0.0
-        for weight, text in fields:
-            have = split_words(text or "")
-            if word in have:
-                best = max(best, weight)
-            elif len(word) >= 3 and any(h.startswith(word) for h in have):
-                best = max(best, 0.5 * weight)
+        begun = (0.5 * weight for said, weight in borne.items() if len(word) >= 3 and said.startswith(word))
+        best = borne.get(word) or max(begun, default=0.0)
         if best > 0.0:
             hit.append(word)
         total += best
