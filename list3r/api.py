@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Un
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from list3r.exporters.registry import ExportOptions
 from list3r.exporters.registry import export as export_memory
 from list3r.exporters.tables import Table, Value, records_of
 from list3r.memory.errors import List3rError, OptionError, naming_extras
@@ -480,20 +481,17 @@ class SceneMemory(MemoryEdits):
         return merge_graph(self.store)
 
     @_alone
-    def export(
-        self, format: str, path: str | Path, *, tokens: int = 2000, question: str | None = None
-    ) -> tuple[Path, ...]:
-        """Write the memory in a format: json, usd, ply, glb, tum, plan, prompt. Raises `OptionError` and `ExportError`.
+    def export(self, format: str, path: str | Path, **options: Unpack[ExportOptions]) -> tuple[Path, ...]:
+        """Write the memory in one of `list3r.exporters.registry.FORMATS`. Raises `OptionError` and `ExportError`.
 
-        Returns the files written: `path`, and more beside it where parts of the memory could not be joined. `prompt`
-        is a folder of text, maps and pictures for a language model; `tokens` and `question` are those of `prompt()`.
+        Returns the files written: `path`, and more beside it where parts of the memory could not be joined. `colmap`,
+        `nerfstudio` and `prompt` are folders. `color` of ply and glb is rgb or instance; `tokens` and `question` of
+        prompt are those of `prompt()`.
+
+            >>> memory.export("ply", "house.ply", color="rgb")
         """
-        if format == "prompt":
-            from list3r.exporters.prompt.pack import write_prompt
-
-            return write_prompt(self, path, tokens, question)
         with self.store.snapshot():
-            return export_memory(self.store, format, path)
+            return export_memory(self, format, path, **options)
 
     def close(self) -> None:
         """Close the file."""

@@ -143,7 +143,7 @@ def test_within_relations_and_similar(room: Path) -> None:
         assert "mug" in run("query", *words)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", ["json", "csv", "plan"])
 def test_every_format_is_written(name: str, room: Path, tmp_path: Path) -> None:
     path = tmp_path / f"room{FORMATS[name].suffixes[0]}"
     report = ask("export", room, "--to", name, "--out", path)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -12,13 +13,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from list3r.api import SceneMemory
 from list3r.exporters.palette import instance_color, linear_from_srgb, srgb_from_linear
-from list3r.exporters.registry import FORMATS, export, find_writer
+from list3r.exporters.registry import FORMATS, find_format
+from list3r.exporters.registry import export as export_memory
 from list3r.memory.errors import ExportError, MemoryFileError, OptionError
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import Instance, Observation, Relation
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, instance, local_instance
+
+
+def installed(package: str) -> bool:
+    """Tell whether a package that only some installs have is here; nothing is, too."""
+    return not package or importlib.util.find_spec(package) is not None
+
+
+FILES = [
+    pytest.param(name, marks=pytest.mark.skipif(not installed(form.package), reason=f"{form.package} is not installed"))
+    for name, form in FORMATS.items()
+    if not form.folder
+]
+"""Formats that are a file."""
 
 TILTED = Sim3.exp([0.5, -0.2, 0.1, 0.1, 0.2, 0.7, 0.4])
 """A S_world_chunk with a scale that is not 1."""
@@ -69,23 +85,39 @@ def usual_path(folder: Path, name: str) -> Path:
     return folder / f"out{FORMATS[name].suffixes[0]}"
 
 
-def beside(path: Path) -> list[Path]:
-    """The further files that a memory of one component gives."""
-    return [path.with_name(f"{path.stem}.relations.csv")] if path.suffix == ".csv" else []
+def export(store: Store, name: str, path: Path) -> tuple[Path, ...]:
+    """Write an open memory in a format."""
+    return export_memory(SceneMemory(store), name, path)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+BESIDE = {
+    "csv": ("relations",),
+    "parquet": ("relations", "frames"),
+    "graphml": ("merges",),
+    "node-link": ("merges",),
+}
+"""The further files that a memory of one component gives."""
+WHOLE = ("json", "usd", "rerun", "report", *BESIDE)
+"""Formats that hold all components, each in a frame or table of its own."""
+
+
+def beside(name: str, path: Path) -> list[Path]:
+    """Their paths."""
+    return [path.with_name(f"{path.stem}.{part}{path.suffix}") for part in BESIDE.get(name, ())]
+
+
+@pytest.mark.parametrize("name", FILES)
 def test_every_format_writes_what_it_says(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
     path = usual_path(tmp_path, name)
     before = {p.name for p in tmp_path.iterdir()}
     with Store.open(make_memory()) as store:
         written = export(store, name, path)
-    assert written == (path, *beside(path))
+    assert written == (path, *beside(name, path))
     assert all(p.stat().st_size > 0 for p in written)
     assert {p.name for p in tmp_path.iterdir()} == before | {"room.l3r", *(p.name for p in written)}
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", FILES)
 def test_same_memory_same_bytes(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
     with Store.open(make_memory()) as store:
         contents = []
@@ -96,7 +128,7 @@ def test_same_memory_same_bytes(name: str, make_memory: Callable[..., Path], tmp
     assert contents[0] == contents[1]
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", FILES)
 def test_an_empty_memory_can_be_exported(name: str, tmp_path: Path) -> None:
     Store.create(tmp_path / "empty.l3r").close()
     with Store.open(tmp_path / "empty.l3r") as store:
@@ -104,21 +136,22 @@ def test_an_empty_memory_can_be_exported(name: str, tmp_path: Path) -> None:
     assert all(p.stat().st_size > 0 for p in written) and written[0] == usual_path(tmp_path, name)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", FILES)
 def test_components_are_never_laid_over_each_other(name: str, split_memory: Path, tmp_path: Path) -> None:
     path = usual_path(tmp_path, name)
     with Store.open(split_memory) as store:
         written = export(store, name, path)
     assert written[0] == path
     assert all(p.is_file() for p in written)
-    assert len(written) == (1 if name in ("json", "usd") else 2)
-    if name not in ("json", "usd", "csv"):
-        assert "component_1" in written[1].name
+    if name in WHOLE:
+        assert len(written) == 1 + len(BESIDE.get(name, ()))
+    else:
+        assert len(written) == 2 and "component_1" in written[1].name
 
 
 def test_unknown_format_names_those_there_are() -> None:
     with pytest.raises(OptionError, match=", ".join(FORMATS)):
-        find_writer("obj")
+        find_format("obj")
 
 
 def test_a_suffix_that_lies_is_refused(make_memory: Callable[..., Path], tmp_path: Path) -> None:
@@ -129,7 +162,7 @@ def test_a_suffix_that_lies_is_refused(make_memory: Callable[..., Path], tmp_pat
         export(store, "usd", tmp_path / "scene.glb")
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", FILES)
 def test_an_absent_folder_is_one_line(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
     with Store.open(make_memory()) as store, pytest.raises(ExportError, match="does not exist; create it") as caught:
         export(store, name, usual_path(tmp_path / "absent", name))
@@ -159,16 +192,16 @@ def test_a_folder_without_permission_is_one_line(make_memory: Callable[..., Path
 LIMITED = """
 import resource, sys
 from pathlib import Path
+import list3r
 from list3r.exporters.registry import FORMATS, export
 from list3r.memory.errors import ExportError
-from list3r.memory.store.store import Store
-with Store.open(sys.argv[1]) as store:
-    for name in FORMATS:
+with list3r.open(sys.argv[1]) as memory:
+    for name in sys.argv[3:]:
         path = Path(sys.argv[2]) / f"out{FORMATS[name].suffixes[0]}"
         path.write_text("old")
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
         try:
-            export(store, name, path)
+            export(memory, name, path)
         except ExportError as error:
             assert "\\n" not in str(error), error
             assert "cannot be written" in str(error), error
@@ -184,9 +217,11 @@ def test_a_full_disk_leaves_the_old_file(make_memory: Callable[..., Path], tmp_p
     folder = tmp_path / "out"
     folder.mkdir()
     memory = make_memory()
-    done = subprocess.run([sys.executable, "-c", LIMITED, memory, folder], capture_output=True, text=True, check=False)
+    names = [name for name, form in FORMATS.items() if not form.folder and name != "rerun" and installed(form.package)]
+    command = [sys.executable, "-c", LIMITED, memory, folder, *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert {p.name for p in folder.iterdir()} == {usual_path(folder, name).name for name in FORMATS}
+    assert {p.name for p in folder.iterdir()} == {usual_path(folder, name).name for name in names}
 
 
 def test_a_failure_inside_leaves_nothing(make_memory: Callable[..., Path], tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from list3r.cli.build import batch as batch_commands
 from list3r.cli.build import commands as build_commands
 from list3r.cli.build import update as update_commands
 from list3r.cli.edit import commands as edit_commands
+from list3r.cli.edit import export as export_commands
 from list3r.cli.edit import files as file_commands
 from list3r.cli.edit import scale as scale_commands
 from list3r.cli.measure import commands as evaluation_commands
@@ -51,6 +52,7 @@ for module in (
     picture_commands,
     edit_commands,
     embed_commands,
+    export_commands,
     file_commands,
     evaluation_commands,
     update_commands,

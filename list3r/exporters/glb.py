@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from list3r.exporters.components import Component, has_box, read_components, thinned_support
 from list3r.exporters.output import part_path, replacing, units
 from list3r.exporters.palette import Color, instance_color, linear_from_srgb, structure_color
+from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 
@@ -29,14 +30,20 @@ _EDGES = ((0, 1), (0, 2), (0, 4), (3, 1), (3, 2), (3, 7), (5, 1), (5, 4), (5, 7)
 class GlbSettings:
     """What goes into the file."""
 
+    color: str = "rgb"
+    """Of the points. rgb: the colours that were seen; instance: one colour an instance, the same in every export."""
     points_per_instance: int = 5000
     """At most so many points of a thing."""
     points_per_structure: int = 20000
     """At most so many points of a floor, a wall and the like."""
 
+    def __post_init__(self) -> None:
+        if self.color not in ("instance", "rgb"):
+            raise OptionError(f"points are coloured by instance or rgb, not {self.color!r}")
+
 
 def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = None) -> tuple[Path, ...]:
-    """Write node `instance_12` with its children `instance_12_points` and, for things, `instance_12_box` (lines).
+    """Write node `instance_12 mug` with its children `instance_12_points` and, for things, `instance_12_box` (lines).
 
     The node `world` above them turns z up into the y up of glTF. Facts of an instance are the `extras` of its geometry.
     Each component is a file of its own, the main one at `path`. Returns the files written.
@@ -59,15 +66,17 @@ def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
     for instance in component.instances:
         limit = settings.points_per_structure if instance.structure else settings.points_per_instance
         name = f"instance_{instance.id}"
-        scene.graph.update(name, "world")
+        node = f"{name} {instance.label or instance.structure or instance.description.split(',')[0]}".strip()
+        scene.graph.update(node, "world")
         support = thinned_support(store, instance, limit)
         if len(support.points):
-            linear = np.round(255 * linear_from_srgb(support.rgb)).astype(np.uint8)
+            rgb = support.rgb if settings.color == "rgb" else np.tile(_color(instance), (len(support.points), 1))
+            linear = np.round(255 * linear_from_srgb(rgb)).astype(np.uint8)
             alpha = np.full((len(linear), 1), 255, np.uint8)
             cloud = trimesh.PointCloud(support.points, colors=np.hstack([linear, alpha]))
-            _add(scene, cloud, f"{name}_points", name, instance)
+            _add(scene, cloud, f"{name}_points", node, instance)
         if has_box(instance) and not instance.structure:
-            _add(scene, _wire_box(instance), f"{name}_box", name, instance)
+            _add(scene, _wire_box(instance), f"{name}_box", node, instance)
     if not scene.geometry:
         _add_nothing(scene)
     return bytes(scene.export(file_type="glb", unitize_normals=False))
@@ -88,11 +97,14 @@ def _add_nothing(scene: trimesh.Scene) -> None:
 
 def _wire_box(instance: Instance) -> trimesh.path.Path3D:
     entities = [trimesh.path.entities.Line(np.array(edge)) for edge in _EDGES]
-    color: Color = (structure_color if instance.structure else instance_color)(instance.id)
-    rgba: NDArray[np.uint8] = np.append(np.round(255 * linear_from_srgb(color)), 255).astype(np.uint8)
+    rgba: NDArray[np.uint8] = np.append(np.round(255 * linear_from_srgb(_color(instance))), 255).astype(np.uint8)
     return trimesh.path.Path3D(
         entities=entities, vertices=instance.box.corners(), colors=np.tile(rgba, (len(entities), 1)), process=False
     )
+
+
+def _color(instance: Instance) -> Color:
+    return (structure_color if instance.structure else instance_color)(instance.id)
 
 
 def _facts(instance: Instance) -> dict[str, Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +36,41 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_folder(folder: str | Path, kind: str) -> Iterator[Path]:
+    """Yield a temporary folder beside `folder`; it takes its place when the block ends without an error.
+
+    The file `list3r-KIND.json` in it says whose it is: a folder that has one is replaced, another one that holds files
+    is refused. Raises `ExportError` for that, and for every failure of the disk inside the block.
+    """
+    folder, ours = Path(folder), f"list3r-{kind}.json"
+    if not folder.parent.is_dir():
+        raise ExportError(f"the folder {folder.parent} does not exist; create it first")
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder} is a file; name a folder for the export")
+    temporary, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
+    try:
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / ours).is_file():
+            raise ExportError(f"{folder} holds other files; name a new folder for the export")
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        yield temporary
+        if not (temporary / ours).exists():
+            (temporary / ours).write_text(
+                json.dumps({"format": f"list3r-{kind}", "version": 1}) + "\n", encoding="utf-8"
+            )
+        if folder.is_dir():
+            folder.replace(old)
+        temporary.replace(folder)
+    except OSError as error:
+        raise ExportError(f"{folder} cannot be written: {error.strerror or error}") from error
+    finally:
+        if old.is_dir() and not folder.exists():
+            old.replace(folder)
+        for rest in (temporary, old):
+            shutil.rmtree(rest, ignore_errors=True)
 
 
 def check_target(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,7 @@ class PlySettings:
 def write_ply(store: Store, path: str | Path, settings: PlySettings | None = None) -> tuple[Path, ...]:
     """Write all support points in world coordinates as binary PLY with a property `instance`, the id of each point.
 
+    Comments name the instances, other signs than ASCII escaped as in JSON.
     Each component is a file of its own, the main one at `path`. Returns the files written.
     """
     path, settings = Path(path), settings or PlySettings()
@@ -91,6 +93,9 @@ def _header(store: Store, component: Component, count: int) -> str:
     ]
     if not component.main:
         lines.append("comment list3r: this component was not placed against the main one; do not overlay them")
+    for instance in component.instances:
+        name = instance.label or instance.structure or instance.description
+        lines.append(f"comment instance {instance.id} {json.dumps(name)[1:-1]}")
     lines.append(f"element vertex {count}")
     lines += [f"property {_PLY_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
     return "\n".join([*lines, "end_header"]) + "\n"

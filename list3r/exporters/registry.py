@@ -6,15 +6,24 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from list3r.exporters.output import check_target
 from list3r.memory.errors import OptionError
 
 if TYPE_CHECKING:  # the command line reads the names of the formats before anything heavy is needed
-    from list3r.memory.store.store import Store
+    from list3r.api import SceneMemory
 
-Writer = Callable[["Store", Path], tuple[Path, ...]]
+Writer = Callable[..., tuple[Path, ...]]
+"""Takes the store (or the memory, see `Format.of_memory`), the path and, where options are given, the settings."""
+
+
+class ExportOptions(TypedDict, total=False):
+    """What may be asked of formats; each has some of them, None is its default."""
+
+    color: str | None
+    tokens: int | None
+    question: str | None
 
 
 @dataclass(frozen=True)
@@ -24,50 +33,97 @@ class Format:
     module: str
     function: str
     suffixes: tuple[str, ...]
-    """File names that fit it, the usual one first."""
-    any_suffix: bool
-    """Whether other names are accepted too."""
+    """File names that fit it, the usual one first; none for a folder."""
     summary: str
     """One line for `--help`."""
+    any_suffix: bool = False
+    """Whether other names are accepted too."""
+    of_memory: bool = False
+    """Whether it is written through the face for Python."""
+    package: str = ""
+    """The package that it takes besides those of the extra `export`, as it is imported."""
+    settings: str = ""
+    """The dataclass of its options."""
+    options: tuple[str, ...] = ()
+    """Fields of the settings that can be asked for, see `ExportOptions`."""
+
+    @property
+    def folder(self) -> bool:
+        """Whether it is a folder."""
+        return not self.suffixes
 
 
 FORMATS: dict[str, Format] = {
-    "json": Format("scene_json", "write_scene_json", (".json",), True, "instances and relations, fixed schema"),
-    "usd": Format(
-        "usd.stage", "write_usd", (".usdc", ".usd", ".usda", ".usdz"), False, "OpenUSD: points, boxes, camera"
+    "json": Format("scene_json", "write_scene_json", (".json",), "instances and relations, fixed schema", True),
+    "usd": Format("usd.stage", "write_usd", (".usdc", ".usd", ".usda", ".usdz"), "OpenUSD: points, boxes, camera"),
+    "ply": Format("ply", "write_ply", (".ply",), "coloured points", settings="PlySettings", options=("color",)),
+    "glb": Format(
+        "glb",
+        "write_glb",
+        (".glb",),
+        "boxes and points for any glTF viewer",
+        settings="GlbSettings",
+        options=("color",),
     ),
-    "ply": Format("ply", "write_ply", (".ply",), False, "points coloured by instance"),
-    "glb": Format("glb", "write_glb", (".glb",), False, "boxes and points for any glTF viewer"),
-    "tum": Format("tum", "write_tum", (".txt", ".tum"), True, "camera trajectory, one line a frame"),
-    "csv": Format("csv_tables", "write_csv", (".csv",), False, "tables of instances and of relations"),
-    "plan": Format("plan.picture", "write_plan", (".png",), False, "plan view of the rooms as a picture"),
+    "tum": Format("tum", "write_tum", (".txt", ".tum"), "camera trajectory, one line a frame", True),
+    "csv": Format("csv_tables", "write_csv", (".csv",), "tables of instances and of relations"),
+    "parquet": Format("parquet", "write_parquet", (".parquet",), "tables with frames too", package="pyarrow"),
+    "graphml": Format("graphs", "write_graphml", (".graphml",), "graphs of relations and of merges"),
+    "node-link": Format("graphs", "write_node_link", (".json",), "the same graphs as JSON", True),
+    "rerun": Format("rerun_log", "write_rerun", (".rrd",), "recording for the Rerun viewer", package="rerun"),
+    "plan": Format("plan.picture", "write_plan", (".png",), "plan view of the rooms as a picture"),
+    "report": Format("report.page", "write_report", (".html",), "a page to read and search", of_memory=True),
+    "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),
+    "nerfstudio": Format("cameras.nerfstudio", "write_nerfstudio", (), "transforms.json with pictures"),
+    "prompt": Format(
+        "prompt.pack",
+        "write_prompt",
+        (),
+        "a pack for a language model",
+        of_memory=True,
+        settings="PackSettings",
+        options=("tokens", "question"),
+    ),
 }
+"""Formats by name. Those that hold one coordinate frame write a further file for each further component."""
 
 
-FOLDERS = ("prompt",)
-"""Formats that are a folder, written through the face for Python."""
+def export(
+    memory: SceneMemory, format_name: str, path: str | Path, **options: Unpack[ExportOptions]
+) -> tuple[Path, ...]:
+    """Write a memory to `path` in a format. Returns the files written, `path` first where it is a file.
 
-
-def export(store: Store, format_name: str, path: str | Path) -> tuple[Path, ...]:
-    """Write a memory to `path` in a format. Returns the files written, `path` first.
-
-    Formats that hold one coordinate frame write a further file beside `path` for each further connected component.
-    Raises `OptionError` for an unknown format or a file name that does not fit it, `ExportError` when it cannot be
-    written.
+    Raises `OptionError` for an unknown format, an option that it does not have or a file name that does not fit it,
+    `ExportError` when it cannot be written.
     """
-    path = Path(path)
-    writer = find_writer(format_name)
-    form = FORMATS[format_name]
-    if not form.any_suffix and path.suffix.lower() not in form.suffixes:
+    path, form = Path(path), find_format(format_name)
+    if form.suffixes and not form.any_suffix and path.suffix.lower() not in form.suffixes:
         raise OptionError(f"the format {format_name} is written to a {' or '.join(form.suffixes)} file, not to {path}")
-    check_target(path)
-    return writer(store, path)
-
-
-def find_writer(format_name: str) -> Writer:
-    """Return the function that writes a format. Raises `OptionError` that names the known formats."""
-    if format_name not in FORMATS:
-        raise OptionError(f"unknown format {format_name!r}; there are {', '.join((*FORMATS, *FOLDERS))}")
-    form = FORMATS[format_name]
+    if not form.folder:
+        check_target(path)
     module = importlib.import_module(f"list3r.exporters.{form.module}")
-    return cast(Writer, getattr(module, form.function))
+    given = _given(format_name, form, dict(options))
+    settings = [getattr(module, form.settings)(**given)] if given else []
+    written: tuple[Path, ...] = getattr(module, form.function)(
+        memory if form.of_memory else memory.store, path, *settings
+    )
+    return written
+
+
+def find_format(name: str) -> Format:
+    """Return a format. Raises `OptionError` that names the known ones."""
+    if name not in FORMATS:
+        raise OptionError(f"unknown format {name!r}; there are {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def _given(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that are given. Raises `OptionError` for one that the format does not have."""
+    given = {k: v for k, v in options.items() if v is not None}
+    for option in given:
+        if option not in form.options:
+            others = [n for n, f in FORMATS.items() if option in f.options]
+            raise OptionError(
+                f"{option} goes with {' and '.join(others) or 'no format'}, not with {name}; leave it out"
+            )
+    return given

@@ -69,6 +69,8 @@ EXTRA_OF_PACKAGE = {
     "lzfse": "record3d",
     "rosbags": "ros",
     "open3d": "open3d",
+    "pyarrow": "parquet",
+    "rerun": "rerun",
     "mcp": "mcp",
     "viser": "view",
     "fsspec": "batch",

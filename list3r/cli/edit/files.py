@@ -1,4 +1,4 @@
-"""export, verify, repair, doctor: the file and the machine."""
+"""verify, repair, doctor: the file and the machine."""
 
 from __future__ import annotations
 
@@ -10,37 +10,13 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
-from list3r.exporters.registry import FOLDERS, FORMATS
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
-    app.command("export")(export)
     app.command("verify")(verify)
     app.command("repair")(repair)
     app.command("doctor")(doctor)
-
-
-def export(
-    memory: MemoryArgument,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join((*FORMATS, *FOLDERS))}.")],
-    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file to write; of prompt, the folder.")],
-    tokens: Annotated[int, typer.Option("--tokens", help="prompt: tokens of the text at most.")] = 2000,
-    question: Annotated[str | None, typer.Option("--question", help="prompt: what to put first.")] = None,
-    json: JsonOption = False,
-) -> None:
-    """Write a memory in another format: scene JSON, USD, coloured points, boxes, trajectory, plan picture, or a pack
-    for a language model: text within a budget of tokens, maps, marked views and crops.
-
-    Example: list3r export house.l3r --to usd --out house.usdc
-    """
-    with open_memory(memory) as scene:
-        written = scene.export(to, out, tokens=tokens, question=question)
-    sizes = {str(path): path.stat().st_size for path in written}
-    if json:
-        print_answer({"format": to, "path": path, "bytes": size} for path, size in sizes.items())
-    else:
-        say(*(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
 
 
 def verify(memory: MemoryArgument, json: JsonOption = False) -> None:

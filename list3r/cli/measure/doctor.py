@@ -34,11 +34,15 @@ _PACKAGES = (
     ("ncnn", "labels by a box detector"),
     ("viser", "the viewer (view)"),
     ("mcp", "agents (mcp)"),
+    ("pyarrow", "export --to parquet"),
+    ("rerun-sdk", "export --to rerun"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
 _OPTIONAL = {
     "viser",
     "mcp",
+    "pyarrow",
+    "rerun-sdk",
     "torch",
     "pycolmap",
     "transformers",

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,11 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from list3r.exporters.output import replacing_folder
 from list3r.exporters.prompt.cognitive_map import cognitive_maps
 from list3r.exporters.prompt.coverage import cover
 from list3r.exporters.prompt.marks import draw_marks
 from list3r.exporters.prompt.scene_text import scene_prompt
-from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.errors import OptionError
 from list3r.queries.pictures import KeyframePicture
 
 if TYPE_CHECKING:
@@ -32,30 +31,28 @@ _OURS = "list3r-prompt.json"
 class PackSettings:
     """What a pack shows."""
 
+    tokens: int = 2000
+    """Budget of the text."""
+    question: str | None = None
+    """What its words name comes first."""
     least_visible: float = 0.3
     """Share of an instance that must show for a view to count for it."""
     least_side_px: float = 12.0
     """Side of a square of the area of its mask, likewise."""
 
 
-def write_prompt(
-    memory: SceneMemory,
-    folder: str | Path,
-    tokens: int = 2000,
-    question: str | None = None,
-    settings: PackSettings | None = None,
-) -> tuple[Path, ...]:
+def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings | None = None) -> tuple[Path, ...]:
     """Write scene.md, cognitive_map.json, map.png, views/ and crops/ to a folder; return the files.
 
     The views are the fewest stored keyframes that together show every listed instance. An earlier pack is replaced,
     another folder is not, and an interruption leaves what was there. Raises `OptionError` and `ExportError`.
     """
     folder, settings = Path(folder), settings or PackSettings()
-    prompt = scene_prompt(memory, tokens, question)
+    prompt = scene_prompt(memory, settings.tokens, settings.question)
     instances = [i for i in memory.instances(structure=None) if i.state != "removed"]
     things = {i.id for i in instances if i.structure is None}
     listed = [n for n in prompt.listed if n in things]
-    with _replacing_folder(folder) as temporary:
+    with replacing_folder(folder, "prompt") as temporary:
         (temporary / "scene.md").write_text(prompt.text, encoding="utf-8")
         maps = cognitive_maps(instances, memory.units)
         (temporary / "cognitive_map.json").write_text(json.dumps(maps, indent=1) + "\n", encoding="utf-8")
@@ -66,7 +63,7 @@ def write_prompt(
             "format": "list3r-prompt",
             "version": 1,
             "memory": memory.path.name,
-            "question": question,
+            "question": settings.question,
             "tokens": prompt.tokens,
             "listed": list(prompt.listed),
             "views": views,
@@ -123,25 +120,3 @@ def _write_crops(memory: SceneMemory, folder: Path, listed: Sequence[int]) -> se
             Image.fromarray(np.ascontiguousarray(crop)).save(folder / f"{instance_id}.jpg", quality=90)
             written.add(instance_id)
     return written
-
-
-@contextlib.contextmanager
-def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """Return a temporary folder beside `folder` that takes its place when the block ends well."""
-    if not folder.parent.is_dir():
-        raise ExportError(f"the folder {folder.parent} does not exist; create it first")
-    if folder.exists() and not folder.is_dir():
-        raise ExportError(f"{folder} is a file; name a folder for the pack")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / _OURS).is_file():
-        raise ExportError(f"{folder} holds other files; name a new folder for the pack")
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
-        yield temporary
-        shutil.rmtree(folder, ignore_errors=True)
-        temporary.replace(folder)
-    except OSError as error:
-        raise ExportError(f"{folder} cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -1,0 +1,82 @@
+"""export: a memory in other formats."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, spread
+from list3r.cli.terminal import say
+from list3r.exporters.registry import FORMATS, find_format
+from list3r.pipeline.request import option
+
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("export")(export)
+
+
+@dataclass(frozen=True)
+class ExportWords:
+    """Options of some formats; what is left out is their default."""
+
+    color: str | None = field(default=None, metadata=option("ply, glb: rgb (as seen) or instance.", "rgb|instance"))
+    tokens: int | None = field(default=None, metadata=option("prompt: tokens of the text at most (2000).", "N"))
+    question: str | None = field(default=None, metadata=option("prompt: what to put first.", "TEXT"))
+
+
+@spread
+def export(
+    memory: MemoryArgument,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")],
+    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for a pipe.")],
+    *,
+    words: ExportWords,
+    json: JsonOption = False,
+) -> None:
+    """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, a page to
+    read, or a folder: models of COLMAP and nerfstudio, a pack for a language model.
+
+    Example: list3r export house.l3r --to usd --out house.usdc
+    """
+    from list3r.memory.errors import OptionError
+
+    options = asdict(words)
+    if out == Path("-"):
+        if json:
+            raise OptionError("--out - takes standard output, --json too; leave one of them out")
+        with open_memory(memory) as scene:
+            _pipe(scene, to, options)
+        return
+    with open_memory(memory) as scene:
+        written = scene.export(to, out, **options)
+    sizes = {str(path): path.stat().st_size for path in written}
+    if json:
+        print_answer({"format": to, "path": path, "bytes": size} for path, size in sizes.items())
+    else:
+        say(*(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
+
+
+def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
+    """Write the first file of a format to standard output, once it is whole. Raises `OptionError` for a folder."""
+    from list3r.memory.errors import OptionError
+
+    form = find_format(to)
+    if form.folder:
+        raise OptionError(f"{to} is a folder and cannot be piped; name one with --out")
+    with tempfile.TemporaryDirectory() as folder:
+        first, *others = scene.export(to, Path(folder) / f"{scene.path.stem}{form.suffixes[0]}", **options)
+        with first.open("rb") as file:
+            shutil.copyfileobj(file, sys.stdout.buffer)
+    for other in others:
+        note(f"note: {other.name} is left out of the pipe; it is written beside a file")
