@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.common import JsonOption, note, only, print_json, print_table, spread
+from list3r.cli.common import JsonOption, note, only, print_table, spread
 from list3r.cli.terminal import write
 from list3r.pipeline.request import BuildRequest, RunOptions
 
@@ -116,7 +117,7 @@ def _told(quiet: bool) -> Any:
 
 def _say(report: BatchReport, json: bool) -> None:
     if json:
-        print_json(report.as_dict())
+        print_answer([report.as_dict()])
         return
     failed = [
         [r.memory, PurePosixPath(r.source).name, r.attempts, r.reason] for r in report.tasks if r.state == "failed"

@@ -123,7 +123,7 @@ def convert(
 
     report = write(source, to, folder, words.options())
     if json:
-        print_json(report.as_dict())
+        print_answer([report.as_dict()])
         return
     say(f"{report.path}  {report.frames} frames, {report.with_depth} with depth, {report.posed} with a pose")
     if report.bad:
