@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3,4,5")
     parser.add_argument("--modes", default=",".join(MODES))
-    parser.add_argument("--frames", type=int, help="cut the walks short")
+    parser.add_argument("--frames", type=int, default=64, help="pictures of each walk; the whole round has about 115")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     words = parser.parse_args()
@@ -58,9 +58,8 @@ def measured(folder: Path, mode: str) -> dict[str, Any]:
     """Build one memory and hold it against the truth."""
     memory = folder / f"{mode}.l3r"
     memory.unlink(missing_ok=True)
-    _, usage = run_list3r(
-        "build", str(folder / "walk.r3d"), "-m", str(memory), "--poses", mode, "--workers", "1", "--preset", "cpu"
-    )
+    options = ("--poses", mode, "--workers", "1", "--preset", "cpu", "--chunk", "40", "--overlap", "12")
+    _, usage = run_list3r("build", str(folder / "walk.r3d"), "-m", str(memory), *options)
     with list3r.open(memory) as scene:
         scene.export("json", folder / f"{mode}.json")
         scene.export("tum", folder / f"{mode}.txt")

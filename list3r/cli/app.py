@@ -22,6 +22,7 @@ from list3r.cli.ask import picture as picture_commands
 from list3r.cli.ask import query as query_commands
 from list3r.cli.build import batch as batch_commands
 from list3r.cli.build import commands as build_commands
+from list3r.cli.build import exchange as exchange_commands
 from list3r.cli.build import update as update_commands
 from list3r.cli.edit import commands as edit_commands
 from list3r.cli.edit import export as export_commands
@@ -47,6 +48,7 @@ app = typer.Typer(
 )
 for module in (
     build_commands,
+    exchange_commands,
     memory_commands,
     query_commands,
     picture_commands,

@@ -22,7 +22,6 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     app.command("inspect")(inspect)
     app.command("build")(build)
-    app.command("convert")(convert)
     app.command("demo")(demo)
 
 
@@ -104,31 +103,6 @@ def build(
             return build_memory(source, memory, options=options, settings=request, run=run, watch=watch)
 
     say_result(memory, work, report_lines, json)
-
-
-@spread
-def convert(
-    source: src.SourceArgument,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write; it must not exist.")],
-    *,
-    to: Annotated[str, typer.Option("--to", metavar="LAYOUT", help="tum, transforms, colmap, replica or r3d.")],
-    words: src.SourceWords,
-    json: JsonOption = False,
-) -> None:
-    """Write the frames of any source in a layout that other programs read.
-
-    Example: list3r convert walk.r3d walk-tum --to tum
-    """
-    from list3r.frames.convert import convert as write
-
-    report = write(source, to, folder, words.options())
-    if json:
-        print_answer([report.as_dict()])
-        return
-    say(f"{report.path}  {report.frames} frames, {report.with_depth} with depth, {report.posed} with a pose")
-    if report.bad:
-        say(f"note: {report.bad} frames could not be decoded")
-    say(*(f"note: {line}" for line in report.notes))
 
 
 def demo(

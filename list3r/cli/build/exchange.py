@@ -1,0 +1,68 @@
+"""convert, import: to the layouts of other programs, and from their maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from list3r.cli.answer import print_answer
+from list3r.cli.build import source_options as src
+from list3r.cli.common import JsonOption, spread
+from list3r.cli.terminal import say
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    app.command("convert")(convert)
+    app.command("import")(import_map)
+
+
+@spread
+def convert(
+    source: src.SourceArgument,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write; it must not exist.")],
+    *,
+    to: Annotated[str, typer.Option("--to", metavar="LAYOUT", help="tum, transforms, colmap, replica or r3d.")],
+    words: src.SourceWords,
+    json: JsonOption = False,
+) -> None:
+    """Write the frames of any source in a layout that other programs read.
+
+    Example: list3r convert walk.r3d walk-tum --to tum
+    """
+    from list3r.frames.convert import convert as write
+
+    report = write(source, to, folder, words.options())
+    if json:
+        print_answer([report.as_dict()])
+        return
+    say(f"{report.path}  {report.frames} frames, {report.with_depth} with depth, {report.posed} with a pose")
+    if report.bad:
+        say(f"note: {report.bad} frames could not be decoded")
+    say(*(f"note: {line}" for line in report.notes))
+
+
+def import_map(
+    source: Annotated[str, typer.Argument(metavar="MAP", help="A file or folder of another program.")],
+    memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
+    kind: Annotated[
+        str, typer.Option("--format", metavar="FORMAT", help="conceptgraphs, hovsg, hydra, colmap, ply or auto.")
+    ] = "auto",
+    up: Annotated[str, typer.Option("--up", metavar="AXIS", help="The axis of the map that points up.")] = "z",
+    json: JsonOption = False,
+) -> None:
+    """Make a memory of a map that another program made: its things, related and found by the rules of this one.
+
+    Example: list3r import dsg.json -m house.l3r
+    """
+    from list3r.pipeline.importing import import_map as read
+
+    report = read(source, memory, kind=kind, up=up)
+    if json:
+        print_answer([{"memory": str(memory), **report.as_dict()}])
+        return
+    say(f"{memory}  {report.format}: {report.things} things became {report.instances} instances")
+    say(f"structure  {report.structure} pieces, {report.relations} relations")
+    say(*(f"note: {line}" for line in report.notes))
