@@ -73,7 +73,7 @@ def _mesh(content: Mapping[str, Any]) -> NDArray[np.float32] | None:
     """Points of the mesh, shape (N, 3); None where the file has none."""
     mesh = content.get("mesh")
     try:
-        points = np.asarray(mesh["points"], np.float32) if isinstance(mesh, dict) else np.zeros(0)
+        points = np.asarray(mesh["points"] if isinstance(mesh, dict) else (), np.float32)
     except (KeyError, TypeError, ValueError):
         return None
     return points if points.ndim == 2 and points.shape[1] == 3 and len(points) else None

@@ -141,7 +141,7 @@ def _chunk(found: ImportedMap, R: NDArray[np.float64]) -> ChunkResult:
 
 def _local(number: int, thing: ImportedThing, R: NDArray[np.float64], size: int) -> LocalInstance:
     points = thing.points[np.isfinite(thing.points).all(axis=1)] @ R.T.astype(np.float32)
-    rgb = np.tile(np.uint8(GRAY), (len(points), 1)) if thing.rgb is None else thing.rgb[: len(points)]
+    rgb = np.tile(np.array(GRAY, np.uint8), (len(points), 1)) if thing.rgb is None else thing.rgb[: len(points)]
     feature = np.ones(size, np.float32) if thing.feature is None or len(thing.feature) != size else thing.feature
     return LocalInstance(
         local_id=number,
