@@ -17,7 +17,7 @@ def main() -> None:
     path = Path(sys.argv[2] if len(sys.argv) > 2 else "out/examples/rooms.l3r")
     path.parent.mkdir(parents=True, exist_ok=True)
     if not folder.exists():
-        write_walk(folder, WalkSettings(seed=1, frames=90, size=(320, 240)))
+        write_walk(folder, WalkSettings(seed=1, frames=60, size=(240, 180)))
     with list3r.build(folder, path, force=path.exists()) as memory:
         print(f"{path}: lengths in {memory.units}, gravity {memory.gravity}")
         for thing in memory.instances():

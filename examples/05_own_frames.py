@@ -19,7 +19,7 @@ from list3r.simulation.rendering.render import Renderer
 
 def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/own")
-    settings = WalkSettings(seed=2, frames=40)
+    settings = WalkSettings(seed=2, frames=30, size=(240, 180))
     camera = settings.camera()
     renderer = Renderer(settings.world(), camera)
     times, poses = settings.poses()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from PIL import Image
 
 from list3r.memory.geometry import OrientedBox, Sim3
@@ -25,6 +27,10 @@ from list3r.memory.records import (
     Support,
 )
 from list3r.memory.store.store import Store
+
+THOROUGH = os.environ.get("LIST3R_TEST_PROFILE") == "thorough"
+settings.register_profile("suite", max_examples=300 if THOROUGH else 40, deadline=None)
+settings.load_profile("suite")
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -22,6 +22,7 @@ from list3r.memory.library import consolidation
 from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.maintenance import edits
 from list3r.memory.store.store import Store
+from tests.conftest import THOROUGH
 from tests.memory_scenes import BOX, MUG, TWIN
 from tests.test_consolidation import add, chunk, create
 
@@ -243,7 +244,6 @@ class StoreAgainstModel(RuleBasedStateMachine):
                 assert not (n in now and keys & seen)
 
 
-THOROUGH = os.environ.get("LIST3R_TEST_PROFILE") == "thorough"
 StoreAgainstModel.TestCase.settings = settings(
     max_examples=400 if THOROUGH else 30,
     stateful_step_count=40 if THOROUGH else 9,

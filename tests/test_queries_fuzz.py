@@ -20,7 +20,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.finding.grammar import RELATIONS
 from list3r.queries.match import Filters, Match
 from list3r.queries.relations import ALL_PREDICATES
-from tests.conftest import write_small_room
+from tests.conftest import THOROUGH, write_small_room
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,14 @@ WILD_FILTERS = st.fixed_dictionaries(
     },
 )
 FILTERS = st.one_of(st.just({}), PLAIN_FILTERS, WILD_FILTERS)
-often = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+
+
+def often(examples: int) -> settings:
+    """So many examples, the same each time; ten times as many in a thorough run (`LIST3R_TEST_PROFILE`)."""
+    examples *= 10 if THOROUGH else 1
+    return settings(
+        max_examples=examples, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=not THOROUGH
+    )
 
 
 def answers(ask: Callable[[], Any]) -> Any:
@@ -110,7 +117,7 @@ def answers(ask: Callable[[], Any]) -> Any:
     return found
 
 
-@settings(often, max_examples=100)
+@often(50)
 @given(place=INSIDE, radius=st.floats(0.01, 3), filters=PLAIN_FILTERS)
 def test_what_makes_sense_is_answered_and_answers_agree(
     memory: SceneMemory, place: list[float], radius: float, filters: Any
@@ -127,7 +134,7 @@ def test_what_makes_sense_is_answered_and_answers_agree(
 SOMETHING = st.sampled_from([None, "mug", "table", 2, 3, "#4"])
 
 
-@settings(often, max_examples=100)
+@often(50)
 @given(subject=SOMETHING, predicate=st.sampled_from([None, "on", "supports", "next_to"]), object=SOMETHING)
 def test_relations_that_make_sense_are_the_stored_ones(memory: SceneMemory, **asked: Any) -> None:
     named = {"mug": {3, 4}, "table": {2}, "#4": {4}}
@@ -142,7 +149,7 @@ def test_relations_that_make_sense_are_the_stored_ones(memory: SceneMemory, **as
     assert found is not None and {(r.subject, r.predicate, r.object) for r in found} == wanted
 
 
-@settings(often, max_examples=1000)
+@often(250)
 @given(text=TEXTS, k=st.integers(-1, 5), viewpoint=VIEWPOINTS)
 def test_find(memory: SceneMemory, text: str, k: int, viewpoint: Any) -> None:
     found = answers(lambda: memory.find(text, k, viewpoint=viewpoint))
@@ -152,7 +159,7 @@ def test_find(memory: SceneMemory, text: str, k: int, viewpoint: Any) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
-@settings(often)
+@often(100)
 @given(target=st.one_of(THINGS, POINTS), k=st.integers(-1, 2**70), limit=st.one_of(st.none(), NUMBERS), filters=FILTERS)
 def test_nearest(memory: SceneMemory, target: Any, k: int, limit: float | None, filters: Any) -> None:
     found = answers(lambda: memory.nearest(target, k, max_distance=limit, **filters))
@@ -165,7 +172,7 @@ def test_nearest(memory: SceneMemory, target: Any, k: int, limit: float | None, 
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
-@settings(often)
+@often(100)
 @given(one=POINTS, two=POINTS, radius=NUMBERS, sphere=st.booleans(), filters=FILTERS)
 def test_within(memory: SceneMemory, one: Any, two: Any, radius: float, sphere: bool, filters: Any) -> None:
     region = {"center": one, "radius": radius} if sphere else {"lower": one, "upper": two}
@@ -174,7 +181,7 @@ def test_within(memory: SceneMemory, one: Any, two: Any, radius: float, sphere: 
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@settings(often, max_examples=150)
+@often(50)
 @given(
     place=POINTS, quat=st.lists(NUMBERS, min_size=3, max_size=4), depth=st.one_of(st.none(), NUMBERS), filters=FILTERS
 )
@@ -186,7 +193,7 @@ def test_within_what_a_camera_sees(memory: SceneMemory, place: Any, quat: Any, d
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@settings(often)
+@often(100)
 @given(
     subject=st.one_of(st.none(), THINGS),
     predicate=st.one_of(st.none(), st.sampled_from(ALL_PREDICATES), TEXTS),
@@ -202,7 +209,7 @@ def test_relations(memory: SceneMemory, **arguments: Any) -> None:
         assert math.isfinite(r.margin)
 
 
-@settings(often, max_examples=200)
+@often(70)
 @given(one=IDS, two=IDS, gap=NUMBERS, structure=st.booleans())
 def test_path_and_seen(memory: SceneMemory, one: int, two: int, gap: float, structure: bool) -> None:
     way = answers(lambda: memory.path_between(one, two, structure=structure))
@@ -236,7 +243,7 @@ LINES = st.tuples(
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@settings(often, max_examples=400)
+@often(120)
 @given(line=LINES)
 def test_the_command_line(room: Path, line: tuple[list[str], list[str], list[tuple[str, str]]]) -> None:
     command, values, options = line

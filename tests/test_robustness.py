@@ -11,12 +11,8 @@ import pytest
 import list3r
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
+from tests.program import in_process as run
 from tests.test_cli_errors import write_frames
-
-
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "list3r", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 def build_ended(walk: Path, memory: Path, end: str, *more: str) -> subprocess.CompletedProcess[str]:

@@ -37,11 +37,11 @@ def test_installed_elsewhere_it_runs_the_demo(wheel: Path, tmp_path: Path) -> No
     subprocess.run(install, check=True, capture_output=True, timeout=300)
     assert {p.name for p in site.iterdir()} <= {"list3r", "list3r-0.1.0.dist-info", "bin"}
     environment = {**os.environ, "PYTHONPATH": str(site)}
-    command = [sys.executable, "-m", "list3r", "demo", "--out", str(tmp_path / "demo"), "--frames", "60", "--json"]
+    command = [sys.executable, "-m", "list3r", "demo", "--out", str(tmp_path / "demo"), "--frames", "24", "--json"]
     result = subprocess.run(
         command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False, timeout=300
     )
     assert result.returncode == 0, result.stderr
     (report,) = json.loads(result.stdout)["matches"]
-    assert report["build"]["posed"] == 60
+    assert report["build"]["posed"] == 24
     assert all(Path(path).stat().st_size > 0 for path in report["exports"].values())
