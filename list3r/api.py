@@ -90,7 +90,7 @@ def build(
     settings: BuildSettings | BuildRequest | None = None,
     **run: Unpack[RunWords],
 ) -> SceneMemory:
-    """Build the memory of a video or folder and open it.
+    """Build the memory of a video or folder and open it; of a webcam or stream until it ends.
 
     `options` says what is known of the source (intrinsics, depth scale, ...). `settings` says how it is worked on: a
     `BuildRequest` names models or a preset and leaves the rest to the machine, `BuildSettings` decides all.
@@ -103,10 +103,10 @@ def build(
 
         >>> list3r.build("walk/", "house.l3r", settings=list3r.BuildRequest(preset="light"), workers=2)
     """
-    from list3r.pipeline import build as pipeline
+    from list3r.pipeline.live import build_any
     from list3r.pipeline.request import RunOptions
 
-    pipeline.build(source, memory, options=options, settings=settings, run=RunOptions(**run))
+    build_any(source, memory, options=options, settings=settings, run=RunOptions(**run))
     return open(memory)
 
 

@@ -22,6 +22,7 @@ from list3r.frames.readers import (
     rosbag,
     scannet,
     seven_scenes,
+    spool,
     stray,
     tum,
 )
@@ -36,6 +37,7 @@ FOLDERS: dict[str, Callable[[Path, SourceOptions], FolderLayout | None]] = {
     "scannet": scannet.find,
     "euroc": euroc.find,
     "nerfstudio": nerfstudio.find,
+    "live": spool.find,
     "7scenes": seven_scenes.find,
     "tum": tum.find,
     "replica": replica.find,

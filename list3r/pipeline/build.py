@@ -68,16 +68,20 @@ def _session(store: Store, job: Job) -> int:
     sessions = store.sessions.all()
     if sessions:
         return sessions[0].session_id
+    return begin_session(store, job)
+
+
+def begin_session(store: Store, job: Job) -> int:
+    """Write down what a new memory is of and begin its first session; its number."""
     info, settings = job.info, job.settings
+    where = info.path if "://" in info.path else str(Path(info.path).resolve())
     with store.transaction():
         store.facts.created_by = f"list3r {__version__}"
         store.facts.scale_kind = _scale_kind(info, settings)
         store.facts.scale_source = _scale_source(info, settings)
         store.facts.gravity = "unknown"
         store.facts.poses = settings.poses
-        return store.sessions.add(
-            str(Path(info.path).resolve()), info.fingerprint, settings.as_plain(), info.frame_count
-        )
+        return store.sessions.add(where, info.fingerprint, settings.as_plain(), info.frame_count)
 
 
 def _scale_kind(info: SourceInfo, settings: BuildSettings) -> str:

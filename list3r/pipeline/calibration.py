@@ -17,7 +17,7 @@ from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
 
-_SILENT_ON_DISTORTION = ("images", "video")
+_SILENT_ON_DISTORTION = ("images", "video", "live")
 """Kinds of source that say nothing of their lens but what the user does."""
 
 

@@ -14,6 +14,24 @@ from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
 
 
 @dataclass(frozen=True)
+class LiveReport:
+    """How a live source was followed."""
+
+    received: int
+    """Pictures that came."""
+    dropped: int
+    """Pictures that came while too many waited."""
+    waiting: int
+    """Pictures that were kept and not worked on any more when the session was ended."""
+    reconnects: int
+    gaps: int
+    """Places where frames are missing: lost connections and dropped pictures."""
+    latency_s: float
+    """Seconds from the last picture of a chunk to its things in the memory, median over chunks."""
+    most_latency_s: float
+
+
+@dataclass(frozen=True)
 class BuildReport:
     """What a build did."""
 
@@ -37,6 +55,8 @@ class BuildReport:
     """CPU seconds by stage, over all runs."""
     notes: tuple[str, ...]
     """What the user should know, one sentence each."""
+    live: LiveReport | None = None
+    """Of a source that grew while it was built."""
 
     def as_dict(self) -> dict[str, object]:
         """For JSON."""

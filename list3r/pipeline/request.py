@@ -125,6 +125,10 @@ class RunOptions:
     detector_classes: Path | None = field(
         default=None, metadata=option("The detector's classes, one name a line; default: the 80 of COCO.", "FILE")
     )
+    live: bool = field(
+        default=False,
+        metadata=option("build: SOURCE is a folder that still grows. Webcams and streams are live anyway."),
+    )
     resume: bool = field(default=False, metadata=option("Go on with what was interrupted."))
     force: bool = field(
         default=False,
@@ -140,6 +144,7 @@ class RunWords(TypedDict, total=False):
     scale_anchor: str | None
     detector: Path | None
     detector_classes: Path | None
+    live: bool
     resume: bool
     force: bool
 

@@ -109,7 +109,7 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     """The chunks of a session, and of those the ones that are not in the memory yet."""
     count = job.info.frame_count
     cuts = _cuts(store, session, job, watch)
-    step = _depth_step(store, session, job, watch)
+    step = settled_step(store, session, job, watch)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks.all(session)}
     options = with_camera(store, session, job.source, job.options, job.settings, job.info, watch.look)
@@ -154,7 +154,7 @@ def add_chunks(
             check_bad_share(len(bad), count, found[0][1] if found else "")
             for part in (p for p in results if p.index not in known):
                 add_chunk(store, session, part, joint, how, library=library, debug_dir=watch.debug_dir)
-                _note_lost(store, session, part)
+                note_lost(store, session, part)
                 added(part)
             watch.show(task.span.stop, count)
 
@@ -196,7 +196,7 @@ def settled_notes(store: Store, session: int) -> tuple[str, ...]:
     return (*notes, f"{why}: depth and things are from every {nth} frame (--depth-every 1 takes all)")
 
 
-def _depth_step(store: Store, session: int, job: Job, watch: Watch) -> int:
+def settled_step(store: Store, session: int, job: Job, watch: Watch) -> int:
     """From every how many frames depth is computed, settled once; 1 for models that take it from elsewhere."""
     if not entry(job.settings.reconstruction).thins:
         return 1
@@ -212,7 +212,7 @@ def _depth_step(store: Store, session: int, job: Job, watch: Watch) -> int:
     return known
 
 
-def _note_lost(store: Store, session: int, result: ChunkResult) -> None:
+def note_lost(store: Store, session: int, result: ChunkResult) -> None:
     """Keep why the camera could not be followed through a chunk."""
     if result.lost_reason:
         with store.transaction():

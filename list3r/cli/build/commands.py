@@ -91,16 +91,16 @@ def build(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Build a memory from a video or a folder of frames.
+    """Build a memory from a video, a folder of frames, a webcam or a stream.
 
     Example: list3r build walk/ -m house.l3r
     """
     options = words.options()
-    from list3r.pipeline.build import build as build_memory
+    from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:
         with watching("building", build_interrupted(memory, run.resume), quiet=json, debug=debug) as watch:
-            return build_memory(source, memory, options=options, settings=request, run=run, watch=watch)
+            return build_any(source, memory, options=options, settings=request, run=run, watch=watch)
 
     say_result(memory, work, report_lines, json)
 

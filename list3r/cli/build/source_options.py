@@ -11,7 +11,12 @@ if TYPE_CHECKING:
     from list3r.frames.options import SourceOptions
 
 SourceArgument = Annotated[
-    str, typer.Argument(metavar="SOURCE", help="A video file, or a folder of frames.", show_default=False)
+    str,
+    typer.Argument(
+        metavar="SOURCE",
+        help="A video file, a folder of frames; build: also a webcam (/dev/video0) or the URL of a stream.",
+        show_default=False,
+    ),
 ]
 Kind = Annotated[str, typer.Option("--kind", help="What the source is: auto, or one of docs/sources.md.")]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Take every N-th frame.")]

@@ -1,0 +1,148 @@
+"""A webcam or a network stream: its pictures are kept in a folder as they come, until the chunks have used them.
+
+What comes while too many frames wait is dropped and counted, whole stretches rather than every other frame, because
+the camera can be followed through a stretch. A lost connection is tried again.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlsplit, urlunsplit
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.live.feed import FeedState, LiveSettings, Tell
+from list3r.frames.readers.spool import LIST
+from list3r.frames.writers.pictures import jpeg
+from list3r.memory.errors import SourceError
+
+SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "udp", "tcp", "srt")
+_DEVICES = "/dev/video"
+
+
+def is_stream(source: str) -> bool:
+    """Return whether a source is a webcam or the address of a stream."""
+    return source.startswith(_DEVICES) or urlsplit(source).scheme.lower() in SCHEMES
+
+
+def without_secrets(source: str) -> str:
+    """Return the address without name, password and query, as it may be shown and stored."""
+    parts = urlsplit(source)
+    if parts.scheme.lower() not in SCHEMES:
+        return source
+    host = parts.netloc.rpartition("@")[2]
+    return urlunsplit((parts.scheme, host, parts.path, "", ""))
+
+
+class StreamFeed:
+    """A `Feed` of a stream; a thread takes its pictures in."""
+
+    def __init__(self, source: str, folder: Path, settings: LiveSettings, fps: float | None, tell: Tell) -> None:
+        """`fps` thins the pictures out to so many a second. `folder` is made, and must not exist."""
+        self.folder, self._source, self._settings, self._tell = folder, source, settings, tell
+        self._least_gap_s = 0.0 if fps is None else 0.9 / fps
+        self._lock = threading.Lock()
+        self._state = FeedState(0, (), False)
+        self._taken, self._gap, self._arrived = 0, False, list[float]()
+        self._stop = threading.Event()
+        (folder / "rgb").mkdir(parents=True)
+        self._thread = threading.Thread(target=self._run, daemon=True, name="stream")
+        self._thread.start()
+
+    def state(self) -> FeedState:
+        """What has come so far."""
+        with self._lock:
+            return self._state
+
+    def taken(self, position: int) -> None:
+        """Say that frames before a position are worked off."""
+        with self._lock:
+            self._taken = max(self._taken, position)
+
+    def arrived_s(self, position: int) -> float:
+        """When a frame came, seconds of `time.monotonic`."""
+        return self._arrived[position]
+
+    def close(self) -> None:
+        """End it; nothing more comes."""
+        self._stop.set()
+        self._thread.join(2 * self._settings.silence_s)
+
+    def _run(self) -> None:
+        reason = "it was ended"
+        try:
+            reason = self._follow()
+        except OSError as error:
+            reason = f"pictures cannot be kept in {self.folder}: {error.strerror or error}"
+        finally:
+            with self._lock:
+                self._state = replace(self._state, ended=True, reason=reason)
+
+    def _follow(self) -> str:
+        """Take pictures in until the stream is over; why it was."""
+        s = self._settings
+        last, pause_s = time.monotonic(), s.pause_s
+        while not self._stop.is_set():
+            said, came, whole = "it ended", False, False
+            try:
+                for image, finite in self._pictures():
+                    last, pause_s, came, whole = time.monotonic(), s.pause_s, True, finite
+                    self._keep(image, last)
+                    if self._stop.is_set():
+                        return "it was ended"
+                if whole:
+                    return "the stream is over"
+            except av.FFmpegError as error:
+                said = error.strerror or str(error)
+            if time.monotonic() - last > s.retry_s:
+                return f"the connection was lost ({said}) and did not come back within {s.retry_s:g} s"
+            if came or not self.state().received:
+                self._tell(f"no connection to {without_secrets(self._source)} ({said}); it is tried again")
+            with self._lock:
+                self._gap = True
+                self._state = replace(self._state, reconnects=self._state.reconnects + came)
+            self._stop.wait(pause_s)
+            pause_s = min(2 * pause_s, s.most_pause_s)
+        return "it was ended"
+
+    def _pictures(self) -> Iterator[tuple[NDArray[np.uint8], bool]]:
+        """Pictures of one connection, RGB, and whether the stream has an end that it states."""
+        wait = {"rw_timeout": str(int(1e6 * self._settings.silence_s)), "fflags": "nobuffer"}
+        kind = "v4l2" if self._source.startswith(_DEVICES) else None
+        words = {} if kind else wait | ({"rtsp_transport": "tcp"} if self._source.startswith("rtsp") else {})
+        silence_s = self._settings.silence_s
+        with av.open(self._source, format=kind, options=words, timeout=(2 * silence_s, silence_s)) as container:
+            if not container.streams.video:
+                raise SourceError(f"{without_secrets(self._source)} has no pictures")
+            finite = bool(container.duration and container.duration > 0)
+            for image in container.decode(video=0):
+                yield np.asarray(image.to_ndarray(format="rgb24"), np.uint8), finite
+
+    def _keep(self, image: NDArray[np.uint8], now: float) -> None:
+        """Write a picture, unless too many wait or it comes too soon after the last one."""
+        with self._lock:
+            number, waiting = self._state.count, self._state.count - self._taken
+            received = self._state.received + 1
+            if self._arrived and not self._gap and now - self._arrived[-1] < self._least_gap_s:
+                self._state = replace(self._state, received=received)
+                return
+            if waiting >= self._settings.most_waiting:
+                self._gap = True
+                self._state = replace(self._state, received=received, dropped=self._state.dropped + 1)
+                return
+        name = f"rgb/{number:08d}.jpg"
+        (self.folder / name).write_bytes(jpeg(image))
+        begun = self._arrived[0] if self._arrived else now
+        with (self.folder / LIST).open("a", encoding="ascii") as file:
+            file.write(f"{now - begun:.6f} {name}\n")
+        with self._lock:
+            self._arrived.append(now)
+            cuts = (*self._state.cuts, number) if self._gap and number else self._state.cuts
+            self._gap = False
+            self._state = replace(self._state, count=number + 1, cuts=cuts, received=received)

@@ -1,0 +1,27 @@
+"""Pictures of a live stream as they were kept: `frames.txt` has a line for each, seconds and the name of its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, read_text
+from list3r.frames.options import SourceOptions
+from list3r.memory.errors import SourceError
+
+LIST = "frames.txt"
+
+
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
+    """The layout, or None for another folder. A last line that is half written does not count."""
+    path = root / LIST
+    if not path.is_file():
+        return None
+    whole, _, _ = read_text(path).rpartition("\n")
+    files = []
+    for number, line in enumerate(whole.splitlines(), start=1):
+        words = line.split()
+        try:
+            files.append(FrameFile(inside(root, words[1], path), time_s=float(words[0])))
+        except (IndexError, ValueError):
+            raise SourceError(f"{path}: line {number} is not seconds and a name; mend or remove it") from None
+    return FolderLayout("live", tuple(files), Optics(options.intrinsics))
