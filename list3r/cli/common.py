@@ -90,7 +90,7 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     for name, parameter in signature.parameters.items():
         group, *told = get_args(parameter.annotation) or (parameter.annotation,)
         if not is_dataclass(group):
-            options.append(parameter)
+            options.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
             continue
         names = told[0] if told else [f.name for f in fields(group)]
         types = get_type_hints(group, include_extras=True)

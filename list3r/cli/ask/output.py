@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from list3r.api import SceneMemory
+    from list3r.cli.ask.words import CameraWords
     from list3r.memory.records import BestView, Relation
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
@@ -45,12 +46,11 @@ SessionOption = Annotated[int | None, typer.Option("--session", help="The sessio
 MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera sees no further than this.")]
 
 
-def camera_from(
-    scene: SceneMemory, view: int | None, time: float | None, pose: str | None, session: int | None
-) -> PosedCamera | None:
+def camera_from(scene: SceneMemory, words: CameraWords) -> PosedCamera | None:
     """The camera that the options name; None for none of them. Raises `OptionError`."""
     from list3r.memory.errors import OptionError
 
+    view, time, pose, session = words.view, words.time, words.pose, words.session
     if sum(option is not None for option in (view, time, pose)) > 1:
         raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
     if view is None and time is None and pose is None:

@@ -1,0 +1,173 @@
+"""Groups of options that the query commands share or that one of them has many of; see `list3r.cli.common.spread`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from list3r.cli.ask.output import (
+    Color,
+    Component,
+    Label,
+    MaxDepth,
+    MaxSize,
+    MinConfidence,
+    MinSize,
+    Pose,
+    SessionOption,
+    State,
+    Structure,
+    Time,
+    View,
+)
+from list3r.cli.common import parse_point
+
+if TYPE_CHECKING:
+    from list3r.queries.match import FilterOptions
+
+OF_LOOKS = ("label", "color", "min_size", "max_size", "min_confidence", "structure")
+"""Filters of questions that neither states nor parts of a memory matter to."""
+
+
+@dataclass(frozen=True)
+class FilterWords:
+    """Which things may answer."""
+
+    label: Label = None
+    color: Color = None
+    min_size: MinSize = None
+    max_size: MaxSize = None
+    min_confidence: MinConfidence = 0.0
+    state: State = None
+    component: Component = None
+    structure: Structure = False
+
+    def options(self) -> FilterOptions:
+        """Return them as the questions of Python take them."""
+        return {
+            "label": self.label,
+            "color": self.color,
+            "min_size": self.min_size,
+            "max_size": self.max_size,
+            "min_confidence": self.min_confidence,
+            "state": self.state,
+            "component": self.component,
+            "structure": self.structure,
+        }
+
+
+@dataclass(frozen=True)
+class NearWords:
+    """What to be near to."""
+
+    words: Annotated[str | None, typer.Argument(metavar="[WORDS]", help="Words of a label or description.")] = None
+    point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None
+    id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Distance from this instance.")] = None
+    max_distance: Annotated[float | None, typer.Option("--max-distance", help="Surfaces no further than this.")] = None
+
+    def origin(self) -> tuple[float, float, float] | None:
+        """Return the point. Raises `OptionError` where nothing is named, or by what is no point."""
+        from list3r.memory.errors import OptionError
+
+        if self.words is None and self.point is None and self.id is None:
+            raise OptionError("say what to be near to: --point x,y,z, --id ID, or words such as mug")
+        return None if self.point is None else parse_point(self.point, "--point")
+
+
+@dataclass(frozen=True)
+class CameraWords:
+    """A camera: that of a frame, or one put somewhere."""
+
+    time: Time = None
+    view: View = None
+    pose: Pose = None
+    session: SessionOption = None
+    max_depth: MaxDepth = None
+
+
+@dataclass(frozen=True)
+class RegionWords:
+    """A box, or a sphere."""
+
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X,Y,Z,X,Y,Z", help="Lower and upper corner of a box.")
+    ] = None
+    point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Centre of a sphere.")] = None
+    radius: Annotated[float | None, typer.Option("--radius", help="Radius of the sphere.")] = None
+
+    def lengths(self, camera: CameraWords) -> dict[str, Sequence[float] | float]:
+        """Return the region, nothing for that of a camera. Raises `OptionError` unless there is one of them."""
+        from list3r.memory.errors import OptionError
+
+        sphere = self.point is not None or self.radius is not None
+        if (self.box is not None) + sphere + (camera.view is not None) + (camera.pose is not None) > 1:
+            raise OptionError("give one region: --box, --point with --radius, --view or --pose")
+        if self.box is not None:
+            parts = self.box.split(",")
+            if len(parts) != 6:
+                raise OptionError(
+                    f"--box {self.box!r}: six numbers with commas are needed, the lower and the upper corner"
+                )
+            lower, upper = (parse_point(",".join(half), "--box") for half in (parts[:3], parts[3:]))
+            return {"lower": lower, "upper": upper}
+        if self.point is not None and self.radius is not None:
+            return {"center": parse_point(self.point, "--point"), "radius": self.radius}
+        if camera.view is None and camera.pose is None:
+            raise OptionError("give a region: --box x,y,z,x,y,z, --point x,y,z with --radius, --view FRAME or --pose")
+        return {}
+
+
+@dataclass(frozen=True)
+class RelationWords:
+    """Which relations, and who looks."""
+
+    subject: Annotated[
+        str | None, typer.Option("--subject", metavar="ID|WORDS", help="Who stands in the relation.")
+    ] = None
+    predicate: Annotated[
+        str | None, typer.Option("--predicate", help="on, in, next_to, near, above, left_of, behind, between, ...")
+    ] = None
+    object: Annotated[str | None, typer.Option("--object", metavar="ID|WORDS", help="To whom.")] = None
+    other: Annotated[str | None, typer.Option("--and", metavar="ID|WORDS", help="The second object of between.")] = None
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="ID|camera|X,Y,Z",
+            help="Who looks, for left_of, right_of, in_front_of and behind: from the centre of an instance, from "
+            "where the camera was last (camera) or in a frame (camera:FRAME), or from a point; towards the middle "
+            "of the two.",
+        ),
+    ] = None
+    min_confidence: MinConfidence = 0.0
+
+
+@dataclass(frozen=True)
+class LikeWords:
+    """What things are compared with."""
+
+    id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Things like this one.")] = None
+    image: Annotated[
+        Path | None, typer.Option("--image", metavar="FILE", help="Things like what this picture shows.")
+    ] = None
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only what is in this box of the picture, px.")
+    ] = None
+
+    def corners(self) -> tuple[float, float, float, float] | None:
+        """Return the box `120,80,180,150`. Raises `OptionError`."""
+        from list3r.memory.errors import OptionError
+
+        if self.box is None:
+            return None
+        try:
+            x0, y0, x1, y1 = (float(part) for part in self.box.split(","))
+        except ValueError:
+            raise OptionError(
+                f"--box {self.box!r}: four numbers x0,y0,x1,y1 are needed, such as 120,80,180,150"
+            ) from None
+        return x0, y0, x1, y1
