@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,9 +34,10 @@ if TYPE_CHECKING:
     from list3r.memory.geometry import Sim3
 
 
-def cloud(
-    truth: Truth,
-    estimate: Estimate,
+@dataclass(frozen=True)
+class CloudWords:
+    """How clouds are placed, thinned and compared."""
+
     align: Annotated[
         list[str] | None,
         typer.Option(
@@ -45,24 +46,25 @@ def cloud(
             help="Place the estimate by the true path of its camera, by its surfaces, or (give both) by one after the"
             " other. Absent: by the path where TRUTH is a source, else none.",
         ),
-    ] = None,
+    ] = None
     path: Annotated[
         Path | None,
         typer.Option("--path", metavar="TRAJECTORY", help="The estimate's own camera path, where it is no memory."),
-    ] = None,
-    scale: ScaleOption = "auto",
-    threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05,
+    ] = None
+    scale: ScaleOption = "auto"
+    threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05
     truncate: Annotated[
         float | None, typer.Option("--truncate", help="Cap single distances, metres; absent: no cap.")
-    ] = None,
-    voxel: Annotated[
-        float, typer.Option("--voxel", help="Thin both clouds to one point a cell, metres; 0: not.")
-    ] = 0.01,
-    points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000,
-    every: EveryOption = None,
-    plot: PlotOption = None,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    voxel: Annotated[float, typer.Option("--voxel", help="Thin both clouds to one point a cell, metres; 0: not.")] = (
+        0.01
+    )
+    points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000
+    every: EveryOption = None
+    plot: PlotOption = None
+
+
+def cloud(truth: Truth, estimate: Estimate, asked: CloudWords, json: JsonOption = False) -> None:
     """Accuracy, completeness, Chamfer, normal consistency, F-score. TRUTH: a cloud or mesh, a memory, or a source with
     depth and poses; ESTIMATE: a cloud or a memory (all supports of its things and surfaces, in the world).
 
@@ -71,26 +73,28 @@ def cloud(
     from list3r.evaluation.cloud import cloud_distances, evaluate_cloud
     from list3r.evaluation.point_clouds import thinned
 
-    check_scale(scale)
-    check_every(every)
-    check_plot(plot)
-    _check_lengths(threshold=threshold, truncate=truncate)
+    check_scale(asked.scale)
+    check_every(asked.every)
+    check_plot(asked.plot)
+    _check_lengths(threshold=asked.threshold, truncate=asked.truncate)
     found, _ = read_points(estimate)
-    true, true_path = read_points(truth, every)
-    true = thinned(true, voxel, points)
+    true, true_path = read_points(truth, asked.every)
+    true = thinned(true, asked.voxel, asked.points)
     true = replace(true, normals=_normals(true))
-    S_truth_estimate, how = _cloud_alignment(align, true, found, true_path, path or estimate, truth, scale)
-    found = thinned(found.moved(S_truth_estimate), voxel, points)
+    S_truth_estimate, how = _cloud_alignment(asked, (true, true_path, truth), (found, asked.path or estimate))
+    found = thinned(found.moved(S_truth_estimate), asked.voxel, asked.points)
     distances = cloud_distances(true.points, found.points)
-    errors = evaluate_cloud(true.points, found.points, (true.normals, _normals(found)), threshold, truncate, distances)
-    if plot is not None:
+    errors = evaluate_cloud(
+        true.points, found.points, (true.normals, _normals(found)), asked.threshold, asked.truncate, distances
+    )
+    if asked.plot is not None:
         title = (
             f"{estimate.name} against {truth.name}: Chamfer {errors.chamfer_cm:.2f} cm, F {100 * errors.f_score:.1f} %"
         )
         gaps = (distances.to_truth, distances.to_estimate)
-        save_picture(_figure(found, true, gaps, 2 * threshold, title, true_path), plot)
+        save_picture(_figure(found, true, gaps, 2 * asked.threshold, title, true_path), asked.plot)
     if json:
-        used = {"truth": true.words, "estimate": found.words, "alignment": how, "voxel_m": voxel}
+        used = {"truth": true.words, "estimate": found.words, "alignment": how, "voxel_m": asked.voxel}
         counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
         print_answer([{**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)}])
         return
@@ -128,13 +132,7 @@ def _figure(
 
 
 def _cloud_alignment(
-    words: list[str] | None,
-    true: PointCloud,
-    found: PointCloud,
-    true_path: Trajectory | None,
-    estimate_path: Path,
-    truth: Path,
-    scale: str,
+    asked: CloudWords, truth: tuple[PointCloud, Trajectory | None, Path], estimate: tuple[PointCloud, Path]
 ) -> tuple[Sim3, str]:
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register
@@ -142,9 +140,10 @@ def _cloud_alignment(
     from list3r.memory.errors import OptionError
     from list3r.memory.geometry import Sim3
 
-    by_source = words is None and is_source(truth) and true_path is not None
-    chosen = words or (["path"] if by_source else ["none"])
-    free = free_scale(scale, estimate_path)
+    (true, true_path, source), (found, estimate_path) = truth, estimate
+    by_source = asked.align is None and is_source(source) and true_path is not None
+    chosen = asked.align or (["path"] if by_source else ["none"])
+    free = free_scale(asked.scale, estimate_path)
     kind = "Sim(3)" if free else "SE(3)"
     S, said = Sim3.identity(), []
     for word in chosen:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, open_memory, print_table
+from list3r.cli.common import JsonOption, open_memory, print_table, spread
 from list3r.cli.measure.cloud import cloud
 from list3r.cli.measure.inputs import align_by_path, is_memory, mask_frames, read_scene_of, read_trajectory
 from list3r.cli.measure.options import (
@@ -37,7 +38,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     group = typer.Typer(help="Measure a result against truth.", no_args_is_help=True, rich_markup_mode=None)
     for command in (trajectory, cloud, instances, revisits):
-        group.command(command.__name__)(command)
+        group.command(command.__name__)(spread(command))
     app.add_typer(group, name="eval")
 
 
@@ -107,9 +108,10 @@ def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float
 # ---------------------------------------------------------------------------------------------- instances
 
 
-def instances(
-    truth: Truth,
-    estimate: Estimate,
+@dataclass(frozen=True)
+class InstanceWords:
+    """How a scene is placed, and where true ids lie."""
+
     align: Annotated[
         str | None,
         typer.Option(
@@ -117,8 +119,8 @@ def instances(
             metavar="TRAJECTORY|none",
             help="True path of the camera, to place a memory by. Absent: groundtruth.txt beside TRUTH, if it is there.",
         ),
-    ] = None,
-    scale: ScaleOption = "auto",
+    ] = None
+    scale: ScaleOption = "auto"
     ids: Annotated[
         Path | None,
         typer.Option(
@@ -126,11 +128,12 @@ def instances(
             metavar="FOLDER",
             help="Pictures of the true ids of every frame, for id switches of a memory. Absent: ids/ beside TRUTH.",
         ),
-    ] = None,
-    every: Annotated[int, typer.Option("--every", metavar="N", help="Follow ids over every N-th frame.")] = 1,
-    plot: PlotOption = None,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    every: Annotated[int, typer.Option("--every", metavar="N", help="Follow ids over every N-th frame.")] = 1
+    plot: PlotOption = None
+
+
+def instances(truth: Truth, estimate: Estimate, asked: InstanceWords, json: JsonOption = False) -> None:
     """Recall, precision, duplicates, merges, id switches; relations. TRUTH: a truth.json; ESTIMATE: a memory or scene
     JSON.
 
@@ -139,21 +142,22 @@ def instances(
     from list3r.evaluation.scene import evaluate_scene, read_scene
     from list3r.memory.errors import OptionError
 
+    align = asked.align
     if align not in (None, "none") and estimate.is_file() and not is_memory(estimate):
         raise OptionError(f"--align {align} places a memory; {estimate} is none and knows no camera path")
-    check_scale(scale)
-    check_plot(plot)
-    check_every(every)
+    check_scale(asked.scale)
+    check_plot(asked.plot)
+    check_every(asked.every)
     true, found = read_scene(truth), read_scene_of(estimate)
     beside = truth.parent / "groundtruth.txt"
     if align is None and is_memory(estimate) and beside.is_file():
         align = str(beside)
-    S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, scale)
+    S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, asked.scale)
     scores = evaluate_scene(found, true, S_truth_scene)
-    scores["identities"] = _identities(true, truth, estimate, ids, every)
-    if plot is not None:
+    scores["identities"] = _identities(true, truth, estimate, asked.ids, asked.every)
+    if asked.plot is not None:
         save_picture(
-            _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), plot
+            _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), asked.plot
         )
     if json:
         print_answer([scores])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,23 +27,30 @@ if TYPE_CHECKING:
     from list3r.evaluation.revisits import RevisitScores
 
 
-def revisits(
-    truth: Truth,
-    memory: Annotated[Path, typer.Argument(metavar="MEMORY", show_default=False)],
+@dataclass(frozen=True)
+class RevisitWords:
+    """How loops are judged."""
+
     least: Annotated[
         float, typer.Option("--least", help="Least share of the surface, seen in both frames, of a revisit.")
-    ] = 0.3,
+    ] = 0.3
     different: Annotated[
         float, typer.Option("--different", help="Share below which frames see different places; between: not counted.")
-    ] = 0.1,
-    precision: Annotated[float, typer.Option("--precision", help="Precision at which rankings are compared.")] = 0.99,
-    session: Annotated[int, typer.Option("--session", help="The session of the memory that TRUTH is of.")] = 1,
-    every: EveryOption = None,
+    ] = 0.1
+    precision: Annotated[float, typer.Option("--precision", help="Precision at which rankings are compared.")] = 0.99
+    session: Annotated[int, typer.Option("--session", help="The session of the memory that TRUTH is of.")] = 1
+    every: EveryOption = None
     save: Annotated[
         Path | None,
         typer.Option("--save", metavar="FILE", help="Write the covisibility as .npz, to be TRUTH next time."),
-    ] = None,
-    plot: PlotOption = None,
+    ] = None
+    plot: PlotOption = None
+
+
+def revisits(
+    truth: Truth,
+    memory: Annotated[Path, typer.Argument(metavar="MEMORY", show_default=False)],
+    asked: RevisitWords,
     json: JsonOption = False,
 ) -> None:
     """Precision and recall of loops against covisibility. TRUTH: the source with depth and poses, or an .npz of frame
@@ -55,20 +63,20 @@ def revisits(
     from list3r.exporters.output import check_target, replacing
     from list3r.memory.errors import OptionError
 
-    settings = RevisitTruthSettings(least, different, precision)
-    check_every(every)
-    check_plot(plot)
-    if save is not None:
-        if save.suffix.lower() != ".npz":
-            raise OptionError(f"--save {save}: the file must end in .npz")
-        check_target(save)
+    settings = RevisitTruthSettings(asked.least, asked.different, asked.precision)
+    check_every(asked.every)
+    check_plot(asked.plot)
+    if asked.save is not None:
+        if asked.save.suffix.lower() != ".npz":
+            raise OptionError(f"--save {asked.save}: the file must end in .npz")
+        check_target(asked.save)
     with open_memory(memory) as scene:
-        chunks = [c for c in scene.store.chunks.all() if c.session_id == session]
-        frames = scene.store.frames.all(session)
+        chunks = [c for c in scene.store.chunks.all() if c.session_id == asked.session]
+        frames = scene.store.frames.all(asked.session)
         edges = scene.store.edges.all()
     if not chunks:
-        raise OptionError(f"{memory} has no session {session}; `list3r info` lists them")
-    found = read_covisibility_of(truth, every)
+        raise OptionError(f"{memory} has no session {asked.session}; `list3r info` lists them")
+    found = read_covisibility_of(truth, asked.every)
     _check_clock(truth, found.frame, found.time_s, {f.frame_index: f.time_s for f in frames if f.state != "bad"})
     spans = {c.chunk_id: (c.first_frame, c.last_frame) for c in chunks}
     inside = [e for e in edges if e.u in spans and e.v in spans]
@@ -77,13 +85,13 @@ def revisits(
     ]
     judged = judge(Candidates.of_edges(inside), found, spans, neighbours, settings)
     scores = score([judged], settings)
-    if save is not None:
-        with replacing(save) as temporary:
+    if asked.save is not None:
+        with replacing(asked.save) as temporary:
             write_covisibility(temporary, found)
-    if plot is not None:
+    if asked.plot is not None:
         from list3r.evaluation.figures import revisits_figure
 
-        save_picture(revisits_figure(found.frame, found.share, judged, f"loop candidates of {memory.name}"), plot)
+        save_picture(revisits_figure(found.frame, found.share, judged, f"loop candidates of {memory.name}"), asked.plot)
     if json:
         counts = {"covisible_frames": len(found.frame), "pairs_of_chunks": len(judged.true_pairs)}
         print_answer([{**scores.as_dict(), **counts}])
