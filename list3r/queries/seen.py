@@ -69,7 +69,7 @@ def _spans(frames: list[Sighting], gap_s: float) -> tuple[tuple[int, float, floa
     out: list[tuple[int, float, float]] = []
     for f in frames:
         if out and out[-1][0] == f.session_id and f.time_s - out[-1][2] <= gap_s:
-            out[-1] = (f.session_id, out[-1][1], f.time_s)
+            out[-1] = (f.session_id, min(out[-1][1], f.time_s), max(out[-1][2], f.time_s))  # clocks may step back
         else:
             out.append((f.session_id, f.time_s, f.time_s))
     return tuple(out)

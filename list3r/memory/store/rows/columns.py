@@ -11,6 +11,7 @@ import json
 import types
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from itertools import accumulate
 from operator import attrgetter
 from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -51,7 +52,7 @@ class Columns(Generic[R]):
 
     def __init__(self, record: type[R], *special: Column, omit: Iterable[str] = (), **renamed: str) -> None:
         """`renamed` are names of columns by field, `omit` fields that have their default when read."""
-        hints = get_type_hints(record, include_extras=True)
+        hints = _hints(record)
         omitted = set(omit)
         self._record = record
         known = tuple(f.name for f in fields(record))  # type: ignore[arg-type]
@@ -123,6 +124,13 @@ class Columns(Generic[R]):
         return next(c for c in self._columns if field in c.fields)
 
 
+@cache
+def _hints(record: type[Any]) -> dict[str, Any]:
+    """Return the types of the fields of a record; reading them takes longer than opening a small memory."""
+    return get_type_hints(record, include_extras=True)
+
+
+@cache
 def plain_column(name: str, field: str, hint: Any) -> Column:
     """Return the column of one field by its type."""
     encode, decode = _kind(hint)

@@ -303,6 +303,12 @@ def bad_references(database: sqlite3.Connection, name: str) -> Iterator[str]:
         if source == name:
             query = f"SELECT DISTINCT {column} FROM {source} WHERE {column} NOT IN (SELECT {target} FROM {other})"
             yield from (f"{source}: {column} {row[0]} is not in {other}" for row in database.execute(query))
+    if name == "keyframes":
+        inside = "SELECT 1 FROM chunks c WHERE c.chunk_id = k.chunk_id AND k.frame_index >= c.first_frame"
+        query = (
+            f"SELECT chunk_id, frame_index FROM keyframes k WHERE NOT EXISTS ({inside} AND frame_index <= last_frame)"
+        )
+        yield from (f"keyframes {u}:{n}: it is no frame of its chunk" for u, n in database.execute(query))
     if name == "aliases":
         yield from _circles(dict(database.execute("SELECT id, instance FROM aliases").fetchall()))
 

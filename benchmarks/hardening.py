@@ -1,0 +1,65 @@
+"""What hostile files and words do to the program: lies, damages, command lines, bombs, and the list of what was found.
+
+    python benchmarks/hardening.py --lies 10000 --damages 1000 --command-lines 2000 --bombs \\
+        --json benchmarks/results/hardening.json
+
+`--lies`: memories of valid checksums that hold nonsense, each through all commands that read, all exports and an edit.
+None may end in a traceback, take over 10 s of a processor or 1 GB. The rest is said in `hostile/`. Two processes of the
+lowest priority; the same command goes on where it was ended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # the small memories of the tests
+
+from hostile import lying
+from hostile.work import Batch, Run
+
+EACH = 50
+"""Tries of a batch."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lies", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {"lies": (lying.batch, words.lies)}
+    problems = 0
+    for key, (work, count) in parts.items():
+        if count:
+            problems += len(_part(key, work, count, words)["problems"])
+    raise SystemExit(1 if problems else 0)
+
+
+def _part(key: str, work: Callable[[Path, int, int], Batch], count: int, words: argparse.Namespace) -> dict[str, Any]:
+    batches = -(-count // EACH)
+    run = Run(words.json, key, {"tries": batches * EACH, "seed": words.seed})
+    with tempfile.TemporaryDirectory(dir=_fast_folder()) as folder:
+        run.go(functools.partial(work, Path(folder), words.seed), batches, words.processes)
+    told = run.finish()
+    print(key, json.dumps(told, indent=2), flush=True)
+    return told
+
+
+def _fast_folder() -> str | None:
+    """A folder in memory where there is one."""
+    with suppress(OSError), tempfile.TemporaryFile(dir="/dev/shm"):
+        return "/dev/shm"
+    return None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""One command in this process, bounded in time, and how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import io
+import os
+import re
+import signal
+import sqlite3
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from list3r.cli.app import run
+from list3r.exporters.plan import picture
+from list3r.exporters.plan.layout import PlanSettings
+from list3r.exporters.registry import FORMATS
+from list3r.memory.store.read_checks import ReadChecks
+
+LONGEST_S = 10.0
+"""Processor time of a command; the clock may show `WAITING_S` on a busy machine, in which a wait is seen."""
+WAITING_S = 120.0
+MOST_MB = 1024
+READS = (
+    "list --structure",
+    "list --at 1",
+    "show 2",
+    "show 3 --json",
+    "info --loops",
+    "merges",
+    "verify",
+    "picture 2 --out OUT.jpg",
+    "query find {white box on table}",
+    "query nearest --id 3",
+    "query nearest --point 0,0,1 --state any",
+    "query within --view 3",
+    "query within --point 0,0,1 --radius 2",
+    "query seen 2",
+    "query seen --view 3",
+    "query relations --predicate on",
+    "query relations --predicate left_of --object 2 --from camera",
+    "query path 3 1",
+    "query similar --id 2",
+    "query changes --seen-again",
+)
+"""Commands that read, and answer about a sound `subject`."""
+EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "scale --instance 2 --edge height --meters 0.9")
+
+
+def exports() -> list[str]:
+    """Return a command for each format there is."""
+    written = [
+        f"export --to {name} --out OUT.{name}{form.suffixes[-1 if name == 'usd' else 0]}"
+        for name, form in FORMATS.items()
+    ]
+    return [*(w.replace(".usdz", ".usda") for w in written), "export --to prompt --out OUT.prompt"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended."""
+
+    ended: str
+    """Its exit status, or hang, traceback, memory."""
+    seconds: float
+    """Processor time."""
+    out: str
+    told: str
+    """Standard error, or the error and its place."""
+    peak_mb: int = 0
+
+    @property
+    def fine(self) -> bool:
+        """Whether it ended as a command may."""
+        return self.ended in ("0", "1", "2")
+
+
+class _TooLongError(BaseException):
+    """A command took longer than any may."""
+
+
+def ask(words: Sequence[str]) -> Outcome:
+    """Run one command."""
+    out, err, started = io.StringIO(), io.StringIO(), time.process_time()
+    told = ""
+    _forget_peak()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _alarm():
+            ended = str(run(list(words)))
+    except _TooLongError as error:
+        ended, told = "hang", _place(error)
+    except SystemExit as stop:
+        ended = str(stop.code)
+    except BaseException as error:
+        ended, told = "traceback", f"{type(error).__name__}: {str(error)[:150]} at {_place(error)}"
+    peak = peak_mb()
+    if peak > MOST_MB and ended not in ("hang", "traceback"):
+        ended, told = "memory", f"{peak} MB"
+    return Outcome(ended, time.process_time() - started, out.getvalue(), told or err.getvalue()[:300], peak)
+
+
+def command_on(memory: Path, command: str, folder: Path) -> list[str]:
+    """Return the words of one of the commands above, about a memory; what it writes goes to a folder."""
+    words = [str(folder / w) if w.startswith("OUT") else w for w in _words(command)]
+    place = 2 if words[0] == "query" else 1
+    return [*words[:place], str(memory), *words[place:]]
+
+
+def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> dict[str, frozenset[str]]:
+    """Run every command about a sound memory: all must answer. Return the tables that each has read of it.
+
+    Makes those that follow as fast as they can be.
+    """
+    picture.PlanSettings = functools.partial(  # type: ignore[assignment, misc]
+        PlanSettings, width_px=400, legend_px=4, min_map_px=100, max_map_px=200
+    )
+    read: dict[str, frozenset[str]] = {}
+    for command in commands:
+        with _tables_read() as tables:
+            ended = ask(command_on(memory, command, folder))
+        if ended.ended != "0":
+            raise SystemExit(f"`{command}` about a sound memory ended with {ended}")
+        read[command] = frozenset(tables)
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
+    return read
+
+
+@contextlib.contextmanager
+def _tables_read() -> Iterator[set[str]]:
+    """Names of the tables that connections made inside read."""
+    tables: set[str] = set()
+    note = ReadChecks._note
+
+    def also(self: ReadChecks, action: int, table: str | None, *more: str | None) -> int:
+        if action == sqlite3.SQLITE_READ and table is not None:
+            tables.add("instance_boxes" if table.startswith("instance_boxes") else table)
+        return note(self, action, table, *more)
+
+    ReadChecks._note = also  # type: ignore[method-assign]
+    try:
+        yield tables
+    finally:
+        ReadChecks._note = note  # type: ignore[method-assign]
+
+
+def peak_mb() -> int:
+    """Return the most memory that this process had since `_forget_peak`, where the system tells it."""
+    with contextlib.suppress(OSError):
+        found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+        return int(found[1]) // 1024 if found else 0
+    return 0
+
+
+def _forget_peak() -> None:
+    with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:  # noqa: PTH123
+        file.write("5")
+
+
+def _place(error: BaseException) -> str:
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(where.filename).name}:{where.lineno}"
+
+
+@contextlib.contextmanager
+def _alarm() -> Iterator[None]:
+    def ring(*_: object) -> None:
+        raise _TooLongError
+
+    before = {n: signal.signal(n, ring) for n in (signal.SIGPROF, signal.SIGALRM)}
+    signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+    signal.setitimer(signal.ITIMER_REAL, WAITING_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _words(command: str) -> list[str]:
+    """Words of a command; braces hold several together."""
+    head, _, rest = command.partition("{")
+    text, _, tail = rest.partition("}")
+    return [*head.split(), *([text] if text else []), *tail.split()]
+
+
+def be_nice() -> None:
+    """Let others go first."""
+    with contextlib.suppress(OSError):
+        os.nice(15)
