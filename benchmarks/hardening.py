@@ -22,7 +22,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # the small memories of the tests
 
-from hostile import lying
+from hostile import damages, lying
 from hostile.work import Batch, Run
 
 EACH = 50
@@ -32,11 +32,15 @@ EACH = 50
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lies", type=int, default=0)
+    parser.add_argument("--damages", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
-    parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {"lies": (lying.batch, words.lies)}
+    parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {
+        "damages": (damages.batch, words.damages),
+        "lies": (lying.batch, words.lies),
+    }
     problems = 0
     for key, (work, count) in parts.items():
         if count:

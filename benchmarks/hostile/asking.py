@@ -49,7 +49,7 @@ READS = (
     "query changes --seen-again",
 )
 """Commands that read, and answer about a sound `subject`."""
-EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "scale --instance 2 --edge height --meters 0.9")
+EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "delete 5")
 
 
 def exports() -> list[str]:

@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-from machine import machine, write_json
+from machine import STARTED_AT, machine, write_json
 
 from hostile.asking import Outcome, be_nice
 
@@ -94,7 +94,7 @@ class Run:
         return []
 
     def _keep(self, n: int, batch: Batch) -> None:
-        self.batches[str(n)] = batch
+        self.batches[str(n)] = batch | {"commit": STARTED_AT}
         self._all[self.key] = {"asked": self.asked, **self.total(), "batches": self.batches}
         write_json(self.path, self._all)
 
@@ -105,6 +105,7 @@ class Run:
             counts.update(batch.get("counts", {}))
         return {
             "tries": sum(b["tries"] for b in self.batches.values()),
+            "commits": sorted({b["commit"] for b in self.batches.values()}),
             "counts": dict(sorted(counts.items())),
             "problems": [p for b in self.batches.values() for p in b["problems"]],
             "longest_s": max((b.get("longest_s", 0.0) for b in self.batches.values()), default=0.0),
