@@ -22,7 +22,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # the small memories of the tests
 
-from hostile import damages, lying
+from hostile import command_lines, damages, lying
 from hostile.work import Batch, Run
 
 EACH = 50
@@ -33,12 +33,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lies", type=int, default=0)
     parser.add_argument("--damages", type=int, default=0)
+    parser.add_argument("--command-lines", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
     parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {
         "damages": (damages.batch, words.damages),
+        "command lines": (command_lines.batch, words.command_lines),
         "lies": (lying.batch, words.lies),
     }
     problems = 0

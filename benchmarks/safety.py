@@ -1,5 +1,5 @@
 """What a memory survives: kill -9 while it is built, updated and edited (`kills`), readers beside a writer, flipped
-bytes, truncation, lies with valid checksums (`lies`).
+bytes, truncation, lies with valid checksums (`hostile/lies.py`).
 
     python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --lies 200 --json benchmarks/results/safety.json
 
@@ -25,8 +25,8 @@ from queue import Empty
 from typing import Any
 
 import numpy as np
+from hostile import lying
 from kills import build_command, kill_builds, kill_commands, kill_edits, kill_updates, kill_writes, update_command
-from lies import tell_lies
 from machine import machine, write_json
 
 from list3r.exporters.scene_json import scene_dict
@@ -329,7 +329,7 @@ def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Calla
         # A file of its own for each: what a killed writer left beside one belongs to no other.
         yield part, lambda k=kill, n=count: k(_copy(made.updated, k.__name__), n, seed + 2)
     yield "flips", lambda: flip(made.built, folder, words.flips, seed)
-    yield "lies", lambda: tell_lies(made.updated, words.lies, seed, folder)
+    yield "lies", lambda: lying.tell(folder, seed, words.lies)
     yield "repairs", lambda: repair_flips(made.built, folder, words.flips // 10, seed + 1)
     yield "file_mb", lambda: round(made.built.stat().st_size / 1e6, 2)
     yield "verify_s", lambda: _verify_s(made.built)

@@ -2,61 +2,70 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
+import shutil
 import sqlite3
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from list3r.cli.app import run
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
-from list3r.memory.maintenance import edits
 from list3r.memory.maintenance.repair import repair
-from list3r.memory.records import Edge
+from list3r.memory.store.checksums import summed_tables
 from list3r.memory.store.rows.values import RULES, bad_references, bad_values
 from list3r.memory.store.store import Store
-from tests.conftest import write_small_room
 
 Make = Callable[..., Path]
-LIES = 8
+LIES = 15
 
 
 @pytest.fixture(scope="module")
-def lies() -> Iterator[ModuleType]:
-    """`benchmarks/lies.py`, which does the same at length."""
-    path = Path(__file__).resolve().parents[1] / "benchmarks" / "lies.py"
+def hostile() -> Iterator[SimpleNamespace]:
+    """`benchmarks/hostile`, which does the same at length."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(path.parent)
-        spec = importlib.util.spec_from_file_location("lies", path)
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        patch.setitem(sys.modules, "lies", module)
-        spec.loader.exec_module(module)
-        yield module
+        patch.syspath_prepend(Path(__file__).resolve().parents[1] / "benchmarks")
+        names = ("asking", "lies", "subject")
+        yield SimpleNamespace(**{name: importlib.import_module(f"hostile.{name}") for name in names})
+
+
+@pytest.fixture(scope="module")
+def sound(hostile: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A memory with something in every table."""
+    return Path(hostile.subject.write_subject(tmp_path_factory.mktemp("hostile") / "sound.l3r"))
 
 
 @pytest.fixture
-def rich(tmp_path: Path) -> Path:
-    """A memory with something in nearly every table."""
-    path = tmp_path / "rich.l3r"
-    with Store.create(path) as store:
-        with store.transaction():
-            write_small_room(store)
-            store.edges.add(
-                [Edge(1, 1, "loop", Sim3.identity(), 0.5, 0.5, 9, 0.01, True, "seen again", {"s_det": 0.5}, (0, 3))]
-            )
-        edits.label(store, 2, "mug")
-        edits.merge(store, 3, 4)
-    return path
+def rich(sound: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copy(sound, tmp_path / "rich.l3r"))
 
 
-def test_lies_end_in_no_traceback_and_no_hang(lies: ModuleType, rich: Path, tmp_path: Path) -> None:
-    report = lies.tell_lies(rich, LIES, 5, tmp_path)
-    assert report["problems"] == [] and report["commands"] >= 24 * LIES
+def test_every_table_holds_something_to_lie_about(hostile: SimpleNamespace, sound: Path) -> None:
+    held = {table.name for table in hostile.lies._contents(sound)}
+    assert held == {*summed_tables(), *hostile.lies.UNSIGNED}
+
+
+def test_lies_end_in_no_traceback_and_no_hang(hostile: SimpleNamespace, sound: Path) -> None:
+    asking, path = hostile.asking, sound.with_name("lie.l3r")
+    commands = (*asking.READS, *asking.exports(), *asking.EDITS)
+
+    @settings(
+        max_examples=LIES, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+    )
+    @given(hostile.lies.lies(sound), st.lists(st.sampled_from(commands), min_size=4, max_size=4, unique=True))
+    def tell(lie: Any, asked: list[str]) -> None:
+        hostile.lies.write_lie(sound, path, lie)
+        for command in ("verify", *asked):
+            outcome = asking.ask(asking.command_on(path, command, path.parent))
+            assert outcome.fine, (command, outcome)
+
+    tell()
 
 
 SOME = {
@@ -68,17 +77,17 @@ SOME = {
     "relations: object 77 is not in instances": "UPDATE relations SET object = 77 WHERE subject = 3",
     "aliases": "UPDATE aliases SET instance = id",
     "memory gravity: value": "UPDATE memory SET value = '\"sideways\"' WHERE key = 'gravity'",
-    "edges 1:1:loop:0:3: scores": "UPDATE edges SET scores = '{\"s_det\": {}}'",
+    "edges 1:2:loop:0:3: scores": "UPDATE edges SET scores = '{\"s_det\": {}}'",
 }
 
 
 @pytest.mark.parametrize("told", SOME)
 def test_a_lie_is_one_line_that_names_table_and_row(
-    told: str, lies: ModuleType, rich: Path, capsys: pytest.CaptureFixture[str]
+    told: str, hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with sqlite3.connect(rich) as database:
         assert database.execute(SOME[told]).rowcount > 0
-        lies._sign(database)
+        hostile.lies.sign(database)
     assert run(["verify", str(rich)]) == 1
     assert told in capsys.readouterr().out
     with pytest.raises(MemoryFileError, match="repair"), Store.open(rich) as store:
@@ -91,10 +100,10 @@ def test_a_lie_is_one_line_that_names_table_and_row(
         store.edges.all()
 
 
-def test_a_label_that_is_no_text_is_mended(lies: ModuleType, rich: Path) -> None:
+def test_a_label_that_is_no_text_is_mended(hostile: SimpleNamespace, rich: Path) -> None:
     with sqlite3.connect(rich) as database:
         database.execute(SOME["instances 3: label"])
-        lies._sign(database)
+        hostile.lies.sign(database)
     assert repair(rich).rebuilt
     with Store.open(rich) as store:
         assert store.verify() == [] and 2 in {i.id for i in store.instances.all()}

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import importlib.util
 import io
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import time
@@ -25,6 +27,7 @@ from list3r.memory.store.read_checks import ReadChecks
 LONGEST_S = 10.0
 """Processor time of a command; the clock may show `WAITING_S` on a busy machine, in which a wait is seen."""
 WAITING_S = 120.0
+SERVING_S = 10.0
 MOST_MB = 1024
 READS = (
     "list --structure",
@@ -53,12 +56,12 @@ EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "d
 
 
 def exports() -> list[str]:
-    """Return a command for each format there is."""
-    written = [
-        f"export --to {name} --out OUT.{name}{form.suffixes[-1 if name == 'usd' else 0]}"
-        for name, form in FORMATS.items()
-    ]
-    return [*(w.replace(".usdz", ".usda") for w in written), "export --to prompt --out OUT.prompt"]
+    """Return a command for each format whose package is there."""
+    there = {n: f for n, f in FORMATS.items() if not f.package or importlib.util.find_spec(f.package)}
+    endings = {
+        name: "" if form.folder else ".usda" if name == "usd" else form.suffixes[0] for name, form in there.items()
+    }
+    return [f"export --to {name} --out OUT-{name}{ending}" for name, ending in endings.items()]
 
 
 @dataclass(frozen=True)
@@ -84,13 +87,13 @@ class _TooLongError(BaseException):
     """A command took longer than any may."""
 
 
-def ask(words: Sequence[str]) -> Outcome:
-    """Run one command."""
+def ask(words: Sequence[str], longest_s: float | None = None, *, serves: bool = False) -> Outcome:
+    """Run one command; one that serves is interrupted as by Ctrl-C."""
     out, err, started = io.StringIO(), io.StringIO(), time.process_time()
     told = ""
     _forget_peak()
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _alarm():
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _alarm(longest_s, serves):
             ended = str(run(list(words)))
     except _TooLongError as error:
         ended, told = "hang", _place(error)
@@ -105,8 +108,10 @@ def ask(words: Sequence[str]) -> Outcome:
 
 
 def command_on(memory: Path, command: str, folder: Path) -> list[str]:
-    """Return the words of one of the commands above, about a memory; what it writes goes to a folder."""
+    """Return the words of one of the commands above, about a memory; what it writes goes to a folder, anew."""
     words = [str(folder / w) if w.startswith("OUT") else w for w in _words(command)]
+    for made in (Path(word) for word in words if word.startswith(f"{folder / 'OUT'}") and Path(word).is_dir()):
+        shutil.rmtree(made)
     place = 2 if words[0] == "query" else 1
     return [*words[:place], str(memory), *words[place:]]
 
@@ -169,13 +174,19 @@ def _place(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _alarm() -> Iterator[None]:
+def _alarm(longest_s: float | None, serves: bool) -> Iterator[None]:
     def ring(*_: object) -> None:
         raise _TooLongError
 
-    before = {n: signal.signal(n, ring) for n in (signal.SIGPROF, signal.SIGALRM)}
-    signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
-    signal.setitimer(signal.ITIMER_REAL, WAITING_S)
+    def interrupt(*_: object) -> None:
+        signal.signal(signal.SIGALRM, ring)
+        signal.setitimer(signal.ITIMER_REAL, WAITING_S)
+        raise KeyboardInterrupt
+
+    before = {signal.SIGPROF: signal.signal(signal.SIGPROF, ring)}
+    before[signal.SIGALRM] = signal.signal(signal.SIGALRM, interrupt if serves else ring)
+    signal.setitimer(signal.ITIMER_PROF, longest_s or LONGEST_S)
+    signal.setitimer(signal.ITIMER_REAL, SERVING_S if serves else WAITING_S)
     try:
         yield
     finally:

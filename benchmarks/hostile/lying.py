@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, Phase, Verbosity, given, seed, settings
 from hostile.asking import EDITS, READS, ask, command_on, exports, warm_up
 from hostile.lies import Lie, lies, write_lie
 from hostile.subject import write_subject
-from hostile.work import Batch, Tally
+from hostile.work import Batch, Tally, total
 
 EACH = 50
 
@@ -23,6 +23,12 @@ def _subject(folder: Path) -> tuple[Path, dict[str, frozenset[str]]]:
     own.mkdir()
     subject = write_subject(own / "sound.l3r")
     return subject, warm_up(subject, own, (*READS, *exports()))
+
+
+def tell(folder: Path, first_seed: int, count: int) -> Batch:
+    """Tell so many lies in this process."""
+    batches = [batch(folder, first_seed, n) for n in range(-(-count // EACH))]
+    return total(batches)
 
 
 def batch(folder: Path, first_seed: int, n: int) -> Batch:

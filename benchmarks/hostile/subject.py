@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
@@ -78,3 +79,20 @@ def _tell_changes(store: Store) -> None:
     )
     store.votes.put(1, "net", {2: Votes(0.5, {"cup": (4.0, 16.0)}, 4.0)})
     store.detected_labels.replace({ids[2]: DetectedLabel("cup", 0.9, 3.0, "net")})
+
+
+def write_source(folder: Path, frames: int = 4) -> Path:
+    """Write a folder in the TUM layout, textured pictures of a wall 2 m away that moves sideways; depth in 1/5000 m."""
+    rng = np.random.default_rng(0)
+    wall = rng.integers(0, 255, (48, 64 + 2 * frames, 3), np.uint8)
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+    for k in range(frames):
+        Image.fromarray(wall[:, 2 * k : 2 * k + 64]).save(folder / "rgb" / f"{k}.0.png")
+        Image.fromarray(np.full((48, 64), 10_000, np.uint16)).save(folder / "depth" / f"{k}.0.png")
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").write_text("".join(f"{k}.0 {kind}/{k}.0.png\n" for k in range(frames)))
+    poses = "".join(f"{k}.0 {0.08 * k} 0 0 0 0 0 1\n" for k in range(frames))
+    (folder / "groundtruth.txt").write_text(poses)
+    (folder / "calibration.txt").write_text("50 50 31.5 23.5\n")
+    return folder

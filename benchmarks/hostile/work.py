@@ -7,7 +7,7 @@ import multiprocessing
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -71,7 +71,7 @@ class Run:
                 if self._go(work, [n], 1):
                     self._keep(n, {"tries": 0, "problems": [{"what": f"batch {n}", "ended": "the process crashed"}]})
             left = [n for n in range(count) if str(n) not in self.batches]
-        return self.total()
+        return total(self.batches.values())
 
     def _go(self, work: Callable[[int], Batch], numbers: list[int], processes: int) -> list[int]:
         """Do batches; the numbers of those that were under way when a process broke."""
@@ -95,26 +95,27 @@ class Run:
 
     def _keep(self, n: int, batch: Batch) -> None:
         self.batches[str(n)] = batch | {"commit": STARTED_AT}
-        self._all[self.key] = {"asked": self.asked, **self.total(), "batches": self.batches}
+        self._all[self.key] = {"asked": self.asked, **total(self.batches.values()), "batches": self.batches}
         write_json(self.path, self._all)
-
-    def total(self) -> dict[str, Any]:
-        """Return the sum of the batches."""
-        counts: Counter[str] = Counter()
-        for batch in self.batches.values():
-            counts.update(batch.get("counts", {}))
-        return {
-            "tries": sum(b["tries"] for b in self.batches.values()),
-            "commits": sorted({b["commit"] for b in self.batches.values()}),
-            "counts": dict(sorted(counts.items())),
-            "problems": [p for b in self.batches.values() for p in b["problems"]],
-            "longest_s": max((b.get("longest_s", 0.0) for b in self.batches.values()), default=0.0),
-            "peak_mb": max((b.get("peak_mb", 0) for b in self.batches.values()), default=0),
-        }
 
     def finish(self) -> dict[str, Any]:
         """Leave the batches out of the file, and return the sum."""
-        told = {"asked": self.asked, **self.total()}
+        told = {"asked": self.asked, **total(self.batches.values())}
         self._all[self.key] = told
         write_json(self.path, self._all)
         return told
+
+
+def total(batches: Iterable[Batch]) -> dict[str, Any]:
+    """Return the sum of batches."""
+    done, counts = list(batches), Counter[str]()
+    for batch in done:
+        counts.update(batch.get("counts", {}))
+    return {
+        "tries": sum(b["tries"] for b in done),
+        "commits": sorted({b.get("commit", STARTED_AT) for b in done}),
+        "counts": dict(sorted(counts.items())),
+        "problems": [p for b in done for p in b["problems"]],
+        "longest_s": max((b.get("longest_s", 0.0) for b in done), default=0.0),
+        "peak_mb": max((b.get("peak_mb", 0) for b in done), default=0),
+    }
