@@ -14,7 +14,9 @@ pytest.importorskip("pxr")
 from pxr import Gf, Usd, UsdGeom, UsdUtils
 
 from list3r.exporters.palette import linear_from_srgb
-from list3r.exporters.usd.stage import UsdSettings, class_token, set_colors, usd_stage, write_usd
+from list3r.exporters.usd.labels import class_token
+from list3r.exporters.usd.mesh import set_vertex_colors
+from list3r.exporters.usd.stage import UsdSettings, usd_stage, write_usd
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from tests.conftest import instance
@@ -121,7 +123,7 @@ def test_colours_that_do_not_repeat_have_no_indices(tmp_path: Path) -> None:
     shades = np.arange(30, dtype=np.uint8).reshape(10, 3)
     stage = Usd.Stage.CreateInMemory()
     prim = UsdGeom.Points.Define(stage, "/p")
-    set_colors(prim, shades)
+    set_vertex_colors(prim, shades)
     assert not prim.GetDisplayColorPrimvar().IsIndexed()
     assert np.allclose(np.array(prim.GetDisplayColorPrimvar().Get()), linear_from_srgb(shades), atol=1e-6)
 

@@ -24,6 +24,9 @@ class ExportOptions(TypedDict, total=False):
     color: str | None
     tokens: int | None
     question: str | None
+    mesh: bool | None
+    colliders: bool | None
+    density: float | None
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,14 @@ class Format:
 
 FORMATS: dict[str, Format] = {
     "json": Format("scene_json", "write_scene_json", (".json",), "instances and relations, fixed schema", True),
-    "usd": Format("usd.stage", "write_usd", (".usdc", ".usd", ".usda", ".usdz"), "OpenUSD: points, boxes, camera"),
+    "usd": Format(
+        "usd.stage",
+        "write_usd",
+        (".usdc", ".usd", ".usda", ".usdz"),
+        "OpenUSD: points, boxes, meshes, camera",
+        settings="UsdSettings",
+        options=("mesh", "colliders"),
+    ),
     "ply": Format("ply", "write_ply", (".ply",), "coloured points", settings="PlySettings", options=("color",)),
     "glb": Format(
         "glb",
@@ -73,6 +83,14 @@ FORMATS: dict[str, Format] = {
     "rerun": Format("rerun_log", "write_rerun", (".rrd",), "recording for the Rerun viewer", package="rerun"),
     "plan": Format("plan.picture", "write_plan", (".png",), "plan view of the rooms as a picture"),
     "report": Format("report.page", "write_report", (".html",), "a page to read and search", of_memory=True),
+    "simready": Format(
+        "simready.assembly",
+        "write_simready",
+        (),
+        "a prop for each instance and a scene of them, for simulators",
+        settings="SimreadySettings",
+        options=("density",),
+    ),
     "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),
     "nerfstudio": Format("cameras.nerfstudio", "write_nerfstudio", (), "transforms.json with pictures"),
     "prompt": Format(

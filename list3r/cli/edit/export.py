@@ -33,6 +33,11 @@ class ExportWords:
     color: str | None = field(default=None, metadata=option("ply, glb: rgb (as seen) or instance.", "rgb|instance"))
     tokens: int | None = field(default=None, metadata=option("prompt: tokens of the text at most (2000).", "N"))
     question: str | None = field(default=None, metadata=option("prompt: what to put first.", "TEXT"))
+    mesh: bool = field(default=False, metadata=option("usd: a closed mesh of each instance in place of its points."))
+    colliders: bool = field(default=False, metadata=option("usd: meshes that collide."))
+    density: float | None = field(
+        default=None, metadata=option("simready: kg per cubic metre of the hull, for an estimated mass.", "KG/M3")
+    )
 
 
 @spread
@@ -51,7 +56,7 @@ def export(
     """
     from list3r.memory.errors import OptionError
 
-    options = asdict(words)
+    options = {name: value for name, value in asdict(words).items() if value not in (None, False)}
     if out == Path("-"):
         if json:
             raise OptionError("--out - takes standard output, --json too; leave one of them out")

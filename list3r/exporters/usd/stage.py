@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +9,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from list3r.exporters.components import Component, has_box, point_spacing, read_components, thinned_support
+from list3r.exporters.meshes.instance_mesh import instance_mesh
 from list3r.exporters.output import replacing, units
 from list3r.exporters.palette import instance_color, linear_from_srgb
 from list3r.exporters.usd.camera import add_cameras, set_time_range
-from list3r.memory.description.coco import COCO_80
+from list3r.exporters.usd.labels import class_token, set_labels
+from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind, set_vertex_colors
 from list3r.memory.errors import ExportError, OptionError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.records import Instance, Support
@@ -31,6 +32,10 @@ class UsdSettings:
     """At most so many points of a thing."""
     points_per_structure: int = 20000
     """At most so many points of a floor, a wall and the like."""
+    mesh: bool = False
+    """Whether instances and structure have a closed mesh too; their points are then invisible."""
+    colliders: bool = False
+    """Whether meshes collide, structure as it is and things by their convex hull; asks for meshes."""
 
     def __post_init__(self) -> None:
         if min(self.points_per_instance, self.points_per_structure) < 0:
@@ -83,6 +88,8 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
             limit = settings.points_per_structure if instance.structure else settings.points_per_instance
             support = thinned_support(store, instance, limit)
             paths[instance.id] = _add_instance(stage, scope.GetPath(), instance, support)
+            if settings.mesh or settings.colliders:
+                _add_surface(stage, paths[instance.id], instance, store, settings)
             if instance.dynamic and has_box(instance):
                 _animate(stage.GetPrimAtPath(paths[instance.id]), instance, store)
         add_cameras(stage, scope.GetPath(), component)
@@ -133,7 +140,7 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
     Usd.ModelAPI(prim).SetKind("component")
     Usd.ModelAPI(group.GetPrim()).SetKind("group")
     prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'thing'} #{instance.id}")
-    _set_labels(prim, instance)
+    set_labels(prim, instance)
     prim.SetDocumentation(instance.description or class_token(instance))
     _set_facts(prim, instance)
     T_world_object = Sim3.identity()
@@ -147,6 +154,24 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
     if len(support.points):
         _add_points(stage, path, T_world_object.inverse().apply(support.points), support.rgb)
     return path
+
+
+def _add_surface(stage: Usd.Stage, path: Sdf.Path, instance: Instance, store: Store, settings: UsdSettings) -> None:
+    """Add the mesh of an instance in place of its points, where its support allows one."""
+    mesh = instance_mesh(store, instance)
+    if mesh is None:
+        return
+    box = instance.box
+    T_world_object = Sim3(np.ones(()), box.rotation, box.center) if has_box(instance) else Sim3.identity()
+    prim = add_mesh(stage, path.AppendChild("mesh"), mesh, T_world_object)
+    looks = Sdf.Path("/World/Looks/seen")
+    material = UsdShade.Material.Get(stage, looks) or add_vertex_material(stage, looks)
+    bind(prim.GetPrim(), material)
+    points = stage.GetPrimAtPath(path.AppendChild("points"))
+    if points:
+        UsdGeom.Imageable(points).MakeInvisible()
+    if settings.colliders:
+        add_collider(prim, fixed=instance.structure is not None)
 
 
 def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:
@@ -179,43 +204,7 @@ def _add_points(stage: Usd.Stage, path: Sdf.Path, points_object: NDArray[np.floa
     prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
     low, high = points.min(axis=0) - width / 2, points.max(axis=0) + width / 2
     prim.CreateExtentAttr([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())])
-    set_colors(prim, rgb)
-
-
-def set_colors(prim: UsdGeom.Points, rgb: NDArray[np.uint8]) -> None:
-    """Set the colour of each point; each colour once with indices, where that is less."""
-    distinct, index = np.unique(rgb, axis=0, return_inverse=True)
-    primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    indexed = len(distinct) < len(rgb)
-    colors = np.ascontiguousarray(linear_from_srgb(distinct if indexed else rgb), dtype=np.float32)
-    primvar.Set(Vt.Vec3fArray.FromNumpy(colors))
-    if indexed:
-        primvar.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(index.ravel(), dtype=np.int32)))
-
-
-def _set_labels(prim: Usd.Prim, instance: Instance) -> None:
-    """Set the semantic label in the taxonomy `class`, and in `coco` where the label is one of its 80."""
-    _set_token(prim, "class", class_token(instance))
-    if (instance.label or "").lower() in COCO_80:
-        _set_token(prim, "coco", str(instance.label).lower())
-
-
-def _set_token(prim: Usd.Prim, taxonomy: str, token: str) -> None:
-    """Set one label; by hand where this build of USD has no `UsdSemantics`."""
-    try:
-        from pxr import UsdSemantics
-    except ImportError:
-        prim.AddAppliedSchema(f"SemanticsLabelsAPI:{taxonomy}")
-        name = f"semantics:labels:{taxonomy}"
-        prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, custom=False).Set([token])
-        return
-    UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([token])
-
-
-def class_token(instance: Instance) -> str:
-    """Return label, else kind of structure, else the words of the description before its first comma, as one token."""
-    words = instance.label or instance.structure or instance.description.split(",")[0]
-    return re.sub(r"\W+", "_", words.strip().lower()).strip("_") or "unknown"
+    set_vertex_colors(prim, rgb)
 
 
 _FACT_TYPES: dict[type, Any] = {

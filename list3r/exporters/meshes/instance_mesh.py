@@ -1,0 +1,160 @@
+"""A closed, coloured mesh of an instance from its surface points: reconstructed, a hull, or a slab of structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import QhullError, cKDTree
+
+from list3r.exporters.components import has_box, point_spacing, thinned_support
+from list3r.exporters.meshes.closed import ClosedSurface, divided, filled, hull, outward, slab, zero_level
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How meshes are made. Lengths are shares of an instance's longest side."""
+
+    points: int = 20_000
+    """Of an instance that are looked at, at most."""
+    least_points: int = 24
+    """With fewer there is no mesh."""
+    cells: int = 28
+    """Along the longest side, at most."""
+    reach_cells: float = 1.6
+    """A point stands for what is so near to it, cells; neighbours on a surface then touch."""
+    convex_depth: float = 0.06
+    """A point so deep under the convex hull still lies on it: noise, and the roundness of sides."""
+    convex_share: float = 0.85
+    """With so many points on the hull, the hull is the better mesh: what nobody saw is closed straight."""
+    convex_sides: float = 0.6
+    """And where so much of its area bears points, of two opposite sides the better: under a table nothing does."""
+    hull_faces: int = 10_000
+    """Of a hull, at most; more of them show colours finer."""
+    least_part: float = 0.1
+    """Parts of less than this share of the volume are left out."""
+    slab_cells: int = 128
+    """Along the longest side of structure, at most."""
+    slab_thickness: float = 0.003
+
+
+@dataclass(frozen=True)
+class InstanceMesh:
+    """A closed surface with colours, world coordinates."""
+
+    surface: ClosedSurface
+    rgb: NDArray[np.uint8]
+    """Of vertices, sRGB. Shape (V, 3)."""
+    kind: str
+    """reconstructed: follows the points; hull: convex, also where nobody looked; slab: a plane of structure."""
+
+
+def instance_mesh(store: Store, instance: Instance, settings: MeshSettings | None = None) -> InstanceMesh | None:
+    """Return the mesh of an instance, None where its support allows none."""
+    s = settings or MeshSettings()
+    support = thinned_support(store, instance, s.points)
+    points = support.points.astype(np.float64)
+    points = points[_dense(points)]
+    if len(points) < s.least_points or not np.ptp(points, axis=0).max() > 0:
+        return None
+    if instance.structure is not None and has_box(instance):
+        surface, kind = _slab(points, instance, s), "slab"
+    elif (convex := _hull(points, instance.box.rotation, s)) is not None:
+        surface, kind = convex, "hull"
+    else:
+        surface, kind = _reconstructed(points, s), "reconstructed"
+    if not len(surface.faces):
+        return None
+    near = np.asarray(cKDTree(support.points).query(surface.vertices, k=[1, 2, 3, 4])[1])
+    rgb = support.rgb[near].astype(np.float64).mean(axis=1)
+    return InstanceMesh(surface, np.round(rgb).astype(np.uint8), kind)
+
+
+def _dense(points: Array) -> NDArray[np.bool_]:
+    """Tell which points have neighbours as near as most have: strays would bend a hull."""
+    if len(points) < 10:
+        return np.ones(len(points), bool)
+    away = np.asarray(cKDTree(points).query(points, k=[9])[0])[:, 0]
+    return np.asarray(away <= 4.0 * np.median(away) + 1e-12)
+
+
+def _hull(points: Array, axes_world: Array, s: MeshSettings) -> ClosedSurface | None:
+    """Return the convex hull where nearly all points lie on it and its sides bear points."""
+    size = float(np.ptp(points, axis=0).max())
+    _, spread, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    if spread[2] < 0.01 * spread[0]:
+        points = np.concatenate([points - 0.005 * size * axes[2], points + 0.005 * size * axes[2]])
+    try:
+        found = hull(points)
+    except QhullError:
+        return None
+    a, b, c = (found.vertices[found.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    some = points[:: max(1, len(points) // 2000)]
+    depth = -(some @ normal.T - np.einsum("ij,ij->i", normal, a)).max(axis=1)
+    if float((depth < s.convex_depth * size).mean()) < s.convex_share:
+        return None
+    found = divided(found, size / 16, s.hull_faces)
+    return found if _borne_sides(found, points, axes_world, s.convex_depth * size) >= s.convex_sides else None
+
+
+def _borne_sides(surface: ClosedSurface, points: Array, axes_world: Array, reach: float) -> float:
+    """Return the share of the area of a hull that bears points, of two opposite sides that which bears more."""
+    corners = surface.vertices[surface.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ axes_world
+    area = np.linalg.norm(across, axis=1)
+    axis = np.abs(across).argmax(axis=1)
+    side = 2 * axis + (across[np.arange(len(axis)), axis] > 0)
+    borne = cKDTree(points).query(corners.mean(axis=1))[0] < reach
+    areas, borne_areas = np.bincount(side, area, 6), np.bincount(side, area * borne, 6)
+    share = (borne_areas / np.maximum(areas, 1e-30)).reshape(3, 2).max(axis=1)
+    return float(share @ areas.reshape(3, 2).sum(axis=1) / areas.sum())
+
+
+def _reconstructed(points: Array, s: MeshSettings) -> ClosedSurface:
+    """Return the surface around all that is near a point, or enclosed by that, drawn back to the points."""
+    cell = max(float(np.ptp(points, axis=0).max()) / s.cells, point_spacing(points.astype(np.float32)))
+    reach = s.reach_cells * cell
+    low = points.min(axis=0) - reach - 2 * cell
+    shape = np.ceil((points.max(axis=0) + reach + 2 * cell - low) / cell).astype(int) + 1
+    centers = low + cell * np.indices(tuple(shape)).reshape(3, -1).T
+    tree = cKDTree(points)
+    away = tree.query(centers, distance_upper_bound=3 * reach)[0]
+    field = (reach - np.minimum(away, 3 * reach)).reshape(tuple(shape))
+    solid = _large_parts(filled(field > 0), s.least_part)
+    enclosed = solid & (field <= 0)
+    field = np.where(enclosed, reach, np.where(solid, field, np.minimum(field, -0.1 * reach)))
+    surface = zero_level(field)
+    vertices = low + cell * surface.vertices
+    near = points[np.asarray(tree.query(vertices, k=[1, 2, 3, 4])[1])].mean(axis=1)
+    return outward(replace(surface, vertices=near + 0.4 * (vertices - near)))
+
+
+def _large_parts(solid: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    parts, count = ndimage.label(solid)
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return np.asarray((sizes >= least * sizes.max())[parts] & solid)
+
+
+def _slab(points: Array, instance: Instance, s: MeshSettings) -> ClosedSurface:
+    """Return the plate that the points of a plane cover, with its holes."""
+    thin = int(np.argmin(instance.box.size))
+    axes = instance.box.rotation[:, [(thin + 1) % 3, (thin + 2) % 3, thin]]
+    local = points @ axes
+    size = float(np.ptp(local[:, :2], axis=0).max())
+    cell = max(size / s.slab_cells, 2 * point_spacing(points.astype(np.float32)))
+    low = local[:, :2].min(axis=0)
+    index = np.floor((local[:, :2] - low) / cell).astype(int)
+    cells = np.zeros(tuple(index.max(axis=0) + 1), bool)
+    cells[tuple(index.T)] = True
+    plate = slab(ndimage.binary_closing(np.pad(cells, 2), iterations=2)[2:-2, 2:-2] | cells)
+    flat = plate.vertices * [cell, cell, s.slab_thickness * size] + [*low, float(np.median(local[:, 2]))]
+    return outward(ClosedSurface(flat @ axes.T, plate.faces))
