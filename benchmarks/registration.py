@@ -1,6 +1,7 @@
 """Registration of chunks by their things alone, in simulated homes that are seen again from elsewhere or changed.
 
-python benchmarks/registration.py --preset opposite --seeds 61-80 --json FILE
+python benchmarks/registration.py --preset opposite --seeds 66-80 --json FILE
+python benchmarks/registration.py --judge FILE     # the scores of FILE by the thresholds as they are now
 
 A home is filmed twice (`benchmarks.simulation.returns`): rooms and at last one of them, then that room again. Every
 chunk of the second run is registered to the last five of the first, and to as many of another home, with
@@ -14,6 +15,7 @@ relation is believed that is right, and its error is that of the best supported 
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import time
 from pathlib import Path
@@ -32,7 +34,10 @@ def main() -> None:
     parser.add_argument("--preset", default="opposite")
     parser.add_argument("--seeds", default="61-80", help="first-last")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--judge", type=Path)
     words = parser.parse_args()
+    if words.judge:
+        return _judged_again(words.judge, words.seeds)
     first, last = (int(n) for n in words.seeds.split("-"))
     pairs: list[dict[str, Any]] = []
     before: Any = None
@@ -47,6 +52,20 @@ def main() -> None:
     print(machine())
 
 
+def _judged_again(path: Path, seeds: str) -> None:
+    """Judge stored scores of some seeds by the thresholds as they are now."""
+    from list3r.association.revisits.constellations.registration import RegistrationSettings, doubt
+
+    held = json.loads(path.read_text(encoding="utf-8"))
+    first, last = (int(n) for n in seeds.split("-"))
+    pairs = [p for p in held["pairs"] if first <= p["seed"] <= last]
+    for pair in pairs:
+        pair["believed"] = "agreeing" in pair and doubt(pair, RegistrationSettings()) is None
+    found = summary(pairs)
+    print(json.dumps(found))
+    write_json(path, {"preset": held["preset"], "scored_at": held["commit"], "total": found, "pairs": pairs})
+
+
 def summary(pairs: list[dict[str, Any]]) -> dict[str, Any]:
     """What was joined, how rightly and how well."""
     homes = sorted({p["seed"] for p in pairs})
@@ -57,6 +76,7 @@ def summary(pairs: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "homes": len(homes),
         "joined": len({p["seed"] for p in believed if p["right"]}),
+        "by_two_relations": sum(sum(p["right"] for p in believed if p["seed"] == s) >= 2 for s in homes),
         "within_0.1_m_and_3_deg": len(close),
         "pairs": len(pairs),
         "believed": len(believed),
@@ -141,7 +161,7 @@ def _registered(old: dict[str, Any], new: dict[str, Any], seed: int) -> list[dic
                 off_m = float(np.median(np.linalg.norm(error.apply(points) - points, axis=1)))
                 off_deg = float(np.degrees(np.arccos(np.clip((np.trace(error.rotation) - 1) / 2, -1, 1))))
                 right = old is new and off_m <= RIGHT_M and off_deg <= RIGHT_DEG
-                row |= {"believed": doubt(found, new["settings"]) is None, "right": right}
+                row |= {"believed": doubt(found.scores, new["settings"]) is None, "right": right}
                 row |= {"off_m": round(off_m, 4), "off_deg": round(off_deg, 3)}
                 row |= {name: round(value, 4) for name, value in found.scores.items()}
             rows.append(row)

@@ -8,6 +8,7 @@ and that neither chunk sees through what the other saw. The weights were chosen 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,11 +47,13 @@ class RegistrationSettings:
     """of those with so many things,"""
     least_match: float = 5.0
     """whose log odds sum up to this."""
-    believed_pairs: int = 5
+    believed_pairs: int = 4
     """Things that must still agree once surfaces were brought together, for a relation to be believed,"""
-    least_support: float = 7.0
+    most_after: float = 1.9
+    """and lie no further apart than this, root mean square, in deviations,"""
+    least_support: float = 8.0
     """and what speaks for it: their log odds, less where one chunk sees through the other's surfaces or few meet,"""
-    least_agreement: float = 0.93
+    least_agreement: float = 0.9
     """of which so much may not be seen through,"""
     most_rival: float = 0.6
     """and another relation of the same chunks must have this much less."""
@@ -114,10 +117,10 @@ def register(u: Place, v: Place, metric: bool, settings: RegistrationSettings) -
     return Registration(best.S_v_u, best.match, best.fit, scores)
 
 
-def doubt(found: Registration, settings: RegistrationSettings) -> str | None:
-    """Return why a relation is not believed, or None."""
-    scores, s = found.scores, settings
-    if scores["agreeing"] < s.believed_pairs:
+def doubt(scores: Mapping[str, float], settings: RegistrationSettings) -> str | None:
+    """Return why a relation of these scores is not believed, or None."""
+    s = settings
+    if scores["agreeing"] < s.believed_pairs or scores["after"] > s.most_after:
         return f"with surfaces brought together only {scores['agreeing']:.0f} things agree"
     if scores["agreement"] < s.least_agreement:
         return f"{1 - scores['agreement']:.0%} of what is compared lies in space that the other chunk saw to be empty"

@@ -98,7 +98,7 @@ class ThingSearch:
             if found is not None:
                 way = ways.predict(u, self._id) if u in tied else None
                 off = None if way is None else way.deviations(found.S_v_u)
-                against = doubt(found, s.registration)
+                against = doubt(found.scores, s.registration)
                 if against is None and off is not None and off > most_deviations:
                     against = f"the way between the chunks contradicts it by {off:.0f} deviations"
                 out.append(self._edge(u, old, new, found, against))
