@@ -22,20 +22,14 @@ _SILENT_ON_DISTORTION = ("images", "video", "live")
 
 
 def with_camera(
-    store: Store,
-    session: int,
-    source: str | Path,
-    options: SourceOptions,
-    settings: BuildSettings,
-    info: SourceInfo,
-    look: Callable[[str, int, int], None] | None = None,
+    store: Store, session: int, options: SourceOptions, estimate: Callable[[], SessionCamera | None]
 ) -> SourceOptions:
     """The options with the camera that was estimated for a session, for models that leave that to a stage of its own.
 
-    It is estimated once: an interrupted session goes on with the same.
+    It is estimated once, by `estimate`: an interrupted session goes on with the same.
     """
     before = store.sessions.get(session)
-    known = before.camera or estimated_camera(source, options, settings, info, look)
+    known = before.camera or estimate()
     if known is None:
         return options
     if before.camera is None:

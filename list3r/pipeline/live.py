@@ -27,7 +27,7 @@ from list3r.frames.options import SourceOptions
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError, TrackingError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
-from list3r.pipeline.calibration import with_camera
+from list3r.pipeline.calibration import estimated_camera, with_camera
 from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import add_chunk, finish_session
@@ -226,7 +226,9 @@ def _begun(store: Store, feed: Feed, job: Job, options: SourceOptions, watch: Wa
     begun = replace(options, start=0, stop=max(_FIRST_FRAMES, feed.state().count))
     first = replace(job, options=begun, source=feed.folder)
     step = settled_step(store, session, first, watch)
-    told = with_camera(store, session, feed.folder, begun, job.settings, job.info, watch.look)
+    told = with_camera(
+        store, session, begun, lambda: estimated_camera(feed.folder, begun, job.settings, job.info, watch.look)
+    )
     whole = replace(told, start=options.start, stop=options.stop)
     return LiveSession(store, session, job, feed, whole, step)
 

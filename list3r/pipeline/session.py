@@ -23,7 +23,7 @@ from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
-from list3r.pipeline.calibration import camera_notes, with_camera
+from list3r.pipeline.calibration import camera_notes, estimated_camera, with_camera
 from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
 from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.finishing import check_run
@@ -112,7 +112,12 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     step = settled_step(store, session, job, watch)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks.all(session)}
-    options = with_camera(store, session, job.source, job.options, job.settings, job.info, watch.look)
+    options = with_camera(
+        store,
+        session,
+        job.options,
+        lambda: estimated_camera(job.source, job.options, job.settings, job.info, watch.look),
+    )
     tasks = []
     for span in spans:
         if span.index not in done:

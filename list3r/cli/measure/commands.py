@@ -45,19 +45,21 @@ def register(app: typer.Typer) -> None:
 # ---------------------------------------------------------------------------------------------- trajectory
 
 
-def trajectory(
-    truth: Truth,
-    estimate: Estimate,
+@dataclass(frozen=True)
+class TrajectoryWords:
+    """How poses are associated and placed."""
+
     delta: Annotated[
         str, typer.Option("--delta", help="Distance of the poses that RPE relates: 10 (frames), 0.5m or 2s.")
-    ] = "1",
-    tolerance: Annotated[float, typer.Option("--tolerance", help="Greatest gap of associated times, seconds.")] = 0.01,
+    ] = "1"
+    tolerance: Annotated[float, typer.Option("--tolerance", help="Greatest gap of associated times, seconds.")] = 0.01
     scale: Annotated[
         str, typer.Option("--scale", help="Of the picture: free, fixed or auto (free for a memory of relative scale).")
-    ] = "auto",
-    plot: PlotOption = None,
-    json: JsonOption = False,
-) -> None:
+    ] = "auto"
+    plot: PlotOption = None
+
+
+def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryWords, json: JsonOption = False) -> None:
     """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a TUM file, a memory, or a source with poses.
 
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
@@ -65,17 +67,18 @@ def trajectory(
     from list3r.evaluation.trajectory import Delta, evaluate_trajectory
     from list3r.memory.errors import OptionError
 
-    check_scale(scale)
-    check_plot(plot)
+    tolerance = asked.tolerance
+    check_scale(asked.scale)
+    check_plot(asked.plot)
     if not tolerance >= 0:
         raise OptionError(f"--tolerance {tolerance:g}: seconds, 0 or more, are needed")
-    apart = Delta.parse(delta)
+    apart = Delta.parse(asked.delta)
     true, found = read_trajectory(truth), read_trajectory(estimate)
     errors = evaluate_trajectory(true, found, tolerance, delta=apart)
-    if plot is not None:
-        free = free_scale(scale, estimate)
+    if asked.plot is not None:
+        free = free_scale(asked.scale, estimate)
         save_picture(
-            _trajectory_figure(true, found, tolerance, f"{estimate.name} against {truth.name}", free=free), plot
+            _trajectory_figure(true, found, tolerance, f"{estimate.name} against {truth.name}", free=free), asked.plot
         )
     scores = errors.as_dict()
     if json:

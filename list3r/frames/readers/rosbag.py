@@ -112,7 +112,7 @@ class BagSource:
         roles = ["color"] if self._depth is None else ["color", "depth"]
         at = {role: self._wanted(role, numbers) for role in roles}
         upcoming = iter(numbers)
-        due = next(upcoming)
+        due: int | None = next(upcoming)
         with _opened(self._path) as reader:
             topics = {self._stream(role).topic: role for role in roles}
             connections = [c for c in reader.connections if c.topic in topics]
@@ -125,13 +125,12 @@ class BagSource:
                     continue
                 waiting[number][role] = raw
                 kinds = {topics[c.topic]: c.msgtype for c in connections}
-                while len(waiting.get(due, ())) == len(roles):
+                while due is not None and len(waiting[due]) == len(roles):
                     yield self._frame(reader, due, waiting.pop(due), kinds)
-                    following = next(upcoming, None)
-                    if following is None:
-                        return
-                    due = following
-        for number in [due, *upcoming]:
+                    due = next(upcoming, None)
+                if due is None:
+                    return
+        for number in [] if due is None else [due, *upcoming]:
             yield BadFrame(number, "its messages are missing from the recording")
 
     def position(self, index: int) -> int:

@@ -184,10 +184,7 @@ class Connection:
         if isinstance(self._database, _Closed):
             return
         if self._lock is not None and self._committed is not None and os.getpid() == self._process:
-            with contextlib.suppress(sqlite3.Error):
-                if any(follower.pending for follower in self._followers):
-                    with self.transaction():
-                        pass
+            self._write_followers()
             self._committed.close()
             fold_in(self._database, _LAST_WAIT_MS)
         self._database.close()
@@ -195,6 +192,12 @@ class Connection:
         if self._lock is not None:
             self._lock.release()
         self._lock = None
+
+    def _write_followers(self) -> None:
+        """Write what follows from the rows and was left for later."""
+        if any(follower.pending for follower in self._followers):
+            with contextlib.suppress(sqlite3.Error), self.transaction():
+                pass
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -206,10 +209,7 @@ class Connection:
                 self._writing = True
                 try:
                     yield
-                    self._refuse(self._checks.found())
-                    self._refuse(self._written_over())
-                    for follower in self._followers:
-                        follower.write()
+                    self._finish_writing()
                 except BaseException:
                     self._roll_back()
                     raise
@@ -219,6 +219,13 @@ class Connection:
                 raise MemoryFileError(explained(self.path, error)) from error
             finally:
                 self._writing = False
+
+    def _finish_writing(self) -> None:
+        """Check what was written, and what it was written over, then write what follows from it."""
+        self._refuse(self._checks.found())
+        self._refuse(self._written_over())
+        for follower in self._followers:
+            follower.write()
 
     def _written_over(self) -> str | None:
         """The first damage of what the transaction that runs writes over, which must not be signed anew."""
@@ -270,9 +277,12 @@ class Connection:
             try:
                 yield
             finally:
-                if self._database.in_transaction:
-                    with contextlib.suppress(sqlite3.DatabaseError):  # nothing was written; damage was met on the way
-                        self._database.execute("ROLLBACK")
+                self._end_reading()
+
+    def _end_reading(self) -> None:
+        if self._database.in_transaction:
+            with contextlib.suppress(sqlite3.DatabaseError):  # nothing was written; damage was met on the way
+                self._database.execute("ROLLBACK")
 
     @contextlib.contextmanager
     def unchecked(self) -> Iterator[sqlite3.Connection]:

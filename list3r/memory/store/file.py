@@ -231,19 +231,22 @@ def private_copy(path: Path) -> sqlite3.Connection:
     try:
         with tempfile.TemporaryDirectory(prefix="list3r-") as folder:
             copy = Path(folder) / "copy.l3r"
-            for end in ("", "-wal", "-journal"):
-                if Path(f"{path}{end}").exists():
-                    shutil.copyfile(f"{path}{end}", f"{copy}{end}")
-            database = connected(copy, "rw")
-            try:
-                for statement in ("SELECT count(*) FROM sqlite_master", "PRAGMA journal_mode=OFF"):
-                    database.execute(statement).fetchall()  # what a journal undoes is undone before it goes
-            except BaseException:
-                database.close()
-                raise
-            return database
+            for end in (end for end in ("", "-wal", "-journal") if Path(f"{path}{end}").exists()):
+                shutil.copyfile(f"{path}{end}", f"{copy}{end}")
+            return _without_journal(connected(copy, "rw"))
     except OSError as error:
         raise MemoryFileError(f"{path} cannot be copied to be read: {error.strerror}") from error
+
+
+def _without_journal(database: sqlite3.Connection) -> sqlite3.Connection:
+    """The same connection once what a journal undoes is undone; closed where that fails."""
+    try:
+        for statement in ("SELECT count(*) FROM sqlite_master", "PRAGMA journal_mode=OFF"):
+            database.execute(statement).fetchall()
+    except BaseException:
+        database.close()
+        raise
+    return database
 
 
 def check_beside(path: Path) -> None:
