@@ -52,7 +52,7 @@ class Columns(Generic[R]):
 
     def __init__(self, record: type[R], *special: Column, omit: Iterable[str] = (), **renamed: str) -> None:
         """`renamed` are names of columns by field, `omit` fields that have their default when read."""
-        hints = _hints(record)
+        hints = _hints(record)  # type: ignore[arg-type]
         omitted = set(omit)
         self._record = record
         known = tuple(f.name for f in fields(record))  # type: ignore[arg-type]
