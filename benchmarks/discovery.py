@@ -23,6 +23,7 @@ import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
 
+from list3r.evaluation.calibration import calibration
 from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.instances.base import Discoverer, Proposals
 from list3r.instances.geometric.discovery import GeometricDiscoverer
@@ -108,9 +109,9 @@ def make(method: str, settings: InstanceSettings, film: Film, weights: Path | No
         return GeometricDiscoverer(settings)
     if method == "true":
         return TrueDiscoverer(film)
-    from list3r.instances.learned.discovery import LearnedDiscoverer
+    from list3r.instances.learned.discovery import LearnedDiscoverer, LearnedSettings
 
-    return LearnedDiscoverer(settings, weights)
+    return LearnedDiscoverer(settings, weights, LearnedSettings(least_name=0.0))
 
 
 class TrueDiscoverer:
@@ -140,11 +141,13 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
     frame = _upright(up)
     stride, structural = views.stride, {t.id for t in film.things if t.structure}
     true, told, pairs = _Gathered(), _Gathered(), []
+    said: dict[int, tuple[float, str, float]] = {}
     right = claimed = there = 0
     for proposals in found:
         view = views.view(proposals.position)
         ids = film.ids[proposals.position][::stride, ::stride].astype(np.int64)
         labels = proposals.labels[::stride, ::stride]
+        said |= _said(proposals)
         identity = np.append(-1, proposals.identity if proposals.identity is not None else [])[labels]
         flat = np.append(False, proposals.structure if proposals.structure is not None else [])[labels].astype(bool)
         bound = np.isin(ids, list(structural)) & view.confirmed
@@ -176,7 +179,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
             hit = {t for t, _, _ in errors.matches}
             out |= {"duplicates": errors.duplicates, "merged": errors.merged_pairs}
             out |= {"small": len(small), "small_found": sum(k in hit for k in small)}
-    return out | _by_masks(pixels, large)
+    return out | _by_masks(pixels, large) | _as_sure_as_right(pixels, large, said, {t.id: t.label for t in film.things})
 
 
 def _true_points(film: Film, views: ChunkViews, position: int) -> NDArray[np.float32]:
@@ -189,13 +192,8 @@ def _true_points(film: Film, views: ChunkViews, position: int) -> NDArray[np.flo
 
 def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
     """Things found and listed by IoU of their pixels over all views, of those that are `large` enough to count."""
-    true, at = np.unique(pairs[:, 0], return_inverse=True)
-    told, to = np.unique(pairs[:, 1], return_inverse=True)
-    shared = np.zeros((len(true), len(told)))
-    np.add.at(shared, (at, to), 1)
-    union = shared.sum(axis=1, keepdims=True) + shared.sum(axis=0, keepdims=True) - shared
-    iou = (shared / union)[true >= 0][:, told >= 0]
-    wanted = np.array([t in large for t in true[true >= 0].tolist()], bool)
+    true, _, iou = _mask_ious(pairs)
+    wanted = np.array([t in large for t in true.tolist()], bool)
     out = {}
     for threshold in (0.25, 0.5):
         matches = match_boxes(iou, threshold)
@@ -203,6 +201,16 @@ def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
         tag = f"{threshold:g}"
         out |= {f"mask_found_{tag}": len(matches) - faint, f"mask_listed_{tag}": iou.shape[1] - faint}
     return out
+
+
+def _mask_ious(pairs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """True things (T,), found ones (E,), and the IoU of their pixels over all views (T, E)."""
+    true, at = np.unique(pairs[:, 0], return_inverse=True)
+    told, to = np.unique(pairs[:, 1], return_inverse=True)
+    shared = np.zeros((len(true), len(told)))
+    np.add.at(shared, (at, to), 1)
+    union = shared.sum(axis=1, keepdims=True) + shared.sum(axis=0, keepdims=True) - shared
+    return true[true >= 0], told[told >= 0], (shared / union)[true >= 0][:, told >= 0]
 
 
 class _Gathered:
@@ -253,6 +261,36 @@ def _wide(box: OrientedBox) -> OrientedBox:
     return replace(box, size=np.maximum(box.size, 0.01))
 
 
+def _said(proposals: Proposals) -> dict[int, tuple[float, str, float]]:
+    """Confidence, likeliest name and its probability of each thing, where the discoverer tells them."""
+    if proposals.named is None or proposals.identity is None:
+        return {}
+    rows = zip(proposals.identity.tolist(), proposals.score.tolist(), proposals.named, strict=True)
+    return {k: (round(score, 4), *names[0]) for k, score, names in rows if names}
+
+
+def _as_sure_as_right(
+    pairs: NDArray[np.int64], large: set[int], said: dict[int, tuple[float, str, float]], labels: dict[int, str]
+) -> dict[str, Any]:
+    """Of each thing that is named: [confidence, whether it is one thing by masks at IoU 0.5], and of those that match a
+    true thing at 0.25: [probability of its name, whether it is right].
+    """
+    best: dict[int, tuple[float, int]] = {}
+    true, told, iou = _mask_ious(pairs)
+    for column, number in enumerate(told.tolist()):
+        row = int(iou[:, column].argmax()) if len(true) else 0
+        best[number] = (float(iou[row, column]), int(true[row])) if len(true) else (0.0, -1)
+    whole, names = [], []
+    for number, (score, name, probability) in sorted(said.items()):
+        share, thing = best.get(number, (0.0, -1))
+        if share >= 0.25 and thing not in large:
+            continue
+        whole.append([score, int(share >= 0.5)])
+        if share >= 0.25:
+            names.append([probability, int(labels[thing + 1] == name)])
+    return {"whole": whole, "names": names}
+
+
 def _of_faint(pairs: NDArray[np.int64], large: set[int]) -> set[int]:
     """Estimates of which most pixels show one thing that was hardly in view: neither right nor wrong."""
     codes, count = np.unique(pairs[pairs[:, 1] >= 0], axis=0, return_counts=True)
@@ -290,6 +328,10 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     right, claimed, there = (sum(r["structure"][k] for r in rows) for k in range(3))
     out["structure_f1"] = round(2 * right / max(claimed + there, 1), 3)
     out["cpu_ms_per_frame"] = round(1000 * sum(r["cpu_s"] for r in rows) / max(total("frames"), 1), 1)
+    for key, word in (("whole", "confidence"), ("names", "names")):
+        pairs = np.array([p for r in rows for p in r[key]], float).reshape(-1, 2)
+        if len(pairs):
+            out[word] = calibration(pairs[:, 0], pairs[:, 1] > 0.5)
     return out
 
 

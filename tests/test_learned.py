@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ from list3r.instances.geometric.cloud import Cloud, pack
 from list3r.instances.geometric.planes import find_planes
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.cut import THING_FEATURES, CloudCut
+from list3r.instances.learned.cut import CloudCut
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph
-from list3r.instances.learned.network import judge
+from list3r.instances.learned.network import Judgement, judge
+from list3r.instances.learned.things import ThingVerdicts, judge_things, names_of, thing_features
 from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings
@@ -29,7 +31,8 @@ def random_graph(seed: int, pieces: int = 30, borders: int = 90) -> PieceGraph:
     left, right = a[a < b][:borders], b[a < b][:borders]
     nodes = rng.normal(size=(pieces, NODE_FEATURES)).astype(np.float32)
     edges = rng.normal(size=(len(left), EDGE_FEATURES)).astype(np.float32)
-    return PieceGraph(nodes, left, right, edges, rng.uniform(1, 9, len(left)).astype(np.float32))
+    moments = np.abs(rng.normal(1.0, 0.2, size=(pieces, 10))).astype(np.float32)
+    return PieceGraph(nodes, left, right, edges, rng.uniform(1, 9, len(left)).astype(np.float32), moments)
 
 
 def one_by_one(count: int, graph: PieceGraph, score: np.ndarray, threshold: float) -> np.ndarray:
@@ -60,7 +63,7 @@ def test_agglomeration_is_average_linkage(seed: int) -> None:
 
 def test_a_border_seen_twice_from_its_other_side_is_itself() -> None:
     graph = random_graph(3)
-    turned = PieceGraph(graph.nodes, graph.left, graph.right, graph.reversed_edges(), graph.weight)
+    turned = replace(graph, edges=graph.reversed_edges())
     assert np.array_equal(turned.reversed_edges(), graph.edges)
     assert not np.array_equal(graph.reversed_edges(), graph.edges)
 
@@ -106,6 +109,24 @@ def test_shipped_weights_are_small_and_whole() -> None:
     assert weights["fine.node_mean"].shape == (NODE_FEATURES,) and weights["fine.edge_mean"].shape == (EDGE_FEATURES,)
 
 
+def test_verdicts_on_things_are_probabilities_whatever_the_order_of_things() -> None:
+    weights = load_weights()
+    graph = replace(random_graph(4), nodes=random_graph(4).nodes[:, :NODE_FEATURES])
+    count, names = len(graph.nodes), names_of(weights)
+    rng = np.random.default_rng(1)
+    log_names = np.log(rng.dirichlet(np.ones(len(names)), count)).astype(np.float32)
+    hidden = rng.normal(size=(count, 32)).astype(np.float32)
+    told = Judgement(rng.normal(size=len(graph.left)), rng.normal(size=count), log_names, hidden)
+    own = rng.integers(5, size=count)
+    said = judge_things(weights, own, graph, told)
+    assert said.names.shape == (5, len(names)) and np.allclose(said.names.sum(axis=1), 1.0, atol=1e-5)
+    assert ((said.whole > 0) & (said.whole < 1)).all() and ((said.structure >= 0) & (said.structure <= 1)).all()
+    turned = judge_things(weights, 4 - own, graph, told)
+    assert np.allclose(turned.whole[::-1], said.whole, atol=1e-5)
+    assert np.allclose(turned.names[::-1], said.names, atol=1e-4)
+    assert thing_features(own, graph, told)[1].shape[1] == len(weights["things.mean"])
+
+
 def test_it_is_asked_for_by_name() -> None:
     found = make_discoverer("learned", "geometric", (), "cpu", InstanceSettings())
     assert isinstance(found, LearnedDiscoverer)
@@ -139,9 +160,9 @@ def test_walls_round_a_corner_are_two() -> None:
     cloud = cloud_of(points.astype(np.float32), normals.astype(np.float32))
     count = len(cloud.keys)
     one = np.ones(1, np.float32)
-    cut = CloudCut(np.zeros(count, np.int32), one, one[:, None], np.zeros((1, THING_FEATURES), np.float32))
-    parted, sure = _walls_apart(cloud, cut, one, find_planes(cloud, 0.03, 1.0))
-    assert len(parted.structure) == len(sure) == 2
+    cut = CloudCut(np.zeros(count, np.int32), ThingVerdicts(one, one, one[:, None]))
+    parted = _walls_apart(cloud, cut, find_planes(cloud, 0.03, 1.0))
+    assert len(parted.told.structure) == len(parted.told.whole) == 2
     first = cloud.points[:, 1] < cloud.points[:, 0]
     far = np.abs(cloud.points[:, 0] - cloud.points[:, 1]) > 0.05
     assert len(np.unique(parted.labels[first & far])) == len(np.unique(parted.labels[~first & far])) == 1

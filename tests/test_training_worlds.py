@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("open3d")
 
-from training.worlds.catalogue import FAMILIES, HELD_OUT, KINDS, kinds_at
+from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, kinds_at
 from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
 from training.worlds.furnish import make_world
@@ -62,3 +62,17 @@ def test_a_film_is_a_function_of_its_seed_and_its_truth_fits() -> None:
     known = {t.id for t in film.things}
     assert set(np.unique(film.ids).tolist()) - {0} <= known
     assert (film.depth > 0).mean() > 0.3 and any(t.structure for t in film.things if t.id in film.ids)
+
+
+def test_what_is_built_in_stands_in_the_room_and_structure_is_none_of_it() -> None:
+    worlds = [make_world(seed, fitted=True) for seed in (2, 5)]
+    built_in = {k.name for k in KINDS.values() if k.place in BUILT_IN}
+    assert all({t.kind for t in world.things} & built_in for world in worlds)
+    for world in worlds:
+        assert sum(t.structure for t in world.things) > 6
+        for thing in world.things:
+            points = thing.vertices()
+            assert thing.structure == (thing.family == "structure")
+            if not thing.structure:
+                assert points[:, :2].min() > -0.05 and (points[:, :2] < np.array(world.size[:2]) + 0.05).all()
+    assert make_world(2).things[6:] != worlds[0].things[6:]

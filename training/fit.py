@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,30 @@ from torch.nn import functional as F
 
 from training.graphs import Lesson
 from training.model import PieceNetwork
+from training.worlds.catalogue import LABELS
+
+
+@dataclass(frozen=True)
+class Blindness:
+    """What an ablation does not see."""
+
+    nodes: tuple[int, ...] = ()
+    """Columns of the features of pieces."""
+    edges: tuple[int, ...] = ()
+    """Columns of the features of borders."""
+    messages: bool = True
+    """Whether messages are passed."""
+
+
+SEEING = Blindness()
+ABLATIONS = {
+    "colour": Blindness((16, 17, 18, 19, 20, 21), (7, 8, 20, 21, 22, 23)),
+    "views": Blindness((24, 25), (17, 18, 19, 20, 21)),
+    "messages": Blindness(messages=False),
+}
+"""What can be left out. Superpoints keep to borders of colour all the same."""
+BLIND = 1e9
+"""Deviation by which a feature vanishes."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +55,9 @@ class FitSettings:
     noise: float = 0.0
     """Deviation of what is added to features, of their own deviation."""
     seed: int = 0
+    start: Path | None = None
+    """Folder of an earlier fit to go on from, its learning rate a third."""
+    blind: Blindness = field(default_factory=lambda: SEEING)
 
 
 def fit(
@@ -39,8 +66,14 @@ def fit(
     """Train a network; a state of each epoch in `folder` lets an interrupted run go on, `log.jsonl` tells losses."""
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
-    _standardise(network, lessons)
-    optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
+    rate = settings.rate
+    if settings.start is None:
+        _standardise(network, lessons, settings.blind)
+    else:
+        load_earlier(network, settings.start)
+        rate /= 3.0
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=settings.decay)
+    (folder / "labels.json").write_text(json.dumps(LABELS))
     state, start = folder / "state.pt", 0
     if state.exists():
         saved = torch.load(state, weights_only=True)
@@ -54,7 +87,7 @@ def fit(
         for k, row in enumerate(order.tolist()):
             done = (epoch * len(lessons) + k) / steps
             for group in optimiser.param_groups:
-                group["lr"] = float(settings.rate * min(1.0, done * 30 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
+                group["lr"] = float(rate * min(1.0, done * 30 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
             losses.append(_step(network, optimiser, lessons[row], settings))
         entry = {"epoch": epoch + 1, **_means(losses), "s": round(time.monotonic() - began, 1), **score(network, held)}
         with (folder / "log.jsonl").open("a") as log:
@@ -62,6 +95,21 @@ def fit(
         print(json.dumps(entry), flush=True)  # noqa: T201
         torch.save({"network": network.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1}, state)
     return network
+
+
+def load_earlier(network: PieceNetwork, folder: Path) -> None:
+    """Take over the weights of an earlier fit; names are matched by their words, new ones start anew."""
+    saved = torch.load(folder / "state.pt", weights_only=True)["network"]
+    row = {word: 1 + k for k, word in enumerate(json.loads((folder / "labels.json").read_text()))}
+    own = network.state_dict()
+    for part in ("weight", "bias"):
+        head = own[f"node_head.{part}"].clone()
+        head[0] = saved[f"node_head.{part}"][0]
+        for k, word in enumerate(LABELS):
+            if word in row:
+                head[1 + k] = saved[f"node_head.{part}"][row[word]]
+        saved[f"node_head.{part}"] = head
+    network.load_state_dict(saved)
 
 
 def tensors(lesson: Lesson) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -76,12 +124,14 @@ def tensors(lesson: Lesson) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     )
 
 
-def _standardise(network: PieceNetwork, lessons: Sequence[Lesson]) -> None:
+def _standardise(network: PieceNetwork, lessons: Sequence[Lesson], blind: Blindness) -> None:
     nodes = np.concatenate([lesson.graph.nodes for lesson in lessons])
     edges = np.concatenate([lesson.graph.edges for lesson in lessons])
     for name, values in (("node", nodes), ("edge", edges)):
         getattr(network, f"{name}_mean").copy_(torch.from_numpy(values.mean(axis=0)))
-        getattr(network, f"{name}_std").copy_(torch.from_numpy(values.std(axis=0) + 1e-3))
+        std = values.std(axis=0) + 1e-3
+        std[list(getattr(blind, f"{name}s"))] = BLIND
+        getattr(network, f"{name}_std").copy_(torch.from_numpy(std))
 
 
 def truths(lesson: Lesson) -> tuple[Any, Any, Any]:

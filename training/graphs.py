@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.geometric.cloud import neighbour_pairs
 from list3r.instances.learned.cut import make_parts
-from list3r.instances.learned.graph import PieceGraph, Surroundings
+from list3r.instances.learned.graph import PieceGraph, Surroundings, chunk_surface
 from list3r.instances.learned.network import judge
 from list3r.instances.learned.pieces import Pieces, cut_pieces
 from training.samples import Sample, read_sample
@@ -71,7 +70,7 @@ def first_lesson(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
     if not kept.exists():
         sample = read_sample(path)
         cloud = sample.cloud()
-        pieces = cut_pieces(cloud, sample.views, surroundings_of(sample))
+        pieces = cut_pieces(chunk_surface(cloud, sample.views, surroundings_of(sample)))
         lesson = lesson_of(sample, pieces.graph, pieces.labels, sample.truth_of(cloud))
         _write(kept, lesson, pieces.labels)
     return _read(kept)
@@ -91,10 +90,11 @@ def second_lessons(
         sample = read_sample(path)
         cloud = sample.cloud()
         truth = sample.truth_of(cloud)
-        pieces = Pieces(labels, neighbour_pairs(cloud.keys, 1), lesson.graph)
+        pieces = Pieces(labels, lesson.graph)
+        surface = chunk_surface(cloud, sample.views, surroundings_of(sample))
         told = judge(arrays, "fine", lesson.graph)
         for sure, file in zip(sures, files, strict=True):
-            parts, graph = make_parts(cloud, sample.views, surroundings_of(sample), pieces, told, sure)
+            parts, graph = make_parts(surface, pieces, told, sure)
             _write(file, lesson_of(sample, graph, parts, truth), np.zeros(0, np.int32))
     return [_read(f)[0] for f in files]
 
@@ -110,9 +110,10 @@ def _write(path: Path, lesson: Lesson, labels: NDArray[np.int32]) -> None:
         right=g.right,
         edges=g.edges,
         weight=g.weight,
+        moments=g.moments,
         thing=lesson.thing,
         structure=lesson.structure,
-        name=lesson.name,
+        name=np.array([LABELS[k] if k >= 0 else "" for k in lesson.name.tolist()], str),
         size=lesson.size,
         labels=labels,
     )
@@ -122,5 +123,7 @@ def _write(path: Path, lesson: Lesson, labels: NDArray[np.int32]) -> None:
 def _read(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
     with np.load(path) as data:
         a = {name: data[name] for name in data.files}
-    graph = PieceGraph(a["nodes"], a["left"], a["right"], a["edges"], a["weight"])
-    return Lesson(int(a["seed"]), graph, a["thing"], a["structure"], a["name"], a["size"]), a["labels"]
+    graph = PieceGraph(a["nodes"], a["left"], a["right"], a["edges"], a["weight"], a["moments"])
+    row = {label: k for k, label in enumerate(LABELS)}
+    name = np.array([row.get(label, -1) for label in a["name"].tolist()], np.int64)
+    return Lesson(int(a["seed"]), graph, a["thing"], a["structure"], name, a["size"]), a["labels"]

@@ -1,6 +1,6 @@
 """Make data and weights of the learned discoverer from seeds.
 
-python -m training.train --out DIR --worlds 200 --held 12
+python -m training.train --out DIR --worlds 140 --fitted 60 --held 12
 
 Every step is kept in the folder and not done again: chunks, graphs, the state of each network after each epoch.
 """
@@ -17,19 +17,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.cut import EXTRA_EDGES, EXTRA_NODES, CutSettings, summarise
+from list3r.instances.learned.cut import EXTRA_EDGES, EXTRA_NODES, CutSettings
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
-from list3r.instances.learned.network import judge
 from list3r.instances.learned.weights import write_weights
-from training.fit import FitSettings, fit
+from training.fit import ABLATIONS, SEEING, FitSettings, fit
 from training.graphs import Lesson, first_lesson, second_lessons
 from training.model import PieceNetwork
 from training.samples import make_sample
+from training.things import clusters, fit_things, overlaps
 from training.worlds.catalogue import LABELS
 
-FIRST_SEED, FIRST_HELD_SEED = 1000, 5000
-"""Seeds of worlds for training count up from the first, those of left-out worlds for the log from the second."""
+FIRST_SEED, FIRST_FITTED_SEED, FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 1000, 2000, 5000, 5500
+"""Seeds count up from here: worlds for training, those with what is built in, and left-out worlds of both kinds."""
 
 OTHER_THRESHOLDS = (0.5, 3.5)
 """Where agglomeration of fine pieces stops besides, so that the second network sees parts of other sizes too."""
@@ -38,67 +37,64 @@ OTHER_THRESHOLDS = (0.5, 3.5)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of chunks, graphs, states and logs")
-    parser.add_argument("--worlds", type=int, default=200)
-    parser.add_argument("--held", type=int, default=12, help="left-out worlds that the log is told of")
+    parser.add_argument("--worlds", type=int, default=140, help="rooms with loose furniture")
+    parser.add_argument("--fitted", type=int, default=60, help="rooms with what is built in")
+    parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=12)
+    parser.add_argument("--start", type=Path, help="folder of an earlier run whose networks are trained on")
+    parser.add_argument("--without", choices=sorted(ABLATIONS), help="an ablation: what the networks do not see")
     parser.add_argument("--weights", type=Path, help="where the weights go; out/weights.npz without it")
     words = parser.parse_args()
     torch.set_num_threads(1)
     data = words.out / "chunks"
     paths = [make_sample(FIRST_SEED + k, data) for k in range(words.worlds)]
+    paths += [make_sample(FIRST_FITTED_SEED + k, data, fitted=True) for k in range(words.fitted)]
     held = [make_sample(FIRST_HELD_SEED + k, data, held_out=True) for k in range(words.held)]
-    train(paths, held, words.out, words.epochs, words.weights or words.out / "weights.npz")
+    held += [make_sample(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(words.held)]
+    train(paths, held, words.out, words.epochs, words.weights or words.out / "weights.npz", words.start, words.without)
 
 
-def train(paths: Sequence[Path], held: Sequence[Path], out: Path, epochs: int, weights: Path) -> None:
-    """Train both networks and the confidence on chunks, and write the weights."""
+def train(
+    paths: Sequence[Path],
+    held: Sequence[Path],
+    out: Path,
+    epochs: int,
+    weights: Path,
+    start: Path | None = None,
+    without: str | None = None,
+) -> None:
+    """Train both networks and the judge of things on chunks, and write the weights."""
     lessons, seen = [first_lesson(p)[0] for p in paths], [first_lesson(p)[0] for p in held]
-    fine = fit(
-        PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS)), lessons, seen, out / "fine", FitSettings(epochs)
-    )
-    arrays = named("fine", fine)
+    blind = ABLATIONS[without] if without else SEEING
+    depth = 3 if blind.messages else 0
+    fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), depth=depth)
+    settings = FitSettings(epochs, start=start and start / "fine", blind=blind)
+    arrays = named("fine", fit(fine, lessons, seen, out / "fine", settings))
     usual = CutSettings().sure
-    more = [second_lessons(p, arrays, out / "parts", (usual, *OTHER_THRESHOLDS)) for p in paths]
+    every = [
+        lesson
+        for k, p in enumerate(paths)
+        for lesson in second_lessons(p, arrays, out / "parts", _thresholds(k, usual))
+    ]
     unseen = [second_lessons(p, arrays, out / "parts", (usual,))[0] for p in held]
-    shape = (NODE_FEATURES + EXTRA_NODES, EDGE_FEATURES + EXTRA_EDGES)
-    every = [lesson for several in more for lesson in several]
-    settings = FitSettings(epochs, noise=0.15, decay=1e-2)
-    coarse = fit(PieceNetwork(*shape, len(LABELS), dropout=0.15), every, unseen, out / "coarse", settings)
-    arrays |= named("coarse", coarse)
-    arrays |= fit_confidence(arrays, [several[0] for several in more])
+    coarse = PieceNetwork(
+        NODE_FEATURES + EXTRA_NODES, EDGE_FEATURES + EXTRA_EDGES, len(LABELS), dropout=0.15, depth=depth
+    )
+    settings = FitSettings(epochs, noise=0.15, decay=1e-2, start=start and start / "coarse", blind=blind)
+    arrays |= named("coarse", fit(coarse, every, unseen, out / "coarse", settings))
+    arrays |= fit_things(arrays, every, unseen, blind=blind)
     write_weights(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, unseen)}))  # noqa: T201
+
+
+def _thresholds(row: int, usual: float) -> tuple[float, ...]:
+    """Where agglomeration of fine pieces stops for a chunk: as in use, and for every third chunk besides."""
+    return (usual, OTHER_THRESHOLDS[row // 3 % 2]) if row % 3 == 0 else (usual,)
 
 
 def named(prefix: str, network: PieceNetwork) -> dict[str, NDArray[Any]]:
     """Return the arrays of a network by the names that inference asks for."""
     return {f"{prefix}.{k}": v.detach().numpy() for k, v in network.state_dict().items()}
-
-
-def clusters(arrays: dict[str, NDArray[Any]], lesson: Lesson, enough: float) -> tuple[NDArray[np.int64], Any]:
-    """Return the thing of each part of a graph (P,), and what the second network said."""
-    told = judge(arrays, "coarse", lesson.graph)
-    g = lesson.graph
-    return agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, enough), told
-
-
-def overlaps(
-    lesson: Lesson, own: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return each cluster's IoU by voxels with the thing it fits best, that thing, and which clusters are structure."""
-    known = lesson.thing > 0
-    count = int(own.max(initial=-1)) + 1
-    size = np.bincount(own, lesson.size, minlength=count)
-    whole = np.bincount(lesson.thing[known], lesson.size[known])
-    codes, at = np.unique(own[known] << 16 | lesson.thing[known], return_inverse=True)
-    shared = np.bincount(at, lesson.size[known])
-    cluster, thing = codes >> 16, codes & 0xFFFF
-    iou = shared / (size[cluster] + whole[thing] - shared)
-    best, which = np.zeros(count), np.zeros(count, np.int64)
-    order = np.argsort(iou, kind="stable")
-    best[cluster[order]], which[cluster[order]] = iou[order], thing[order]
-    bound = np.bincount(own, lesson.size * lesson.structure, minlength=count) > 0.5 * size
-    return best, which, bound
 
 
 def things_found(
@@ -126,28 +122,6 @@ def things_found(
         "precision_0.5": b / listed_,
     }
     return {k: round(float(v), 3) for k, v in values.items()}
-
-
-def fit_confidence(arrays: dict[str, NDArray[Any]], lessons: Sequence[Lesson]) -> dict[str, NDArray[np.float32]]:
-    """Return the logistic regression that tells whether a cluster is one whole thing (IoU of 0.5 by voxels)."""
-    rows, right = [], []
-    for lesson in lessons:
-        own, told = clusters(arrays, lesson, CutSettings().enough)
-        iou, _, bound = overlaps(lesson, own)
-        cut = summarise(np.zeros(0, np.int32), own, lesson.size, lesson.graph, told)
-        rows.append(cut.features[~bound])
-        right.append(iou[~bound] > 0.5)
-    x, y = np.concatenate(rows), np.concatenate(right).astype(np.float64)
-    mean, std = x.mean(axis=0), x.std(axis=0) + 1e-3
-    x = (x - mean) / std
-    full = np.concatenate([x, x**2, np.ones((len(x), 1))], axis=1)
-    weight = np.zeros(full.shape[1])
-    for _ in range(30):
-        p = 1 / (1 + np.exp(-np.clip(full @ weight, -20, 20)))
-        hessian = full.T @ (full * (p * (1 - p))[:, None]) + 1.0 * np.eye(len(weight))
-        weight += np.linalg.solve(hessian, full.T @ (y - p) - weight)
-    names = {"mean": mean, "std": std, "weight": weight}
-    return {f"confidence.{k}": v.astype(np.float32) for k, v in names.items()}
 
 
 if __name__ == "__main__":

@@ -63,4 +63,6 @@ def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposal
         structure=None if proposals.structure is None else proposals.structure[keep],
         base=None if proposals.base is None else proposals.base[keep],
         names=None if proposals.names is None else tuple(proposals.names[k] for k in keep.tolist()),
+        whole=None if proposals.whole is None else proposals.whole[keep],
+        named=None if proposals.named is None else tuple(proposals.named[k] for k in keep.tolist()),
     )

@@ -81,7 +81,8 @@ class LocalInstance:
     support: Support
     """Chunk coordinates."""
     stability: float
-    """Mean agreement of the propagated masks with the images, in [0, 1]."""
+    """Mean agreement of the propagated masks with the images, times the probability that it is one thing and all of it
+    where the discoverer tells it, in [0, 1]."""
     plane: Plane | None = None
     """Plane (n, d), n . p + d = 0 in chunk coordinates, n towards the cameras, if it is flat. Shape (4,)."""
     structure: bool = False
@@ -92,6 +93,8 @@ class LocalInstance:
     """Where it was while it moved, for dynamic ones."""
     names: tuple[tuple[str, float], ...] = ()
     """What the discoverer called it on each anchor, with its score in (0, 1); empty where it has no names."""
+    named: tuple[tuple[str, float], ...] = ()
+    """Names that it may have, with their probabilities over all views of the chunk, where the discoverer knows."""
 
 
 @dataclass(frozen=True)

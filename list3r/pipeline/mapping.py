@@ -21,7 +21,13 @@ from list3r.instances.overlays import write_support
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.labels import apply_labels, put_votes, votes_of_names
+from list3r.memory.library.labels import (
+    OWN_NAMES,
+    apply_labels,
+    put_votes,
+    votes_of_names,
+    votes_of_probabilities,
+)
 from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.pipeline.placing import knows_cameras, place_chunks, poses_given
@@ -50,6 +56,9 @@ def add_chunk(
         named = {i.local_id: votes_of_names(i.names) for i in result.library.instances if i.names}
         if named:
             put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named)
+        told = {i.local_id: votes_of_probabilities(i.named) for i in result.library.instances if i.named}
+        if told:
+            put_votes(store, chunk_id, OWN_NAMES, told)
         given = poses_given(store, session_id)
         if given:
             store.edges.add(_edge_of_given_poses(store, session_id))

@@ -137,6 +137,15 @@ def _proposals(
         if segment.base is not None:
             bases[row] = segment.base @ view.T_chunk_cam
     structure = np.array([cut.segments[number].structure for number in order], bool)
+    named = tuple(cut.segments[number].named for number in order.tolist())
     return Proposals(
-        view.position, full, score[order], features[order], planes, order.astype(np.int64), structure, bases
+        position=view.position,
+        labels=full,
+        score=score[order],
+        features=features[order],
+        plane=planes,
+        identity=order.astype(np.int64),
+        structure=structure,
+        base=bases,
+        named=named if any(named) else None,
     )

@@ -41,6 +41,8 @@ class Segment:
     """How sure it is one thing, in [0, 1]."""
     base: NDArray[np.float64] | None = None
     """Plane of the wall or floor that a panel lies on, chunk coordinates, n towards the cameras. Shape (4,)."""
+    named: tuple[tuple[str, float], ...] = ()
+    """Names that it may have, with their probabilities."""
 
 
 @dataclass(frozen=True)

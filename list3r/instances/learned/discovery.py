@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.base import Frame
+from list3r.instances.base import Proposals
 from list3r.instances.geometric.cloud import Cloud, build_cloud
 from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.features import object_feature
@@ -17,11 +19,15 @@ from list3r.instances.geometric.segments import Segment, Segmentation
 from list3r.instances.geometric.surfaces import estimate_up
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
-from list3r.instances.learned.graph import Surroundings
+from list3r.instances.learned.graph import Surroundings, chunk_surface
 from list3r.instances.learned.network import Weights
+from list3r.instances.learned.things import ThingVerdicts, names_of
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
+from list3r.reconstruction.base import Reconstruction
 
+MOST_NAMES = 3
+"""Names that are told of one thing at most."""
 FLAT = 0.85
 """Share of a thing's voxels near its plane from which it is a flat surface."""
 
@@ -33,6 +39,10 @@ class LearnedSettings:
     least_confidence: float = 0.35
     """Things that are less probably one whole are scraps and not proposed; chosen on worlds for training, where recall
     and precision meet near it."""
+    least_name: float = 0.5
+    """Names that are less probable are not told."""
+    plane_area_m2: float = 0.25
+    """Smallest flat surface looked for, from which gravity is told and structure is parted."""
     cut: CutSettings = field(default_factory=CutSettings)
 
 
@@ -49,37 +59,32 @@ class LearnedDiscoverer(GeometricDiscoverer):
         self._learned = learned or LearnedSettings()
         self._weights: Weights = load_weights(weights)
 
+    def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
+        """Propose masks on the frame at `position`, best first, with the probability that each is one thing."""
+        found = super().__call__(frames, reconstruction, position)
+        return replace(found, whole=found.score)
+
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
         settings = self.settings.segment
         shown = [views.view(p) for p in views.anchors]
         cloud = build_cloud(shown, settings.voxel_m * views.unit)
         poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
-        planes = find_planes(cloud, settings.plane_area_m2 * views.unit**2, views.unit)
+        planes = find_planes(cloud, self._learned.plane_area_m2 * views.unit**2, views.unit)
         up = estimate_up(planes, poses)
         height = float(np.median(poses[:, :3, 3] @ up))
         around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
-        cut = cut_cloud(cloud, shown, around, self._weights, self._learned.cut)
-        sure = confidence(cut, self._weights)
-        listed = (sure >= self._learned.least_confidence) | (cut.structure > 0.5)
-        labels, segments, features = _described(
-            cloud, *_walls_apart(cloud, cut.only(listed), sure[listed], planes), up, views.unit
-        )
+        cut = cut_cloud(chunk_surface(cloud, shown, around), self._weights, self._learned.cut)
+        listed = (cut.told.whole >= self._learned.least_confidence) | (cut.told.structure > 0.5)
+        parted = _walls_apart(cloud, cut.only(listed), planes)
+        names = names_of(self._weights)
+        labels, segments, features = _described(cloud, parted, up, views.unit, names, self._learned.least_name)
         return cloud, Segmentation(labels, tuple(segments), up), features
 
 
-def confidence(cut: CloudCut, weights: Weights) -> NDArray[np.float32]:
-    """Return the probability that each thing is one whole, by a logistic regression fitted in training. Shape (T,)."""
-    x = (cut.features - weights["confidence.mean"]) / weights["confidence.std"]
-    full = np.concatenate([x, x**2, np.ones((len(x), 1), np.float32)], axis=1)
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(full @ weights["confidence.weight"], -20, 20))), np.float32)
-
-
-def _walls_apart(
-    cloud: Cloud, cut: CloudCut, sure: NDArray[np.float32], planes: Sequence[Plane]
-) -> tuple[CloudCut, NDArray[np.float32]]:
-    """The cut with structure of several planes (walls round a corner) as one thing for each, and their confidence."""
-    labels, origin = cut.labels.copy(), list(range(len(sure)))
-    for number in np.flatnonzero(cut.structure > 0.5).tolist():
+def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudCut:
+    """The cut with structure of several planes (walls round a corner) as one thing for each."""
+    labels, origin = cut.labels.copy(), list(range(len(cut.told.structure)))
+    for number in np.flatnonzero(cut.told.structure > 0.5).tolist():
         mine = np.flatnonzero(cut.labels == number)
         faces = _faces(cloud, mine, planes)
         if len(faces) > 1:
@@ -88,8 +93,7 @@ def _walls_apart(
             for k in range(1, len(faces)):
                 labels[mine[nearest == k]] = len(origin)
                 origin.append(number)
-    rows = np.array(origin, np.int64)
-    return CloudCut(labels, cut.structure[rows], cut.names[rows], cut.features[rows]), sure[rows]
+    return CloudCut(labels, cut.told.rows(np.array(origin, np.int64)))
 
 
 def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> list[NDArray[np.float64]]:
@@ -106,21 +110,32 @@ def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> li
     return faces
 
 
+def _named(told: ThingVerdicts, names: Sequence[str], least: float) -> list[tuple[tuple[str, float], ...]]:
+    """The likeliest names of each thing with their probabilities; none for structure and where none is sure enough."""
+    out: list[tuple[tuple[str, float], ...]] = []
+    for row, structure in zip(told.names, told.structure, strict=True):
+        best = np.argsort(-row, kind="stable")[:MOST_NAMES]
+        sure = structure <= 0.5 and row[best[0]] >= least
+        out.append(tuple((names[k], round(float(row[k]), 4)) for k in best if row[k] >= 0.02) if sure else ())
+    return out
+
+
 def _described(
-    cloud: Cloud, cut: CloudCut, sure: NDArray[np.float32], up: NDArray[np.float64], unit: float
+    cloud: Cloud, cut: CloudCut, up: NDArray[np.float64], unit: float, names: Sequence[str], least_name: float
 ) -> tuple[NDArray[np.int32], list[Segment], NDArray[np.float32]]:
     """Labels from 1 (0 for none), what each segment is, and its feature."""
-    rgb = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8)
+    rgb, count = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8), len(cut.told.structure)
     order = np.argsort(cut.labels, kind="stable")
-    bounds = np.searchsorted(cut.labels[order], np.arange(len(cut.structure) + 1))
-    segments, features = [], np.zeros((len(cut.structure), 64), np.float32)
-    for number in range(len(cut.structure)):
+    bounds = np.searchsorted(cut.labels[order], np.arange(count + 1))
+    segments, features, named = [], np.zeros((count, 64), np.float32), _named(cut.told, names, least_name)
+    for number in range(count):
         mine = order[bounds[number] : bounds[number + 1]]
-        structure = bool(cut.structure[number] > 0.5)
+        structure = bool(cut.told.structure[number] > 0.5)
         features[number] = object_feature(cloud.points[mine], rgb[mine], up, unit)
         plane = _plane_of(cloud, mine, unit)
         kind = "surface" if structure and plane is not None else "thing"
-        segments.append(Segment(kind, plane, structure, float(sure[number]) if not structure else 0.95))
+        score = 0.95 if structure else float(cut.told.whole[number])
+        segments.append(Segment(kind, plane, structure, score, named=named[number]))
     return np.asarray(cut.labels + 1, np.int32), segments, features
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.geometric.cloud import Cloud, key_shift, pack, unpack
+from list3r.instances.geometric.cloud import Cloud, key_shift, neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import lab_of
 from list3r.instances.geometric.fusion import View
 
@@ -35,6 +35,27 @@ class Surroundings:
 
 
 @dataclass(frozen=True)
+class ChunkSurface:
+    """A cloud of N voxels with what features are made of, worked out once."""
+
+    cloud: Cloud
+    views: Sequence[View]
+    around: Surroundings
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]]
+    """Voxels that are neighbours. Shape (M,) each."""
+    lab: Float
+    """Colours of the voxels, Lab with lightness halved. Shape (N, 3)."""
+    view_lab: tuple[Float, ...]
+    """Colours of the views likewise. Shape (h, w, 3) each."""
+
+
+def chunk_surface(cloud: Cloud, views: Sequence[View], around: Surroundings) -> ChunkSurface:
+    """Return a cloud with its neighbours and colours."""
+    shown = [lab_of(v.rgb.reshape(-1, 3).astype(np.float32)).reshape(v.rgb.shape) for v in views]
+    return ChunkSurface(cloud, views, around, neighbour_pairs(cloud.keys, 1), lab_of(cloud.rgb), tuple(shown))
+
+
+@dataclass(frozen=True)
 class PieceGraph:
     """P pieces and E undirected borders between them."""
 
@@ -47,6 +68,8 @@ class PieceGraph:
     """Features of the borders, seen from the left. Shape (E, EDGE_FEATURES)."""
     weight: Float
     """Length of the borders, neighbouring voxels. Shape (E,)."""
+    moments: Float
+    """Voxels, mean place (x, y, z) and covariance (xx, yy, zz, xy, xz, yz) of the pieces, metres, upright. (P, 10)."""
 
     def reversed_edges(self) -> Float:
         """Return the features of the borders as seen from the right. Shape (E, EDGE_FEATURES)."""
@@ -63,39 +86,33 @@ _TURNED = [14, 15, 16]
 """Columns that change their sign then."""
 
 
-def piece_graph(
-    cloud: Cloud,
-    views: Sequence[View],
-    labels: NDArray[np.int32],
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
-    around: Surroundings,
-    doublings: int = 1,
-) -> PieceGraph:
-    """Return the graph of pieces; `labels` (N,) is each voxel's piece, -1 for none, `pairs` neighbouring voxels.
+def piece_graph(surface: ChunkSurface, labels: NDArray[np.int32], doublings: int = 1) -> PieceGraph:
+    """Return the graph of pieces; `labels` (N,) is each voxel's piece, -1 for none.
 
     Pieces are neighbours over gaps, too, that depth edges leave: within two cells of the voxel's size doubled so often.
     """
     count = int(labels.max(initial=-1)) + 1
-    stats = _Pieces(cloud, labels, count, around)
-    touching = _touching(labels, pairs, count)
-    codes = np.union1d(np.unique(touching.code), _near_codes(cloud, labels, count, doublings))
+    stats = _Pieces(surface, labels, count)
+    touching = _touching(labels, surface.pairs, count)
+    codes = _codes(surface.cloud, labels, touching, count, doublings)
     left, right = codes // count, codes % count
-    contact = _contact(cloud, labels, pairs, touching, codes, around)
-    seen = _seen(cloud, views, labels, codes, count)
+    contact = _contact(surface, labels, touching, codes)
+    seen = _seen(surface, labels, codes, count)
     edges = np.column_stack([contact, _between(stats, left, right), seen, _contrast(stats, left, right)])
     weight = np.expm1(contact[:, 0]) + 1.0
     front = np.bincount(left, seen[:, 0] * seen[:, 1], count) + np.bincount(right, seen[:, 0] * seen[:, 2], count)
     behind = np.bincount(left, seen[:, 0] * seen[:, 2], count) + np.bincount(right, seen[:, 0] * seen[:, 1], count)
     total = np.maximum(np.bincount(left, seen[:, 0], count) + np.bincount(right, seen[:, 0], count), 0.1)
     nodes = np.column_stack([stats.features(), front / total, behind / total])
-    return PieceGraph(nodes.astype(np.float32), left, right, edges.astype(np.float32), weight.astype(np.float32))
+    tables = [a.astype(np.float32) for a in (nodes, edges, weight, stats.moments())]
+    return PieceGraph(tables[0], left, right, tables[1], tables[2], tables[3])
 
 
 class _Pieces:
     """Means and moments of the pieces of a cloud, in metres and upright."""
 
-    def __init__(self, cloud: Cloud, labels: NDArray[np.int32], count: int, around: Surroundings) -> None:
-        known = labels >= 0
+    def __init__(self, surface: ChunkSurface, labels: NDArray[np.int32], count: int) -> None:
+        cloud, around, known = surface.cloud, surface.around, labels >= 0
         self._own = labels[known]
         self.count, self._around = count, around
         frame = upright_frame(around.up)
@@ -107,8 +124,9 @@ class _Pieces:
         length = np.linalg.norm(self.normal, axis=1, keepdims=True)
         self.coherence = length[:, 0]
         self.normal = self.normal / np.maximum(length, 1e-6)
-        self.lab = self._mean(lab_of(cloud.rgb[known]))
-        away = lab_of(cloud.rgb[known]) - self.lab[self._own]
+        lab = surface.lab[known]
+        self.lab = self._mean(lab)
+        away = lab - self.lab[self._own]
         self.lab_spread = np.sqrt(self._mean(away**2))
         self.sigma = self._mean(cloud.sigma[known][:, None])[:, 0] / around.unit
         offset = points - self.center[self._own]
@@ -125,6 +143,12 @@ class _Pieces:
         np.minimum.at(low, self._own, z)
         np.maximum.at(high, self._own, z)
         return np.minimum(low, high), np.maximum(low, high)
+
+    def moments(self) -> NDArray[np.float64]:
+        """Size, place and spread. Shape (P, 10)."""
+        c = self._cov
+        spread = [c[:, 0, 0], c[:, 1, 1], c[:, 2, 2], c[:, 0, 1], c[:, 0, 2], c[:, 1, 2]]
+        return np.column_stack([self.size, self.center, *spread])
 
     def features(self) -> NDArray[np.float64]:
         """What each piece is like by itself. Shape (P, NODE_FEATURES - 2)."""
@@ -183,7 +207,27 @@ def _touching(labels: NDArray[np.int32], pairs: tuple[NDArray[np.int64], NDArray
     return _Touching(row, np.minimum(a, b) * count + np.maximum(a, b), a > b)
 
 
-def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: int) -> NDArray[np.int64]:
+MOST_IN_TABLE = 10_000
+"""Pieces up to which pairs of them are marked in a table, which is faster than sorting them."""
+
+
+def _codes(
+    cloud: Cloud, labels: NDArray[np.int32], touching: _Touching, count: int, doublings: int
+) -> NDArray[np.int64]:
+    """Codes of pieces that touch or come near each other, ascending. Shape (E,)."""
+    if count > MOST_IN_TABLE:
+        parts = [touching.code, *_near_codes(cloud, labels, count, doublings)]
+        return np.unique(np.concatenate(parts))
+    table = np.zeros(-(-count * count // 8) * 8, bool)
+    table[touching.code] = True
+    for codes in _near_codes(cloud, labels, count, doublings):
+        table[codes] = True
+    word = np.flatnonzero(table.view(np.uint64))
+    row, place = np.nonzero(table.reshape(-1, 8)[word])
+    return np.asarray(8 * word[row] + place, np.int64)
+
+
+def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: int) -> Iterator[NDArray[np.int64]]:
     """Codes of pieces that come within two cells of a coarser grid: over gaps that depth edges leave."""
     known = np.flatnonzero(labels >= 0)
     cell = pack(unpack(cloud.keys[known]) >> doublings)
@@ -193,7 +237,7 @@ def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: 
     key, own = key[fresh], own[fresh]
     first = np.flatnonzero(np.diff(key, prepend=-1))
     last = np.append(first[1:], len(key)) - 1
-    cells, found = key[first], []
+    cells = key[first]
     span = (-1, 0, 1)
     half = [(i, j, k) for i in span for j in span for k in span if (i, j, k) >= (0, 0, 0)]
     for offset in half:
@@ -202,19 +246,14 @@ def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: 
         for mine in (first, last):
             for theirs in (first, last):
                 a, b = own[mine[hit]], own[theirs[at[hit]]]
-                found.append((np.minimum(a, b) * count + np.maximum(a, b))[a != b])
-    return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
+                yield (np.minimum(a, b) * count + np.maximum(a, b))[a != b]
 
 
 def _contact(
-    cloud: Cloud,
-    labels: NDArray[np.int32],
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
-    touching: _Touching,
-    codes: NDArray[np.int64],
-    around: Surroundings,
+    surface: ChunkSurface, labels: NDArray[np.int32], touching: _Touching, codes: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """What the voxels on both sides of each border tell. Shape (E, 10)."""
+    cloud, pairs = surface.cloud, surface.pairs
     at = np.searchsorted(codes, touching.code)
     a, b = pairs[0][touching.row], pairs[1][touching.row]
     a, b = np.where(touching.flipped, b, a), np.where(touching.flipped, a, b)
@@ -229,8 +268,7 @@ def _contact(
     known = ((n != 0).any(axis=1) & (m != 0).any(axis=1)).astype(np.float64)
     bent = ((m - n) * way).sum(axis=1) * known
     step = np.abs((way * (n + m) / 2.0).sum(axis=1))
-    lab = lab_of(cloud.rgb)
-    color = lab[b] - lab[a]
+    color = surface.lab[b] - surface.lab[a]
     count = int(labels.max(initial=-1)) + 1
     outline = np.sqrt(np.maximum(np.bincount(labels[labels >= 0], minlength=count), 1.0))
     return np.column_stack(
@@ -244,7 +282,7 @@ def _contact(
             mean(step),
             mean(np.linalg.norm(color, axis=1)) / 15.0,
             mean(np.abs(color[:, 0])) / 15.0,
-            mean(np.maximum(cloud.sigma[a], cloud.sigma[b])) / around.unit * 100.0,
+            mean(np.maximum(cloud.sigma[a], cloud.sigma[b])) / surface.around.unit * 100.0,
         ]
     )
 
@@ -276,14 +314,13 @@ def _contrast(stats: _Pieces, left: NDArray[np.int64], right: NDArray[np.int64])
 
 
 def _seen(
-    cloud: Cloud, views: Sequence[View], labels: NDArray[np.int32], codes: NDArray[np.int64], count: int
+    surface: ChunkSurface, labels: NDArray[np.int32], codes: NDArray[np.int64], count: int
 ) -> NDArray[np.float64]:
     """What views show across each border: how often it is seen, who is before whom, the step of colour. (E, 5)."""
     table = np.append(labels, -1)
     sums = np.zeros((5, len(codes)))
-    for view, index in zip(views, cloud.index, strict=True):
+    for view, lab, index in zip(surface.views, surface.view_lab, surface.cloud.index, strict=True):
         image = table[index]
-        lab = lab_of(view.rgb.reshape(-1, 3).astype(np.float32)).reshape(*view.rgb.shape)
         limit = 6.0 * view.reading + 0.015 * view.depth
         for axis in (0, 1):
             one, two = _apart(axis, REACH_PX)

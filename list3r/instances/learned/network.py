@@ -55,6 +55,12 @@ def judge(weights: Weights, prefix: str, graph: PieceGraph) -> Judgement:
     return Judgement(w.two("pair_head", pair)[:, 0], heads[:, 0], names, h)
 
 
+def two_layers(weights: Weights, name: str, x: Float) -> Float:
+    """Return what a hidden layer and a linear one after it make of x. Shape (N, D) -> (N, O)."""
+    h = np.maximum(x @ weights[f"{name}.0.weight"].T + weights[f"{name}.0.bias"], 0.0)
+    return np.asarray(h @ weights[f"{name}.2.weight"].T + weights[f"{name}.2.bias"], np.float32)
+
+
 class _Layers:
     """The layers of one network by name."""
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.geometric.cloud import Cloud
-from list3r.instances.geometric.fusion import View
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.graph import PieceGraph, Surroundings, piece_graph
+from list3r.instances.learned.graph import ChunkSurface, PieceGraph, piece_graph
 from list3r.instances.learned.superpoints import SuperpointSettings, cut_superpoints
 
 
@@ -43,8 +40,6 @@ class Pieces:
 
     labels: NDArray[np.int32]
     """Piece of each voxel, from 0; -1 for none. Shape (N,)."""
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64]]
-    """Voxels that are neighbours. Shape (M,) each."""
     graph: PieceGraph
 
     def joined(self, cluster: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -52,9 +47,7 @@ class Pieces:
         return np.asarray(np.append(cluster, -1)[self.labels], np.int32)
 
 
-def cut_pieces(
-    cloud: Cloud, views: Sequence[View], around: Surroundings, settings: PieceSettings | None = None
-) -> Pieces:
+def cut_pieces(surface: ChunkSurface, settings: PieceSettings | None = None) -> Pieces:
     """Cut a cloud into pieces: superpoints, and what is flat, even and of one colour as one.
 
     Large plain surfaces so become single pieces with long borders: a quarter of the pieces is left, and what a network
@@ -62,12 +55,11 @@ def cut_pieces(
     99.9 % of the voxels lie in a piece of their own thing, and no thing was lost.
     """
     s = settings or PieceSettings()
-    fine = cut_superpoints(cloud, around.unit, s.superpoints)
-    pairs = (fine.left, fine.right)
-    graph = piece_graph(cloud, views, fine.labels, pairs, around)
+    fine = cut_superpoints(surface, s.superpoints)
+    graph = piece_graph(surface, fine.labels)
     own = agglomerate(fine.count, graph.left, graph.right, calm(graph, s.calm), graph.weight, 0.0)
     labels = np.asarray(np.append(own, -1)[fine.labels], np.int32)
-    return Pieces(labels, pairs, piece_graph(cloud, views, labels, pairs, around))
+    return Pieces(labels, piece_graph(surface, labels))
 
 
 def calm(graph: PieceGraph, s: CalmSettings) -> NDArray[np.float32]:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from list3r.instances.geometric.cloud import Cloud, neighbour_pairs
-from list3r.instances.geometric.features import lab_of
+from list3r.instances.geometric.cloud import Cloud
+from list3r.instances.learned.graph import ChunkSurface
 
 
 @dataclass(frozen=True)
@@ -31,26 +31,23 @@ class SuperpointSettings:
 
 @dataclass(frozen=True)
 class Superpoints:
-    """P pieces of a cloud of N voxels, and the E pairs of neighbouring voxels."""
+    """P pieces of a cloud of N voxels."""
 
     labels: NDArray[np.int32]
     """Piece of each voxel, from 0; -1 for none. Shape (N,)."""
     count: int
-    left: NDArray[np.int64]
-    """Voxels that are neighbours, with `right`. Shape (E,)."""
-    right: NDArray[np.int64]
 
 
-def cut_superpoints(cloud: Cloud, unit: float, settings: SuperpointSettings | None = None) -> Superpoints:
+def cut_superpoints(surface: ChunkSurface, settings: SuperpointSettings | None = None) -> Superpoints:
     """Grow pieces from seeds along the shortest ways over the surface, on which edges, steps and colours cost.
 
     Every voxel goes to the seed that is nearest by that cost (a geodesic Voronoi diagram), so pieces keep to creases
     and to borders of colour, and none is much wider than the spacing of the seeds.
     """
     s = settings or SuperpointSettings()
-    left, right = neighbour_pairs(cloud.keys, 1)
-    cost = _costs(cloud, left, right, s)
-    seeds = _seeds(cloud, left, right, cost, s.seed_m * unit)
+    cloud, (left, right) = surface.cloud, surface.pairs
+    cost = _costs(surface, s)
+    seeds = _seeds(cloud, left, right, cost, s.seed_m * surface.around.unit)
     size = len(cloud.keys)
     graph = coo_matrix((cost, (left, right)), shape=(size, size)).tocsr()
     _, _, source = dijkstra(graph, directed=False, indices=seeds, return_predecessors=True, min_only=True)
@@ -58,23 +55,31 @@ def cut_superpoints(cloud: Cloud, unit: float, settings: SuperpointSettings | No
     number = np.full(size, -1, np.int64)
     number[known] = np.searchsorted(seeds, source[known])
     labels, count = _without_scraps(number, s.least)
-    return Superpoints(labels, count, left, right)
+    return Superpoints(labels, count)
 
 
-def _costs(
-    cloud: Cloud, left: NDArray[np.int64], right: NDArray[np.int64], s: SuperpointSettings
-) -> NDArray[np.float32]:
-    """Length of the way between neighbouring voxels. Shape (E,)."""
-    n, lab = cloud.normals, lab_of(cloud.rgb)
-    a, b = n[left], n[right]
-    known = (np.abs(a).sum(axis=1) > 0) & (np.abs(b).sum(axis=1) > 0)
-    bend = np.where(known, 1.0 - np.clip((a * b).sum(axis=1), -1.0, 1.0), 0.3)
-    away = (cloud.points[right] - cloud.points[left]) / cloud.voxel
-    step = np.abs((away * np.where(known[:, None], (a + b) / 2.0, 0.0)).sum(axis=1))
-    color = np.linalg.norm(lab[left] - lab[right], axis=1)
-    way = np.linalg.norm(away, axis=1)
+def _costs(surface: ChunkSurface, s: SuperpointSettings) -> NDArray[np.float32]:
+    """Length of the way between neighbouring voxels. Shape (M,)."""
+    cloud, (left, right) = surface.cloud, surface.pairs
+    known = (cloud.normals != 0).any(axis=1)
+    both = known[left] & known[right]
+    cosine, step, way, color = (np.zeros(len(left), np.float32) for _ in range(4))
+    for k in range(3):
+        n, p, tone = (np.ascontiguousarray(a[:, k]) for a in (cloud.normals, cloud.points, surface.lab))
+        a, b = n[left], n[right]
+        away = (p[right] - p[left]) / np.float32(cloud.voxel)
+        cosine += a * b
+        step += away * (a + b)
+        way += away * away
+        color += np.square(tone[left] - tone[right])
+    bend = np.where(both, 1.0 - np.clip(cosine, -1.0, 1.0), np.float32(0.3))
+    rise = np.where(both, np.abs(step) / np.float32(2.0), np.float32(0.0))
     return np.asarray(
-        0.2 + way + s.normal_weight * bend + s.color_weight * color + s.step_weight * np.maximum(step - 0.5, 0.0),
+        0.2
+        + np.sqrt(way)
+        + s.normal_weight * bend
+        + s.color_weight * np.sqrt(color)
+        + s.step_weight * np.maximum(rise - 0.5, 0.0),
         np.float32,
     )
 

@@ -129,8 +129,10 @@ class LabelledChunk:
             )
             feature = _joined_feature(proposals, joined, number)
             names = () if structure else _names(proposals, joined, number)
+            stability *= 1.0 if structure else _whole(proposals, joined, number)
             instance = LocalInstance(len(instances), mask_track, feature, support, stability, plane, structure)
-            instances.append(replace(instance, names=names))
+            named = () if structure else _named(proposals, joined, number)
+            instances.append(replace(instance, names=names, named=named))
         pairs = cannot_link_pairs(instances, self.settings.track.cannot_link_frames, views.unit)
         return LocalLibrary(tuple(instances), pairs, feature_space)
 
@@ -294,6 +296,30 @@ def _names(
         if p.names is not None
         for n in np.flatnonzero(owner == number).tolist()
     )
+
+
+def _whole(proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int) -> float:
+    """Return the mean probability that an instance's candidates are one thing; 1 where nobody tells it."""
+    said = [p.whole[owner == number] for p, owner in zip(proposals, joined, strict=True) if p.whole is not None]
+    every = np.concatenate(said) if said else np.zeros(0, np.float32)
+    return float(every.mean()) if len(every) else 1.0
+
+
+def _named(
+    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
+) -> tuple[tuple[str, float], ...]:
+    """Return the names that an instance may have: the mean of what is said of its candidates on all anchors."""
+    said = [
+        p.named[n]
+        for p, owner in zip(proposals, joined, strict=True)
+        if p.named is not None
+        for n in np.flatnonzero(owner == number).tolist()
+    ]
+    total: dict[str, float] = {}
+    for names in said:
+        for name, probability in names:
+            total[name] = total.get(name, 0.0) + probability / len(said)
+    return tuple(sorted(total.items(), key=lambda item: (-item[1], item[0])))
 
 
 def _joined_feature(

@@ -80,6 +80,20 @@ def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
     return Votes(0.0, classes, looks)
 
 
+OWN_NAMES = "learned"
+"""The source of names that the learned discoverer tells; every other source overrules it."""
+_OWN_LOOKS = 1.5
+"""Pictures that all views of a chunk together count as, where their names were pooled already."""
+
+
+def votes_of_probabilities(named: Iterable[tuple[str, float]], likeness: float = LabelSettings.likeness) -> Votes:
+    """Return votes by which `decide`, hearing nothing else, gives names the probabilities that they have here."""
+    rest = max(1.0 - sum(p for _, p in named), _SCORES[0])
+    scale = 1.0 + likeness * (_OWN_LOOKS - 1.0)
+    classes = {name: (_OWN_LOOKS, scale * (math.log(max(p, _SCORES[0] / 10) / rest) - PRIOR_ODDS)) for name, p in named}
+    return Votes(0.0, classes, _OWN_LOOKS)
+
+
 def decide(
     votes: Mapping[str, Votes],
     known: Mapping[str, Collection[str] | None] | None = None,
@@ -104,6 +118,16 @@ def decide(
     best = min(odds, key=lambda c: (-odds[c], c))
     confidence = (1.0 - s.always_wrong) * math.exp(odds[best] - top) / total
     return (best, confidence, found[best]) if confidence >= s.min_confidence and found[best] >= s.min_found else None
+
+
+def decide_by_rank(
+    votes: Mapping[str, Votes],
+    known: Mapping[str, Collection[str] | None] | None = None,
+    settings: LabelSettings | None = None,
+) -> tuple[str, float, float] | None:
+    """Return what `decide` says of all sources but the learned discoverer, and of all only where they name nothing."""
+    others = {source: v for source, v in votes.items() if source != OWN_NAMES}
+    return decide(others, known, settings) or decide(votes, known, settings)
 
 
 def _said(votes: Votes, name: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:
@@ -181,7 +205,7 @@ def _label(
         for source, found in votes.get(chunk_id, {}).items():
             if local_id in found:
                 total[source] = total.get(source, Votes(0.0, {})) + found[local_id]
-    chosen = decide(total, known, settings)
+    chosen = decide_by_rank(total, known, settings)
     if chosen is None:
         return None
     name, confidence, pictures = chosen

@@ -108,7 +108,9 @@ def _sightings(blob: bytes) -> list[Any]:
 
 
 _SUPPORT = joined(("count", "grid", "points", "confidence", "rgb"), ("support",), _support_columns, _support)
-_INSTANCE = Columns(LocalInstance, joined(("track",), ("track",), _track_column, _track), omit=("support", "names"))
+_INSTANCE = Columns(
+    LocalInstance, joined(("track",), ("track",), _track_column, _track), omit=("support", "names", "named")
+)
 _NODE = Columns(LocalNode, _SUPPORT, joined(("track",), _OF_TRACK, lambda *_: (), _sightings))
 
 
