@@ -26,18 +26,22 @@ ONE_THING, SAME_NAME = 0.5, 0.25
 """IoU with a true thing, by voxels, from which a cluster is one whole, and from which it should have its name."""
 
 
+OTHER_ENDS = (-2.5, -1.0, 1.5)
+"""Where agglomeration stops besides, so that what is joined too far and not far enough is seen."""
+
+
 @dataclass(frozen=True)
 class ThingFit:
     """How the judge of things is trained."""
 
-    hidden: int = 64
-    steps: int = 1500
+    hidden: int = 128
+    steps: int = 2500
     batch: int = 256
     rate: float = 3e-3
     decay: float = 1e-2
     noise: float = 0.1
     """Deviation of what is added to features, of their own deviation."""
-    dropout: float = 0.3
+    dropout: float = 0.5
     seed: int = 0
 
 
@@ -81,13 +85,14 @@ def clusters(arrays: Arrays, lesson: Lesson, enough: float) -> tuple[NDArray[np.
     return agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, enough), told
 
 
-def table_of(arrays: Arrays, lessons: Sequence[Lesson], *, true_too: bool) -> ThingTable:
-    """Return the clusters of several chunks; with `true_too` parts grouped by the truth are added as wholes."""
+def table_of(arrays: Arrays, lessons: Sequence[Lesson], *, more: bool) -> ThingTable:
+    """Return the clusters of several chunks; with `more` those of other thresholds and of the truth, too."""
     rows: list[tuple[NDArray[Any], ...]] = []
     for lesson in lessons:
-        own, told = clusters(arrays, lesson, CutSettings().enough)
-        groupings = [own]
-        if true_too and (lesson.thing > 0).any():
+        told, g = judge(arrays, "coarse", lesson.graph), lesson.graph
+        ends = (CutSettings().enough, *(OTHER_ENDS if more else ()))
+        groupings = [agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, end) for end in ends]
+        if more:
             groupings.append(np.unique(lesson.thing, return_inverse=True)[1].astype(np.int64))
         for grouping in groupings:
             iou, which, bound = overlaps(lesson, grouping)
@@ -108,7 +113,7 @@ def fit_things(
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the judge of things, trained on `lessons` and calibrated on left-out worlds."""
     s = settings or ThingFit()
-    table = table_of(arrays, lessons, true_too=True)
+    table = table_of(arrays, lessons, more=True)
     free = ~table.structure
     x, whole, name = table.x[free], table.whole[free], table.name[free]
     mean, std = x.mean(axis=0), x.std(axis=0) + 1e-2
@@ -147,7 +152,7 @@ def fit_things(
 
 def calibrate(arrays: Arrays, held: Sequence[Lesson]) -> dict[str, NDArray[Any]]:
     """Return the scale and shift of the log odds of being whole, and the temperature of names, on left-out worlds."""
-    table = table_of(arrays, held, true_too=False)
+    table = table_of(arrays, held, more=False)
     free = ~table.structure
     x = ((table.x[free] - arrays["things.mean"]) / arrays["things.std"]).astype(np.float32)
     out = two_layers(arrays, "things.net", x).astype(np.float64)
