@@ -35,6 +35,7 @@ from list3r.memory.geometry import OrientedBox, upright_box
 from list3r.memory.relations.instance_geometry import fit_box, without_strays
 from list3r.reconstruction.base import backproject
 from training.samples import chunk_settings
+from training.worlds.catalogue import LABELS
 from training.worlds.film import Film, FilmSettings, frames_of, make_film, reconstruction_of
 
 MIN_PX = 150
@@ -273,7 +274,7 @@ def _as_sure_as_right(
     pairs: NDArray[np.int64], large: set[int], said: dict[int, tuple[float, str, float]], labels: dict[int, str]
 ) -> dict[str, Any]:
     """Of each thing that is named: [confidence, whether it is one thing by masks at IoU 0.5], and of those that match a
-    true thing at 0.25: [probability of its name, whether it is right].
+    true thing at 0.25: [probability of its name, whether it is right]; the house's makers call things otherwise.
     """
     best: dict[int, tuple[float, int]] = {}
     true, told, iou = _mask_ious(pairs)
@@ -286,7 +287,7 @@ def _as_sure_as_right(
         if share >= 0.25 and thing not in large:
             continue
         whole.append([score, int(share >= 0.5)])
-        if share >= 0.25:
+        if share >= 0.25 and labels[thing + 1] in LABELS:
             names.append([probability, int(labels[thing + 1] == name)])
     return {"whole": whole, "names": names}
 
