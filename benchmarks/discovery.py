@@ -52,17 +52,19 @@ def main() -> None:
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
     parser.add_argument("--house", type=Path, help="folder of aws-robomaker-small-house-world; walks there, not worlds")
     parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
+    parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it beside")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    weights = {"learned": words.weights} | {n: Path(f) for n, _, f in (text.partition("=") for text in words.also)}
+    methods = [*filter(None, words.methods.split(",")), *(n for n in weights if n != "learned")]
     for seed in seeds_of(words.seeds):
         film = film_of(seed, words.sensor, words.house, fitted=words.fitted)
-        for method in words.methods.split(","):
-            rows.append(
-                {"method": method, "seed": seed, "sensor": film[0].sensor, **judge(film, seed, method, words.weights)}
-            )
+        for method in methods:
+            said = judge(film, seed, method, weights.get(method))
+            rows.append({"method": method, "seed": seed, "sensor": film[0].sensor, **said})
             print(json.dumps(rows[-1]), flush=True)
-    table = {m: summary([r for r in rows if r["method"] == m]) for m in words.methods.split(",")}
+    table = {m: summary([r for r in rows if r["method"] == m]) for m in methods}
     print(machine())
     for method, entry in table.items():
         print(method, json.dumps(entry))
