@@ -26,6 +26,8 @@ from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
 from list3r.reconstruction.base import Reconstruction
 
+OFF_WALL = 4.0
+"""Voxels, besides three deviations of depth, from which a point lies off the plane of a wall or floor."""
 MOST_NAMES = 3
 """Names that are told of one thing at most."""
 FLAT = 0.85
@@ -82,17 +84,21 @@ class LearnedDiscoverer(GeometricDiscoverer):
 
 
 def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudCut:
-    """The cut with structure of several planes (walls round a corner) as one thing for each."""
+    """The cut with structure of several planes (walls round a corner) as one thing for each.
+
+    What lies off all of them (a ledge, a bit of a neighbour) is of none, so that walls stay flat.
+    """
     labels, origin = cut.labels.copy(), list(range(len(cut.told.structure)))
     for number in np.flatnonzero(cut.told.structure > 0.5).tolist():
         mine = np.flatnonzero(cut.labels == number)
         faces = _faces(cloud, mine, planes)
-        if len(faces) > 1:
+        if faces:
             height = np.stack([np.abs(cloud.points[mine] @ f[:3] + f[3]) for f in faces])
             nearest = height.argmin(axis=0)
             for k in range(1, len(faces)):
                 labels[mine[nearest == k]] = len(origin)
                 origin.append(number)
+            labels[mine[height.min(axis=0) > OFF_WALL * cloud.voxel + 3.0 * cloud.sigma[mine]]] = -1
     return CloudCut(labels, cut.told.rows(np.array(origin, np.int64)))
 
 
