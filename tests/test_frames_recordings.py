@@ -18,6 +18,7 @@ from tests.recordings import (
     WITH_DEPTH,
     arkit,
     off_plane,
+    png,
     put,
     shots,
     write_colmap,
@@ -140,6 +141,28 @@ def test_optimised_cameras_of_polycam_are_preferred(tmp_path: Path) -> None:
     assert len(frames_of(path)) == COUNT
 
 
+def test_pictures_of_a_fisheye_become_those_of_a_pinhole(tmp_path: Path) -> None:
+    lens = {"k1": 0.1, "k2": -0.02, "k3": 0.01, "k4": 0.0}
+    path = write_nerfstudio(tmp_path / "walk", camera_model="OPENCV_FISHEYE", **lens)
+    column, row = np.meshgrid(np.arange(160), np.arange(120))
+    where = np.stack([column, row, np.zeros_like(row)], axis=2).astype(np.uint8)
+    for picture in (path / "images").iterdir():
+        put(picture.with_suffix(".png"), png(where[:, :, ::-1]))
+        picture.unlink()
+    said = json.loads((path / "transforms.json").read_text())
+    for frame in said["frames"]:
+        frame["file_path"] = frame["file_path"].replace(".jpg", ".png")
+        del frame["depth_file_path"]
+    put(path / "transforms.json", json.dumps(said))
+    seen = frames_of(path)[0].color.astype(float)
+    x, y = (np.array([100, 60, 40]) - 79.5) / 140, (np.array([60, 90, 30]) - 59.5) / 140
+    angle = np.arctan(np.hypot(x, y))
+    bent = angle * (1 + 0.1 * angle**2 - 0.02 * angle**4 + 0.01 * angle**6) / np.hypot(x, y)
+    found = seen[[60, 90, 30], [100, 60, 40]]
+    assert np.abs(found[:, 0] - (140 * x * bent + 79.5)).max() < 1.0
+    assert np.abs(found[:, 1] - (140 * y * bent + 59.5)).max() < 1.0
+
+
 BROKEN = {
     "a zip without metadata": lambda root: _zip(root / "a.r3d", {"rgbd/0.jpg": b"x"}),
     "a zip that ends early": lambda root: _cut(write_record3d(root)),
@@ -151,7 +174,7 @@ BROKEN = {
     "a sens file cut in its header": lambda root: _cut(write_sens(root), 100),
     "transforms without frames": lambda root: _put(root / "transforms.json", "{}").parent,
     "a name that leads out": lambda root: write_nerfstudio(root, frames=[{"file_path": "../../etc/passwd"}]),
-    "a fisheye": lambda root: write_nerfstudio(root, camera_model="OPENCV_FISHEYE"),
+    "a camera of all directions": lambda root: write_nerfstudio(root, camera_model="EQUIRECTANGULAR"),
     "units of nothing": lambda root: write_nerfstudio(root, depth_unit_scale_factor=0),
     "a camera of stray that is none": lambda root: _put(write_stray(root) / "camera_matrix.csv", "1,2\n").parent,
     "odometry of words": lambda root: _put(write_stray(root) / "odometry.csv", "head\n" + "a," * 9).parent,

@@ -22,6 +22,8 @@ class Camera:
     cy: float
     distortion: tuple[float, ...] = ()
     """OpenCV's (k1, k2, p1, p2, k3), empty for none. Frames handed out by a source are already undistorted."""
+    fisheye: bool = False
+    """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4) of the angle from the axis (Kannala and Brandt)."""
 
     def matrix(self) -> NDArray[np.float64]:
         """Return the intrinsic matrix, px. Shape (3, 3)."""
@@ -29,7 +31,7 @@ class Camera:
 
     def pinhole(self) -> Camera:
         """Return the same camera without lens distortion."""
-        return replace(self, distortion=())
+        return replace(self, distortion=(), fisheye=False)
 
     def resized(self, height: int, width: int) -> Camera:
         """Return the camera of its pictures at another size."""
@@ -37,7 +39,7 @@ class Camera:
             return self
         x, y = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
-        return Camera(width, height, self.fx * x, self.fy * y, cx, cy, self.distortion)
+        return Camera(width, height, self.fx * x, self.fy * y, cx, cy, self.distortion, self.fisheye)
 
     def shrunk(self, width: int) -> Camera:
         """Return the pinhole camera of its pictures at most `width` px wide, of the same shape."""

@@ -57,6 +57,8 @@ class Optics:
     """(height, width) of the pictures that `intrinsics` are stated for; None for the pictures as stored."""
     depth_intrinsics_size: tuple[int, int] | None = None
     """(height, width) of the images that `depth_intrinsics` are stated for; None for depth as stored."""
+    fisheye: bool = False
+    """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4)."""
 
 
 @dataclass(frozen=True)

@@ -38,12 +38,14 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     cameras = {posed[name].camera_id for name in posed}
     camera = found.cameras[posed[next(iter(sorted(posed, key=natural_key)))].camera_id]
     intrinsics, distortion = _camera(camera, model)
+    fisheye = camera.model.name == "OPENCV_FISHEYE"
     notes = [
         f"camera and poses of {model.relative_to(root) if model != root else model.name}, lengths as the model has"
     ]
     if len(cameras) > 1:
         notes.append(f"the model has {len(cameras)} cameras; the first serves all pictures")
-    optics = Optics(options.intrinsics or intrinsics, distortion, intrinsics_size=(camera.height, camera.width))
+    size = (camera.height, camera.width)
+    optics = Optics(options.intrinsics or intrinsics, distortion, intrinsics_size=size, fisheye=fisheye)
     if options.intrinsics is not None:
         optics = Optics(options.intrinsics, options.distortion or ())
     return FolderLayout(
@@ -69,8 +71,8 @@ def _pose(image: Any) -> Any:
 
 
 def _camera(camera: Any, model: Path) -> tuple[Intrinsics, tuple[float, ...]]:
-    """fx, fy, cx, cy for pixel centres at whole numbers, and OpenCV's lens. Raises `SourceError` for a fisheye."""
-    lens = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}
+    """fx, fy, cx, cy for pixel centres at whole numbers, and OpenCV's lens. Raises `SourceError`."""
+    lens = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4}
     name = camera.model.name
     if name not in lens:
         raise SourceError(f"{model} has a {name} camera; undistort its pictures first (colmap image_undistorter)")

@@ -156,7 +156,11 @@ class Undistortion:
         size = (camera.width, camera.height)
         coefficients = np.array(camera.distortion, dtype=np.float64)
         matrix = camera.matrix()
-        self._maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_16SC2)
+        if camera.fisheye:
+            angles = np.resize([*coefficients, 0.0, 0.0, 0.0, 0.0], 4)
+            self._maps = cv2.fisheye.initUndistortRectifyMap(matrix, angles, np.eye(3), matrix, size, cv2.CV_16SC2)
+        else:
+            self._maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_16SC2)
         self.seen = self._remap(np.ones(size[::-1], np.uint8), cv2.INTER_NEAREST) > 0
         """False where the pinhole image looks beyond the lens's picture. Shape (H, W)."""
 

@@ -33,6 +33,8 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
         "depth_scale": options.depth_scale,
     }
     optics = replace(optics, **{name: value for name, value in given.items() if value is not None})
+    if options.distortion is not None:
+        optics = replace(optics, fisheye=False)
     if options.intrinsics is not None:
         optics = replace(optics, intrinsics_size=None)
     if options.depth_intrinsics is not None:
@@ -108,10 +110,12 @@ def build_rig(
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
     stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
+    if stated is not None and optics.fisheye:
+        stated = replace(stated, fisheye=True)
     whole = _of_size(stated, stored_size, "the colour pictures")
     lens = None if whole is None else whole.resized(*color_size)
     camera = lens.pinhole() if lens else None
-    undistortion = Undistortion(lens) if lens and lens.distortion else None
+    undistortion = Undistortion(lens) if lens and (lens.distortion or lens.fisheye) else None
     registration = None
     if depth_size is not None:
         if optics.depth_scale is None:
@@ -136,7 +140,7 @@ def _registration(
     said = _camera(optics.depth_intrinsics, optics.depth_intrinsics_size or depth_size, "depth intrinsics", ())
     depth_camera = _of_size(said, depth_size, "the depth images")
     assert depth_camera is not None and optics.T_color_depth is not None
-    same = replace(camera, distortion=()) == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
+    same = camera.pinhole() == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
     return None if same else DepthReprojection(depth_camera, camera, optics.T_color_depth)
 
 
