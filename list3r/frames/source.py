@@ -68,6 +68,8 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
     if str(path) == "":
         raise SourceError(f"the name of the source is empty; {_WANTED}")
     root = Path(path).expanduser()
+    if options.more:
+        return _open_joined([root, *(Path(p).expanduser() for p in options.more)], options)
     try:
         if not root.exists():
             raise SourceError(f"{root} does not exist; {_WANTED}")
@@ -78,6 +80,18 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
         return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
         raise SourceError(f"{error.filename or root} may not be read; check its permissions") from None
+
+
+def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
+    """Open several video files as one. Raises `SourceError` for anything else."""
+    for path in paths:
+        if not path.is_file() or path.suffix.lower() in (*IMAGE_ENDINGS, *FILES):
+            raise SourceError(f"{path} is no video file; only video files of one recording can be given together")
+        if not os.access(path, os.R_OK) or path.stat().st_size == 0:
+            raise SourceError(f"{path} is empty or may not be read; check the copy and its permissions")
+    from list3r.frames.readers.joined import JoinedVideos
+
+    return JoinedVideos(paths, options)
 
 
 def require_camera(info: SourceInfo) -> Camera:
