@@ -17,8 +17,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from list3r.frames.files import check_ordinary
+from list3r.frames.files import check_ordinary, read_file
 from list3r.memory.errors import OptionError
+from list3r.memory.unpacking import open_archive, parse_json
 
 MANIFEST = "precomputed.json"
 FORMAT = "list3r-precomputed"
@@ -81,7 +82,7 @@ def read_manifest(folder: Path) -> Manifest:
     if path.stat().st_size > _MAX_MANIFEST:
         raise OptionError(f"{path} is {path.stat().st_size} bytes long and no manifest")
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
+        said = parse_json(read_file(path, _MAX_MANIFEST))
     except (ValueError, RecursionError) as error:
         raise OptionError(f"{path} is no JSON ({str(error).splitlines()[0][:120]}); see docs/precomputed.md") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("version") != VERSION:
@@ -170,7 +171,7 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return the named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
     try:
         check_ordinary(path.stat(), path, MAX_BYTES)
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             entries = {e.filename.removesuffix(".npy"): e for e in archive.infolist()}
             claimed = sum(e.file_size for e in entries.values())
             if claimed > min(MAX_BYTES, _FREE_BYTES + _MOST_RATIO * path.stat().st_size):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
 from list3r.frames.decoding.decode import read_raw_depth
-from list3r.frames.layout import Optics, read_numbers, read_text
+from list3r.frames.layout import Optics, read_lines, read_numbers
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.axes import Z_UP_FROM_Y_UP, pose_of_quaternion
@@ -133,7 +133,7 @@ def _matrix(path: Path) -> Intrinsics:
 def _odometry(path: Path) -> dict[int, NDArray[np.float64]]:
     """Poses by frame number. Raises `SourceError` for rows that are no numbers."""
     poses: dict[int, NDArray[np.float64]] = {}
-    for number, line in enumerate(read_text(path).splitlines()[1:], start=2):
+    for number, line in enumerate(read_lines(path)[1:], start=2):
         words = [word.strip() for word in line.split(",")]
         if len(words) < 9:
             continue

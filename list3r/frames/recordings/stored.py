@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import FrameError, OptionError
+from list3r.memory.unpacking import open_archive
 
 MOST_BYTES = 256 * 2**20
 """Largest member that is unpacked; a depth image of 30 megapixels is half of it."""
@@ -63,7 +64,7 @@ class ZipMember:
 @lru_cache(maxsize=4)
 def _archive(path: Path) -> zipfile.ZipFile:
     """Return the archive, its list read once in a process."""
-    return zipfile.ZipFile(path)
+    return open_archive(path)
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class CodedArray:
             raise FrameError(
                 f"{self.name} has {len(data)} bytes, more than {self.shape[1]}x{self.shape[0]} numbers take"
             )
-        raw = _inflated(data, count) if self.codec == "zlib" else _lzfse(data)
+        raw = _inflated(data, count) if self.codec == "zlib" else _lzfse(data, count)
         if raw is None or len(raw) != count:
             had = "damaged" if raw is None else f"{len(raw)} bytes"
             raise FrameError(f"{self.name} is {had}; {self.shape[1]}x{self.shape[0]} numbers are {count} bytes")
@@ -142,7 +143,14 @@ def _inflated(data: bytes, count: int) -> bytes | None:
         return None
 
 
-def _lzfse(data: bytes) -> bytes | None:
+def _lzfse(data: bytes, count: int) -> bytes | None:
+    """The bytes; None where they are damaged, or come in more blocks than so many bytes do.
+
+    A block begins with 40,000 bytes that are new or 10,000 that repeat, and unpacks to 24 MB at most, whatever it
+    claims: there is no other bound.
+    """
+    if sum(data.count(magic) for magic in (b"bvx1", b"bvx2", b"bvxn", b"bvx-")) > 4 + count // 40_000:
+        return None
     try:
         import lzfse
     except ImportError:
