@@ -144,6 +144,52 @@ def association() -> str:
     return _ate_table(runs, VARIANTS, "vggt-long") if fair else _ate_table(runs, BEFORE, "baseline")
 
 
+def returns() -> str:
+    """Return the table of videos in which a place looks otherwise: all instance evidence on and off."""
+    return _ate_table(_read("association-returns")["runs"], VARIANTS, "full-no-instances")
+
+
+def registration() -> str:
+    """Return the table of registration by things alone."""
+    names = {"opposite": "from the opposite end of the room", "moved": "half of the things moved, other light"}
+    rows = []
+    for preset, name in names.items():
+        t = _read(f"registration-{preset}")["total"]
+        wrong = t["believed"] - round(t["precision"] * t["believed"])
+        cells = [f"{t['joined']} of {t['homes']}", f"{t['by_two_relations']}", f"{t['believed']}, {wrong}"]
+        rows.append(
+            [
+                name,
+                *cells,
+                f"{t['median_m']:.2f}, {t['median_deg']:.1f}",
+                f"{t['within_0.1_m_and_3_deg']} of {t['joined']}",
+            ]
+        )
+    heads = ["homes joined", "by two relations or more", "relations believed, wrong ones", "median m, degrees"]
+    return _table(["by things alone, homes that nothing was tuned on", *heads, "within 0.1 m and 3 degrees"], rows)
+
+
+def alignment() -> str:
+    """Return the table of the alignment of whole point maps."""
+    single, double = _read("alignment"), _read("alignment-double")
+    ways = [
+        ("ours, seeds 1 to 8", single, "ours"),
+        ("VGGT-Long's, seeds 1 to 8", single, "vggt_long"),
+        ("ours, seeds 1 and 2", double, "ours"),
+        ("VGGT-Long's in double precision, seeds 1 and 2", double, "vggt_long_double"),
+    ]
+    rows = []
+    for name, held, way in ways:
+        cells = []
+        for case in ("outliers_on_both_sides", "outliers_on_one_side"):
+            m = {key: figure["mean"] for key, figure in held[case][way].items()}
+            position = f"{1000 * m['position_error_m']:.2f} mm"
+            cells.append(f"{position}, {m['rotation_error_deg']:.4f}, {m['scale_error_percent']:.4f} %")
+        rows.append([name, *cells, f"{held['outliers_on_both_sides'][way]['seconds']['mean']:.2f} s"])
+    heads = ["outliers on both sides", "on one side", "processor time"]
+    return _table(["error of position, rotation (degrees), scale; mean", *heads], rows)
+
+
 def changes() -> str:
     """Return the table of second sessions."""
     total = _read("sessions")["total seeds 311 to 320"]
@@ -173,6 +219,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "walks": walks,
     "discovery": discovery,
     "association": association,
+    "returns": returns,
+    "registration": registration,
+    "alignment": alignment,
     "changes": changes,
     "relations": relations,
 }
