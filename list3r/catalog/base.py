@@ -17,8 +17,11 @@ MOST_RANKED = 2_000
 class Backend(Protocol):
     """A database that holds a catalogue. Each call sees one state of it. Raises `CatalogError`."""
 
-    def put(self, content: MemoryContent) -> MemoryEntry:
-        """Write a memory in place of what has its name; nothing where the same file is there. Return its entry."""
+    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+        """Write a memory in place of what has its name; of the same file only when it is asked for `anew`.
+
+        Return its entry, whose revision is the next one where the file is another.
+        """
         ...
 
     def drop(self, name: str) -> bool:

@@ -91,6 +91,10 @@ class Catalog:
             content = read_content(output.place(kept), content.entry.name)
         return self._backend.put(content)
 
+    def again(self, path: str, name: str | None = None) -> MemoryEntry:
+        """Write a memory anew from its file; its revision stays where the file is the same."""
+        return self._backend.put(read_content(path, name), anew=True)
+
     def remove(self, name: str) -> None:
         """Forget a memory; its file stays. Raises `CatalogError` where there is none of that name."""
         if not self._backend.drop(name):

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 import numpy as np
 import psycopg
 from numpy.typing import NDArray
-from psycopg_pool import ConnectionPool, PoolTimeout
 
 from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
+from list3r.catalog.postgres_connections import Connections
 from list3r.catalog.postgres_schema import MIGRATIONS, vector_table
 from list3r.catalog.records import (
     CatalogError,
@@ -30,10 +30,6 @@ _ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
 _THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _THING_OF_ONE = _THING.replace("m.name", "?::text")
 """Of the instances of one memory, whose name is given as a value."""
-_WAIT_S = 5.0
-"""How long a connection is waited for."""
-_STATEMENT_MS = 60_000
-"""How long one question may take."""
 _PROBED = 100
 """Candidates that a search for vectors keeps at each step; more finds more and takes longer."""
 _MOST_ALIKE = 10_000
@@ -48,31 +44,13 @@ class PostgresBackend:
     def __init__(self, url: str, connections: int = 1) -> None:
         """Connect, and bring the schema up to date where this user may. Raises `CatalogError`."""
         self._where = _checked(url)
-        options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} -c jit=off"
-        self._pool = ConnectionPool(
-            url,
-            min_size=1,
-            max_size=connections,
-            timeout=_WAIT_S,
-            open=False,
-            kwargs={
-                "options": options,
-                "connect_timeout": int(_WAIT_S),
-                "application_name": "list3r",
-                "autocommit": True,
-            },
-        )
-        try:
-            with psycopg.connect(url, options=options, connect_timeout=int(_WAIT_S)) as connection:
-                self.has_vectors = _migrated(connection)
-            self._pool.open()
-        except psycopg.Error as error:
-            self._pool.close()
-            raise CatalogError(f"the catalogue at {self._where} cannot be opened: {_said(error)}") from error
+        self._connections = Connections(url, connections)
+        with self._connected("opened") as connection, connection.transaction():
+            self.has_vectors = _migrated(connection)
 
     # ------------------------------------------------------------------ writing
 
-    def put(self, content: MemoryContent) -> MemoryEntry:
+    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name, in one transaction."""
         with self._connected("written; nothing was changed") as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
@@ -83,9 +61,10 @@ class PostgresBackend:
             )
             row = _first(connection.execute(statement, astuple(content.entry)))
             memory, known = int(row[0]), MemoryEntry(*row[1:])
-            if known.revision and replace(content.entry, revision=known.revision) == known:
+            if known.revision and not anew and replace(content.entry, revision=known.revision) == known:
                 return known
-            entry = replace(content.entry, revision=known.revision + 1)
+            same = known.revision and known.sha256 == content.entry.sha256
+            entry = replace(content.entry, revision=known.revision + (not same))
             own = ", ".join(f"{f.name} = %s" for f in fields(MemoryEntry))
             connection.execute(
                 f"UPDATE memory SET {own}, added_at = now() WHERE memory_id = %s", (*astuple(entry), memory)
@@ -208,7 +187,9 @@ class PostgresBackend:
         return self._rows(query, (*given, k))
 
     def spaces(self, memory: str | None) -> list[str]:
-        """Return the names of spaces that hold vectors."""
+        """Return the names of spaces that hold vectors. Raises `CatalogError` where the server has no pgvector."""
+        if not self.has_vectors:
+            raise CatalogError(f"the server at {self._where} has no pgvector; with it, `list3r catalog rebuild`")
         known = self._rows("SELECT name, space_id FROM space ORDER BY name", ())
         if memory is None:
             return [str(name) for name, _ in known]
@@ -272,31 +253,36 @@ class PostgresBackend:
 
     def close(self) -> None:
         """Let the connections go."""
-        self._pool.close()
+        self._connections.close()
 
     def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
-        """Ask; once more where the server was started again since the last question."""
-        for last in (False, True):
-            with self._connected("asked", quiet=not last) as connection:
-                found: list[Any] = connection.execute(_marked(query), values).fetchall()
-                return found
-        raise AssertionError
+        """Ask; once more where the connection was lost, as when the server was started again meanwhile."""
+        try:
+            with self._connections.one() as connection:
+                return _asked(connection, query, values)
+        except psycopg.OperationalError as error:
+            if error.sqlstate is not None and not error.sqlstate.startswith(("57P", "08")):
+                raise self._failed("asked", error) from error
+        except psycopg.Error as error:
+            raise self._failed("asked", error) from error
+        with self._connected("asked") as connection:
+            return _asked(connection, query, values)
 
     @contextlib.contextmanager
-    def _connected(self, what: str, *, quiet: bool = False) -> Iterator[psycopg.Connection[Any]]:
-        """A connection. With `quiet` nothing is raised where it is lost; all others are looked after then."""
+    def _connected(self, what: str) -> Iterator[psycopg.Connection[Any]]:
         try:
-            with self._pool.connection() as connection:
+            with self._connections.one() as connection:
                 yield connection
-        except psycopg.OperationalError as error:
-            if not quiet:
-                raise self._failed(what, error) from error
-            self._pool.check()
-        except (psycopg.Error, PoolTimeout) as error:
+        except psycopg.Error as error:
             raise self._failed(what, error) from error
 
     def _failed(self, what: str, error: Exception) -> CatalogError:
         return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_said(error)}")
+
+
+def _asked(connection: psycopg.Connection[Any], query: str, values: Sequence[Any]) -> list[Any]:
+    found: list[Any] = connection.execute(_marked(query), values).fetchall()
+    return found
 
 
 def _checked(url: str) -> str:

@@ -74,13 +74,15 @@ class SqliteBackend:
     def _tables(self) -> bool:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
-    def put(self, content: MemoryContent) -> MemoryEntry:
+    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name."""
         with self._writing():
             known = self.memories([content.entry.name])
-            if known and replace(content.entry, revision=known[0].revision) == known[0]:
-                return known[0]
-            entry = replace(content.entry, revision=known[0].revision + 1 if known else 1)
+            before = known[0] if known else content.entry
+            if known and not anew and replace(content.entry, revision=before.revision) == before:
+                return before
+            same = bool(known) and before.sha256 == content.entry.sha256
+            entry = replace(content.entry, revision=before.revision + (not same))
             if known:
                 self._forget(entry.name)
             names = ", ".join(f.name for f in fields(MemoryEntry))
@@ -287,7 +289,8 @@ class SqliteBackend:
             try:
                 yield
             except BaseException:
-                self._database.execute("ROLLBACK")
+                if self._database.in_transaction:  # SQLite ends it itself where the disk is full
+                    self._database.execute("ROLLBACK")
                 raise
             self._database.execute("COMMIT")
         except sqlite3.Error as error:

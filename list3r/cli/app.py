@@ -24,6 +24,7 @@ from list3r.cli.build import batch as batch_commands
 from list3r.cli.build import commands as build_commands
 from list3r.cli.build import exchange as exchange_commands
 from list3r.cli.build import update as update_commands
+from list3r.cli.catalog import commands as catalog_commands
 from list3r.cli.edit import commands as edit_commands
 from list3r.cli.edit import export as export_commands
 from list3r.cli.edit import files as file_commands
@@ -64,6 +65,7 @@ for module in (
     mcp_commands,
     view_commands,
     batch_commands,
+    catalog_commands,
 ):
     module.register(app)
 

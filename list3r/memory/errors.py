@@ -75,6 +75,7 @@ EXTRA_OF_PACKAGE = {
     "viser": "view",
     "fsspec": "batch",
     "ray": "ray",
+    "psycopg": "catalog",
     "transformers": "models",
     "huggingface_hub": "models",
     "safetensors": "models",
