@@ -163,6 +163,29 @@ def test_pictures_of_a_fisheye_become_those_of_a_pinhole(tmp_path: Path) -> None
     assert np.abs(found[:, 1] - (140 * y * bent + 59.5)).max() < 1.0
 
 
+def test_pictures_with_cameras_of_their_own_are_carried_to_one(tmp_path: Path) -> None:
+    root = write_colmap(tmp_path)
+    model = root / "sparse/0"
+    column, row = np.meshgrid(np.arange(200), np.arange(150))
+    cameras = []
+    for k, focal in enumerate((120.0, 140.0, 160.0, 140.0)):
+        width, height = (160, 120) if k != 2 else (164, 122)
+        cameras.append(f"{k + 1} PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}")
+        where = np.stack([column, row, np.zeros_like(row)], axis=2)[:height, :width].astype(np.uint8)
+        put(root / f"images/{k:04d}.png", png(where[:, :, ::-1]))
+        (root / f"images/{k:04d}.jpg").unlink()
+    put(model / "cameras.txt", "\n".join(cameras) + "\n")
+    lines = [line for line in (model / "images.txt").read_text().replace(".jpg", ".png").splitlines() if line]
+    own = [f"{line.rsplit(' ', 2)[0]} {k + 1} {k:04d}.png\n\n" for k, line in enumerate(lines)]
+    put(model / "images.txt", "".join(own))
+    info, frames = open_source(root).info, frames_of(root)
+    assert info.camera is not None and info.camera.fx == pytest.approx(140.0)
+    assert [f.color.shape for f in frames] == [(120, 160, 3)] * 4
+    for frame, focal, middle in zip(frames, (120.0, 140.0, 160.0, 140.0), (79.5, 79.5, 81.5, 79.5), strict=True):
+        for u in (60, 100):  # the ray of a pixel of the shared camera, seen by the picture's own
+            assert abs(frame.color[60, u, 0] - (focal * (u - 79.5) / 140.0 + middle)) < 1.0
+
+
 BROKEN = {
     "a zip without metadata": lambda root: _zip(root / "a.r3d", {"rgbd/0.jpg": b"x"}),
     "a zip that ends early": lambda root: _cut(write_record3d(root)),

@@ -43,8 +43,12 @@ class Camera:
 
     def shrunk(self, width: int) -> Camera:
         """Return the pinhole camera of its pictures at most `width` px wide, of the same shape."""
+        return self.pinhole().shrunk_lens(width)
+
+    def shrunk_lens(self, width: int) -> Camera:
+        """Return the camera, with its lens, of its pictures at most `width` px wide, of the same shape."""
         width = min(width, self.width)
-        return self.pinhole().resized(max(1, round(self.height * width / self.width)), width)
+        return self.resized(max(1, round(self.height * width / self.width)), width)
 
 
 @dataclass(frozen=True)

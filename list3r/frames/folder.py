@@ -128,7 +128,7 @@ class FolderSource:
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]
-        color = self._rig.color(self._color(file))
+        color = self._rig.color(self._color(file), file.lens)
         depth = None
         if self._has_depth:
             if file.depth is None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.base import Camera
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
 from list3r.frames.recordings.stored import CodedArray, Stored
@@ -40,6 +42,8 @@ class FrameFile:
     """How sure the sensor is of each depth pixel, as whole numbers, see `Layout.least_confidence`."""
     mask: Stored | None = None
     """Where it is 0 the picture shows nothing that counts: depth is unknown there."""
+    lens: Camera | None = None
+    """The picture's own camera, where pictures differ; what it saw is carried to the camera of the source."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,15 @@ class FolderLayout:
     """Whether the recorder's gravity makes z of the given poses' world point up."""
     upright_tags: bool = True
     """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
+
+
+def usual_camera(cameras: Sequence[Camera]) -> Camera:
+    """Return the camera that stands for all: the only one, or the median pinhole of those of the most usual size."""
+    if len(cameras) == 1:
+        return cameras[0]
+    width, height = Counter((c.width, c.height) for c in cameras).most_common(1)[0][0]
+    same = [(c.fx, c.fy, c.cx, c.cy) for c in cameras if (c.width, c.height) == (width, height)]
+    return Camera(width, height, *np.median(np.array(same), axis=0).tolist())
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -7,11 +7,13 @@ up, pixel centres lie at whole numbers, depth is in millimetres unless `depth_un
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from list3r.frames.base import Camera
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, natural_key, pose_matrix, read_json
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
@@ -43,7 +45,11 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     intrinsics, distortion, size, spread = _camera(path, content, rows, options, _LENS[fisheye])
     notes = ["poses and cameras of transforms.json"]
     if spread > _VARIES:
-        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: their median serves all of them")
+        carried = options.intrinsics is None and not any(f.depth for f in files)
+        what = "every picture is carried to their median" if carried else "their median serves all of them"
+        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: {what}")
+        if carried:
+            files, distortion, fisheye = _with_lenses(files, content, rows, fisheye), (), False
     units = _units_per_metre(path, content)
     optics = Optics(intrinsics, distortion, depth_scale=units, intrinsics_size=size, fisheye=fisheye)
     if intrinsics is not None and not distortion and not fisheye:  # depth of another size has the same camera
@@ -123,6 +129,21 @@ def _camera(
         raise SourceError(f"{path}: {error}") from None
     size = (round(height), round(width)) if width >= 1 and height >= 1 else None
     return intrinsics, distortion, size, float(np.ptp([v[0] for v in known]) / fx)
+
+
+def _with_lenses(
+    files: tuple[FrameFile, ...], content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], fisheye: bool
+) -> tuple[FrameFile, ...]:
+    """The files, each with the camera that its frame states for pictures of a size."""
+    out = []
+    for file, row in zip(files, rows, strict=True):
+        stated = _stated({**content, **row}, _LENS[fisheye])
+        if stated is not None and min(stated[4:6]) >= 1:
+            width, height = round(stated[4]), round(stated[5])
+            fx, fy, cx, cy = stated[:4]
+            file = replace(file, lens=Camera(width, height, fx, fy, cx, cy, tuple(stated[6:]), fisheye))
+        out.append(file)
+    return tuple(out)
 
 
 def _stated(values: Mapping[str, Any], names: Sequence[str]) -> tuple[float, ...] | None:

@@ -65,13 +65,27 @@ class Rig:
     undistortion: Undistortion | None
     registration: DepthReprojection | None
 
-    def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistorted colour. Shape (H, W, 3). Raises `FrameError` for another size than the first frame's."""
+    def color(self, image: NDArray[np.uint8], lens: Camera | None = None) -> NDArray[np.uint8]:
+        """Undistorted colour of a picture, which may have a camera of its own. Shape (H, W, 3).
+
+        Raises `FrameError` for another size than the first frame's, or than its own camera states.
+        """
+        if lens is not None and self.camera is not None:
+            return self._carried(image, lens, self.camera)
         if image.shape[:2] != self.stored_size:
             raise FrameError(f"colour is {_size(image.shape)}, most frames {_size(self.stored_size)}")
         if self.color_size != self.stored_size:
             image = np.asarray(cv2.resize(image, self.color_size[::-1], interpolation=cv2.INTER_AREA))
         return self.straight(image)
+
+    def _carried(self, image: NDArray[np.uint8], lens: Camera, camera: Camera) -> NDArray[np.uint8]:
+        """What a camera of its own saw, as the camera of the source would have seen it. Shape (H, W, 3)."""
+        if image.shape[:2] != (lens.height, lens.width):
+            raise FrameError(f"colour is {_size(image.shape)}, its camera is stated for {lens.width}x{lens.height}")
+        if lens.width > camera.width:
+            lens = lens.shrunk_lens(camera.width)
+            image = np.asarray(cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA))
+        return Undistortion(lens, camera).color(image)
 
     def straight(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorted colour of a picture that has the size of the frames handed out. Shape (H, W, 3)."""
