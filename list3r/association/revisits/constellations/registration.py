@@ -70,6 +70,8 @@ class RegistrationSettings:
     """Things that must still agree once surfaces were brought together, for a relation to be believed."""
     least_belief: float = 3.1
     """Least log odds that a relation is right (`BeliefWeights`) for it to be believed."""
+    least_fitting: float = 0.14
+    """Share of a chunk's surface that must meet the other's: with less a relation is loose."""
     most_rival: float = 0.9
     """Another relation of the same chunks must have less of the believed one's support than this."""
     belief: BeliefWeights = field(default_factory=BeliefWeights)
@@ -153,6 +155,8 @@ def doubt(scores: Mapping[str, float], settings: RegistrationSettings) -> str | 
         return f"with surfaces brought together only {scores['agreeing']:.0f} of them do"
     if (odds := belief(scores, settings.belief)) < settings.least_belief:
         return f"too little speaks for it (log odds {odds:.1f}, wanted {settings.least_belief:.1f})"
+    if scores["fitting"] < settings.least_fitting:
+        return f"too little of the surfaces meets ({scores['fitting']:.0%})"
     if scores["rival"] > settings.most_rival:
         return f"another relation of the two chunks fits as well ({scores['rival']:.0%})"
     return None
