@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any
 
 import typer
+import typer.core
 
 from list3r.cli.answer import print_error, wants_json
 from list3r.cli.ask import memory as memory_commands
@@ -38,9 +39,35 @@ from list3r.cli.serve import view as view_commands
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
 from list3r.memory.errors import List3rError, naming_extras
 
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
+    "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config"),
+    "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
+    "Export": ("export",),
+    "Measure": ("eval",),
+    "Keep": ("verify", "repair", "doctor", "models"),
+}
+"""What commands are for, in the order of the help."""
+
+
+class GroupedCommands(typer.core.TyperGroup):
+    """The commands in groups, each with the first sentence of its help."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands."""
+        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        others = tuple(n for n in commands if not any(n in names for names in GROUPS.values()))
+        for title, names in (*GROUPS.items(), ("Other", others)):
+            rows = [(n, c.get_short_help_str(limit=300)) for n in names if (c := commands.get(n)) is not None]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
 app = typer.Typer(
     name="list3r",
-    help="Object memory for long videos: build it, ask it, export it.",
+    cls=GroupedCommands,
+    help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,

@@ -14,7 +14,11 @@ from list3r.cli.catalog.questions import with_catalog
 from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memory, print_table, spread
 from list3r.cli.terminal import say
 
-query_app = typer.Typer(help="Ask a memory.", no_args_is_help=True, rich_markup_mode=None)
+query_app = typer.Typer(
+    help="Ask what is near, inside, in sight, alike, related, described or changed.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
 """The group that the commands of questions belong to."""
 
 
