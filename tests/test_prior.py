@@ -127,6 +127,15 @@ def test_the_source_says_which_way_is_up_where_its_poses_are_used() -> None:
     assert resolve_settings(BuildSettings(poses="prior"), info(z_up=False)).up == "planes"
 
 
+def test_poses_that_drift_are_a_prior_unless_asked_otherwise() -> None:
+    chosen = {
+        (drift, depth): resolve_settings(BuildSettings(poses="auto"), info(poses_drift=drift, has_depth=depth)).poses
+        for drift in (True, False)
+        for depth in (True, False)
+    }
+    assert chosen == {(True, True): "prior", (True, False): "given", (False, True): "given", (False, False): "given"}
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [({"has_poses": False}, "no poses"), ({"poses_metric": False}, "unit of their own")],

@@ -101,6 +101,8 @@ class SourceInfo:
     """Whether given poses are in metres; a model of COLMAP has a unit of its own."""
     z_up: bool = False
     """Whether the recorder's gravity makes z of the given poses' world point up."""
+    poses_drift: bool = False
+    """Whether given poses were followed as the recording went on and never put right: they drift, and may jump."""
     camera_guess: Camera | None = None
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 

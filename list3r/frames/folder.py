@@ -267,6 +267,7 @@ class FolderSource:
             camera_guess=guess,
             poses_metric=layout.poses_metric,
             z_up=layout.z_up and self._upright(),
+            poses_drift=layout.poses_drift,
         )
 
     def _camera_guess(self) -> Camera | None:

@@ -87,6 +87,8 @@ class FolderLayout:
     """Whether given poses are in metres."""
     z_up: bool = False
     """Whether the recorder's gravity makes z of the given poses' world point up."""
+    poses_drift: bool = False
+    """Whether given poses were followed as the recording went on and never put right: they drift, and may jump."""
     upright_tags: bool = True
     """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
 

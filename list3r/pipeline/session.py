@@ -245,10 +245,11 @@ def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]
 def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:
     """Settings with `auto` replaced by what the source offers."""
     poses, reconstruction = settings.poses, settings.reconstruction
-    if poses == "auto":
-        poses = "given" if info.has_poses else "estimate"
     if reconstruction == "auto":
         reconstruction = usual_model(info.has_depth)
+    if poses == "auto":
+        drift = info.poses_drift and info.poses_metric and entry(reconstruction).follows_prior
+        poses = ("prior" if drift else "given") if info.has_poses else "estimate"
     up = "source" if info.z_up and poses != "estimate" else "planes"
     return replace(settings, poses=poses, reconstruction=reconstruction, up=up)
 

@@ -103,6 +103,7 @@ def _layout(
         tuple(notes),
         least_confidence=LEAST_CONFIDENCE,
         z_up=True,
+        poses_drift=True,
         upright_tags=False,
     )
 

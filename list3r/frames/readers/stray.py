@@ -117,6 +117,7 @@ class StraySource:
             notes=tuple(notes),
             missing=missing,
             z_up=True,
+            poses_drift=True,
         )
 
 
