@@ -161,7 +161,8 @@ def run(broadcast: Broadcast, memory: Path, walk: WalkSettings, readers: int, pa
     checked = subprocess.run(
         [sys.executable, "-m", "list3r", "verify", str(memory)], capture_output=True, text=True, check=False
     )
-    report = json.loads(out)["matches"][0] if process.returncode == 0 else {"live": None}
+    answer = json.loads(out) if process.returncode == 0 else {"matches": [{"live": None}], "notes": []}
+    report = answer["matches"][0]
     answers = [s for r in asking for s in r.seconds]
     return {
         "seconds": broadcast.seconds,
@@ -171,7 +172,7 @@ def run(broadcast: Broadcast, memory: Path, walk: WalkSettings, readers: int, pa
         "from_ctrl_c_to_end_s": round(ended_s, 1),
         "live": report["live"],
         "frames": {k: report.get(k) for k in ("frames", "posed", "chunks", "components", "instances", "relations")},
-        "notes": report.get("notes"),
+        "notes": answer["notes"],
         "readers": readers,
         "answers": len(answers),
         "answer_s": round(statistics.median(answers), 3) if answers else None,

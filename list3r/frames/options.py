@@ -25,6 +25,7 @@ KINDS = (
     "polycam",
     "arkitscenes",
     "scannet",
+    "scannetpp",
     "rosbag",
     "euroc",
     "nerfstudio",

@@ -21,6 +21,7 @@ from list3r.frames.readers import (
     replica,
     rosbag,
     scannet,
+    scannetpp,
     seven_scenes,
     spool,
     stray,
@@ -116,7 +117,9 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     if options.kind == "video":
         raise SourceError(f"{root} is a folder, not a video; name the video file in it or leave out the kind")
     if options.kind in ("auto", "stray") and stray.is_recording(root):
-        return stray.StraySource(root, options)
+        return stray.open_recording(root, options)
+    if options.kind in ("auto", "scannetpp") and scannetpp.is_recording(root):
+        return scannetpp.open_scan(root, options)
     for kind, find in FOLDERS.items():
         if options.kind in ("auto", kind):
             layout = find(root, options)

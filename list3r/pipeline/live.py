@@ -257,6 +257,7 @@ def _report(ours: LiveSession, state: FeedState, started: float) -> BuildReport:
     waiting = max(0, state.count - ours.stop)
     live = LiveReport(
         received=state.received,
+        thinned=state.thinned,
         dropped=state.dropped,
         waiting=waiting,
         reconnects=state.reconnects,

@@ -103,7 +103,7 @@ class CodedArray:
     """Depth or confidence as bare numbers, compressed."""
 
     data: Stored
-    codec: Literal["zlib", "lzfse"]
+    codec: Literal["zlib", "deflate", "lz4", "lzfse"]
     dtype: str
     """Little-endian, as NumPy writes it: "<u2", "<f4", "|u1"."""
     shape: tuple[int, int]
@@ -128,17 +128,35 @@ class CodedArray:
             raise FrameError(
                 f"{self.name} has {len(data)} bytes, more than {self.shape[1]}x{self.shape[0]} numbers take"
             )
-        raw = _inflated(data, count) if self.codec == "zlib" else _lzfse(data, count)
+        raw = _unpacked(data, count, self.codec)
         if raw is None or len(raw) != count:
             had = "damaged" if raw is None else f"{len(raw)} bytes"
             raise FrameError(f"{self.name} is {had}; {self.shape[1]}x{self.shape[0]} numbers are {count} bytes")
         return np.frombuffer(raw, self.dtype).reshape(self.shape)
 
 
-def _inflated(data: bytes, count: int) -> bytes | None:
+def _unpacked(data: bytes, count: int, codec: str) -> bytes | None:
+    """What is packed, hardly more than what is expected; None where it is damaged."""
+    if codec == "lzfse":
+        return _lzfse(data, count)
+    return _lz4(data, count) if codec == "lz4" else _inflated(data, count, -zlib.MAX_WBITS * (codec == "deflate"))
+
+
+def _lz4(data: bytes, count: int) -> bytes | None:
+    try:
+        from lz4.block import LZ4BlockError, decompress
+    except ImportError:
+        raise OptionError("depth of ScanNet++ is packed with LZ4: pip install 'list3r[scannetpp]'") from None
+    try:
+        return bytes(decompress(data, uncompressed_size=count))
+    except LZ4BlockError:
+        return None
+
+
+def _inflated(data: bytes, count: int, bits: int = 0) -> bytes | None:
     """At most one byte more than what is expected, so that a bomb does no harm; None where it is damaged."""
     try:
-        return zlib.decompressobj().decompress(data, count + 1)
+        return zlib.decompressobj(bits or zlib.MAX_WBITS).decompress(data, count + 1)
     except zlib.error:
         return None
 
