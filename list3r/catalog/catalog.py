@@ -22,6 +22,7 @@ from list3r.catalog.records import (
     CatalogRelation,
     CatalogThing,
     MemoryEntry,
+    UnknownMemoryError,
     Wanted,
 )
 from list3r.memory.errors import OptionError, UnknownIdError, naming_extras
@@ -98,7 +99,7 @@ class Catalog:
     def remove(self, name: str) -> None:
         """Forget a memory; its file stays. Raises `CatalogError` where there is none of that name."""
         if not self._backend.drop(name):
-            raise CatalogError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
+            raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
 
     def memories(self) -> list[MemoryEntry]:
         """Return all memories by name."""
@@ -108,7 +109,7 @@ class Catalog:
         """Return one memory. Raises `CatalogError` where there is none of that name."""
         found = self._backend.memories([name])
         if not found:
-            raise CatalogError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
+            raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
         return found[0]
 
     # ------------------------------------------------------------------ questions

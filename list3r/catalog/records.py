@@ -19,6 +19,10 @@ class CatalogError(List3rError):
     """A catalogue that cannot be reached, read or written, or does not hold what is asked for."""
 
 
+class UnknownMemoryError(CatalogError):
+    """A name that no memory of the catalogue has."""
+
+
 @dataclass(frozen=True)
 class MemoryEntry:
     """A memory file as the catalogue knows it."""

@@ -35,6 +35,7 @@ from list3r.cli.models import commands as model_commands
 from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
 from list3r.cli.serve import mcp as mcp_commands
+from list3r.cli.serve import service as service_commands
 from list3r.cli.serve import view as view_commands
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
 from list3r.memory.errors import List3rError, naming_extras
@@ -93,6 +94,7 @@ for module in (
     view_commands,
     batch_commands,
     catalog_commands,
+    service_commands,
 ):
     module.register(app)
 

@@ -75,6 +75,8 @@ EXTRA_OF_PACKAGE = {
     "viser": "view",
     "fsspec": "batch",
     "ray": "ray",
+    "fastapi": "serve",
+    "uvicorn": "serve",
     "psycopg": "catalog",
     "transformers": "models",
     "huggingface_hub": "models",
