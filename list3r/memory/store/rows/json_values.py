@@ -84,6 +84,6 @@ def _key(hint: Any, key: str) -> Any:
 
 def _checked(kind: Any, value: object) -> Any:
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        names = {(int, float): "a number", (list, tuple): "a list"}
-        raise ValueError(f"{type(value).__name__} instead of {names[kind] if kind in names else kind.__name__}")
+        names = {(int, float): "number", (list, tuple): "list"}
+        raise ValueError(f"{repr(value)[:40]} is no {names.get(kind) or kind.__name__}")
     return value
