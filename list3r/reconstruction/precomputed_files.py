@@ -122,12 +122,12 @@ def write_piece(path: Path, piece: Piece) -> None:
 
 def read_frames(path: Path) -> NDArray[np.int64]:
     """Return the frame numbers of a file, without its large arrays. Raises `OptionError`."""
-    return _checked_frames(_arrays(path, ("frames",))["frames"], path)
+    return _checked_frames(read_arrays(path, ("frames",))["frames"], path)
 
 
 def read_piece(path: Path) -> Piece:
     """One file. Raises `OptionError`, naming the array that is wrong."""
-    found = _arrays(path, (*_NEEDED, *_OPTIONAL))
+    found = read_arrays(path, (*_NEEDED, *_OPTIONAL))
     missing = sorted(_NEEDED.keys() - found.keys())
     if missing:
         raise OptionError(f"{path} has no array {', '.join(missing)}; see docs/precomputed.md")
@@ -167,7 +167,7 @@ def _checked_frames(frames: NDArray[Any], path: Path) -> NDArray[np.int64]:
     return frames.astype(np.int64)
 
 
-def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return the named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
     try:
         check_ordinary(path.stat(), path, MAX_BYTES)
