@@ -6,7 +6,9 @@ python benchmarks/association.py --quick --json FILE        # two presets, two s
 A run that was ended goes on where it was when it is started again with the same `--json` and commit.
 
 The presets opposite, night, alike, moved and halls are videos in which a place is seen again but looks otherwise
-(`benchmarks.simulation.returns`), with masks as discovery makes them in homes that it never saw.
+(`benchmarks.simulation.returns`), with masks as discovery makes them in homes that it never saw. The simulated network
+relates places that share no surface by laying look-alike things on one another, which is right where they are the same
+things; with `--joint surfaces` it relates only what shares surfaces, and else takes the camera not to have moved.
 
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
 model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video,
@@ -71,6 +73,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2,3,4,5,6,7,8")
     parser.add_argument("--variants", default=",".join(VARIANTS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--joint", choices=("look-alikes", "surfaces"), default="look-alikes")
     parser.add_argument("--quick", action="store_true", help="presets kidnap and twins, seeds 1 and 2")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path, help="picture of the table: ATE of every seed by preset and variant")
@@ -83,20 +86,20 @@ def main() -> None:
             parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(known)}")
     rows = _resumed(words.json)
     done_jobs = {(r["preset"], r["seed"]) for r in rows}
-    jobs = [(preset, int(seed), tuple(variants)) for seed in words.seeds.split(",") for preset in presets]
+    jobs = [(preset, int(seed), tuple(variants), words.joint) for seed in words.seeds.split(",") for preset in presets]
     jobs = [job for job in jobs if job[:2] not in done_jobs]
     with OrderedPool(run_video, words.workers) as pool:
         for done in pool.map(jobs):
             rows += done
             ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
             print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
-            write_json(words.json, {"unfinished": True, "runs": rows})
+            write_json(words.json, {"unfinished": True, "joint": words.joint, "runs": rows})
     judgements = [(r["preset"], r["variant"], _judgement(r.pop("judgement"))) for r in rows]
     summary = summarise(rows, presets, variants)
     print_tables(summary, presets, variants)
     revisits = revisit_table(judgements, presets, "full" if "full" in variants else variants[-1])
     print(machine())
-    write_json(words.json, {"summary": summary, "revisits": revisits, "runs": rows})
+    write_json(words.json, {"joint": words.joint, "summary": summary, "revisits": revisits, "runs": rows})
     if words.plot is not None:
         plot(words.plot, rows, presets, variants)
 
@@ -137,7 +140,7 @@ def _judgement(plain: dict[str, Any]) -> Any:
     return RevisitJudgement(candidates, labels[0], labels[1], frozenset((u, v) for u, v in plain["true_pairs"]))
 
 
-def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
+def run_video(job: tuple[str, int, Sequence[str], str]) -> list[dict[str, Any]]:
     """All variants on one simulated video."""
     from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
     from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
@@ -146,9 +149,11 @@ def run_video(job: tuple[str, int, Sequence[str]]) -> list[dict[str, Any]]:
     from benchmarks.simulation.returns import make_return
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 
-    preset, seed, variants = job
+    preset, seed, variants, joint_by = job
     video = make_return(preset, seed) if preset in RETURNS else make_video(preset, seed)
     errors = FeedForwardSettings.unseen_home(preset == "halls") if preset in RETURNS else FeedForwardSettings()
+    if joint_by == "surfaces":
+        errors = replace(errors, poses=replace(errors.poses, alike_least_score=float("inf")))
     model = FeedForwardModel(video, errors, seed=seed)
     truth = _Truth(video, most_deg=180.0 if preset in RETURNS else None)
     work = SharedWork()

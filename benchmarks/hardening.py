@@ -22,7 +22,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # the small memories of the tests
 
-from hostile import command_lines, damages, lying
+from hostile import bombs, command_lines, damages, lying
 from hostile.work import Batch, Run
 
 EACH = 50
@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--lies", type=int, default=0)
     parser.add_argument("--damages", type=int, default=0)
     parser.add_argument("--command-lines", type=int, default=0)
+    parser.add_argument("--bombs", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path)
@@ -44,6 +45,11 @@ def main() -> None:
         "lies": (lying.batch, words.lies),
     }
     problems = 0
+    if words.bombs:
+        with tempfile.TemporaryDirectory() as folder:
+            told = bombs.run_bombs(Path(folder))
+        Run(words.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(told)
+        problems += len(told["problems"])
     for key, (work, count) in parts.items():
         if count:
             problems += len(_part(key, work, count, words)["problems"])

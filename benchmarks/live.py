@@ -21,6 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -105,7 +106,7 @@ def main() -> None:
     parser.add_argument("--pause", type=float, default=1.0, help="seconds between two questions of a reader")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
-    walk = WalkSettings(seed=1, frames=words.pictures)
+    walk = WalkSettings(seed=1, frames=words.pictures, size=(240, 180))
     with tempfile.TemporaryDirectory() as scratch:
         broadcast = Broadcast(film(walk), words.seconds, words.cuts)
         result = run(broadcast, Path(scratch) / "live.l3r", walk, words.readers, words.pause)
@@ -130,7 +131,8 @@ def run(broadcast: Broadcast, memory: Path, walk: WalkSettings, readers: int, pa
             self.send_response(200)
             self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
             self.end_headers()
-            broadcast.serve(self)
+            with suppress(ConnectionError):  # whoever listens may leave
+                broadcast.serve(self)
 
         def log_message(self, *args: object) -> None:
             pass
@@ -140,7 +142,7 @@ def run(broadcast: Broadcast, memory: Path, walk: WalkSettings, readers: int, pa
     c = walk.camera()
     command = [sys.executable, "-m", "list3r", "build", f"http://127.0.0.1:{server.server_port}/", "-m", str(memory)]
     command += ["--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}", "--distortion", "0,0,0,0,0", "--preset", "cpu"]
-    command += ["--chunk", "40", "--overlap", "12", "--depth-every", "4", "--json"]
+    command += ["--fps", "5", "--chunk", "20", "--overlap", "6", "--depth-every", "2", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     stop = threading.Event()
     asking = [Reader(memory, stop, pause_s) for _ in range(readers)]
@@ -159,7 +161,8 @@ def run(broadcast: Broadcast, memory: Path, walk: WalkSettings, readers: int, pa
     checked = subprocess.run(
         [sys.executable, "-m", "list3r", "verify", str(memory)], capture_output=True, text=True, check=False
     )
-    report = json.loads(out)["matches"][0] if process.returncode == 0 else {"live": None}
+    answer = json.loads(out) if process.returncode == 0 else {"matches": [{"live": None}], "notes": []}
+    report = answer["matches"][0]
     answers = [s for r in asking for s in r.seconds]
     return {
         "seconds": broadcast.seconds,
@@ -169,7 +172,7 @@ def run(broadcast: Broadcast, memory: Path, walk: WalkSettings, readers: int, pa
         "from_ctrl_c_to_end_s": round(ended_s, 1),
         "live": report["live"],
         "frames": {k: report.get(k) for k in ("frames", "posed", "chunks", "components", "instances", "relations")},
-        "notes": report.get("notes"),
+        "notes": answer["notes"],
         "readers": readers,
         "answers": len(answers),
         "answer_s": round(statistics.median(answers), 3) if answers else None,

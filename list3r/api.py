@@ -20,7 +20,6 @@ from list3r.exporters.registry import export as export_memory
 from list3r.exporters.tables import Table, Value, records_of
 from list3r.memory.errors import List3rError, OptionError, naming_extras
 from list3r.memory.geometry import Sim3
-from list3r.memory.maintenance.as_of import store_at
 from list3r.memory.maintenance.editing import MemoryEdits
 from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
@@ -77,6 +76,8 @@ def open(path: str | Path, *, writable: bool = False, at: int | None = None) -> 
         return SceneMemory(Store.open(path, writable=writable))
     if writable:
         raise OptionError(f"{path} as it was after session {at} can only be read")
+    from list3r.memory.maintenance.as_of import store_at
+
     with Store.open(path) as store:
         return SceneMemory(store_at(store, at))
 

@@ -133,6 +133,33 @@ def write_stray(root: Path) -> Path:
     return root
 
 
+def write_scannetpp(root: Path, *, packed: str = "lz4") -> Path:
+    """Whole millimetres packed with LZ4, or float metres with deflate; depth of 256 x 192."""
+    import lz4.block
+
+    rows, depth = {}, b""
+    base = root / "iphone"
+    base.mkdir(parents=True, exist_ok=True)
+    with av.open(str(base / "rgb.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for k, shot in enumerate(shots()):
+            z = plane_depth(shot.T_world_cam, K, (192, 256))
+            if packed == "lz4":
+                data = lz4.block.compress(millimetres(z).tobytes(), store_size=False)
+            else:
+                pack = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+                data = pack.compress(z.astype("<f4").tobytes()) + pack.flush()
+            depth += len(data).to_bytes(4, "little") + data
+            pose = shot.T_world_cam.tolist()
+            rows[f"frame_{k:06d}"] = {"intrinsic": matrix(K)[:3, :3].tolist(), "pose": pose, "aligned_pose": pose}
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(shot.color, "rgb24")))
+        container.mux(stream.encode())
+    put(base / "depth.bin", depth)
+    put(base / "pose_intrinsic_imu.json", json.dumps(rows))
+    return root
+
+
 def write_polycam(root: Path) -> Path:
     for k, shot in enumerate(shots()):
         T, name = arkit(shot.T_world_cam), f"{5_000_000 + 33_333 * k}"
@@ -237,6 +264,7 @@ def matrix(camera: tuple[float, ...]) -> Array:
 WITH_DEPTH: dict[str, Callable[[Path], Path]] = {
     "record3d": write_record3d,
     "stray": write_stray,
+    "scannetpp": write_scannetpp,
     "polycam": write_polycam,
     "arkitscenes": write_arkitscenes,
     "nerfstudio": write_nerfstudio,

@@ -9,7 +9,18 @@ import pytest
 
 from list3r.association.revisits.constellations.constellation import Constellation
 from list3r.association.revisits.constellations.matching import MatchingSettings, likeness, match_constellations
+from list3r.association.revisits.constellations.registration import RegistrationSettings, belief, doubt
+from list3r.association.revisits.constellations.surface_fit import (
+    Held,
+    SurfaceFitSettings,
+    Surfaces,
+    fit_surfaces,
+)
+from list3r.association.revisits.cross_check import Side
+from list3r.association.revisits.cues import CueSettings, instance_set
+from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.records import FrameSamples
 
 
 def constellation(seed: int, count: int = 9) -> Constellation:
@@ -79,3 +90,54 @@ def test_features_of_two_spaces_say_nothing() -> None:
 def test_fewer_than_three_things_claim_nothing() -> None:
     u = constellation(7, count=2)
     assert match_constellations(u, u, metric=False, settings=MatchingSettings()) == []
+
+
+def room(S: Sim3, seed: int) -> Surfaces:
+    """Points of the floor and of three walls of a room of 4 x 3 x 2.5 m, in another gauge."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 1, (3000, 3)) * [4.0, 3.0, 2.5]
+    flat = rng.integers(4, size=3000)
+    points[flat == 0, 2], points[flat == 1, 0] = 0.0, 0.0
+    points[flat == 2, 1], points[flat == 3, 0] = 0.0, 4.0
+    points = S.apply(points + 0.005 * rng.standard_normal(points.shape))
+    samples = replace(
+        FrameSamples.empty(),
+        frame=np.zeros(3000, np.int64),
+        pixel=np.arange(3000, dtype=np.int32),
+        points=points.astype(np.float32),
+        confidence=np.ones(3000, np.float32),
+        instance=np.full(3000, -1, np.int32),
+    )
+    nothing = instance_set([], np.zeros((0, 4, 4)), "", CueSettings())
+    return Surfaces(Side(samples, Camera(64, 48, 50, 50, 32, 24), nothing), 2.0 * float(S.scale), SurfaceFitSettings())
+
+
+def test_surfaces_bring_a_rough_relation_together_and_up_holds_it_upright() -> None:
+    S_v_u = Sim3(np.asarray(1.5), rotation_exp(np.array([0.0, 0.0, 2.0])), np.array([1.0, 2.0, 0.3]))
+    u, v = room(Sim3.identity(), 1), room(S_v_u, 2)
+    rough = S_v_u @ Sim3.exp(np.array([0.08, -0.06, 0.05, 0.02, -0.02, 0.05, 0.04]))
+    things = np.array([[1.0, 1.0, 0.5], [3.0, 1.0, 0.5], [2.0, 2.5, 1.0]])
+    up = np.array([0.0, 0.0, 1.0])
+    found = fit_surfaces(rough, u, v, Held(things, S_v_u.apply(things), up, up, 1.5), metric=False)
+    assert found is not None
+    error = np.abs((found.S_v_u.inverse() @ S_v_u).log())
+    assert error[:3].max() < 0.02 and np.degrees(error[3:6].max()) < 0.5 and error[6] < 0.01
+    assert found.fitting > 0.8
+
+
+def test_a_relation_is_believed_by_all_that_speaks_for_it() -> None:
+    scores = {
+        "match": np.e**3,
+        "agreeing": 8.0,
+        "after": 1.0,
+        "agreement": 1.0,
+        "fitting": 1.0,
+        "likeness": 0.7,
+        "rival": 0.0,
+    }
+    settings = RegistrationSettings()
+    # -3.1 + 0.89 * 3 + 0.33 * 8 - 2.6 * 1 + 9.7 * 0 + 1 * 0 + 9.3 * 0.7
+    assert belief(scores, settings.belief) == pytest.approx(6.12)
+    assert doubt(scores, settings) is None
+    for worse in ({"agreeing": 3.0}, {"agreement": 0.6}, {"after": 2.5}, {"fitting": 0.1}, {"rival": 0.95}):
+        assert doubt(scores | worse, settings) is not None

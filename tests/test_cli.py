@@ -58,6 +58,7 @@ COMMANDS = (
     " eval.trajectory eval.cloud eval.instances eval.revisits query.find query.seen query.path"
     " query.changes update merges undo merge split label delete repair"
     " embed detect scale precompute models.list models.fetch batch"
+    " catalog.add catalog.remove catalog.list catalog.check catalog.rebuild serve"
 ).split()
 
 

@@ -14,7 +14,7 @@ from list3r.memory.geometry import Sim3, rotation_exp
 from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, FrameSamples, LocalLibrary
 from list3r.pipeline.session import check_buildable, resolve_settings
 from list3r.pipeline.settings import BuildSettings
-from list3r.reconstruction.prior import PriorSettings, source_from_chunk, steady_runs
+from list3r.reconstruction.prior import PriorSettings, mean_alignment, source_from_chunk, steady_runs
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, walk
 
@@ -102,6 +102,11 @@ def test_the_edge_of_a_prior_says_where_the_chunk_lies_and_how_far_it_may_have_d
     edge = prior_edge(u, before, chunk(np.linalg.inv(moved) @ truth, truth), 2, PriorEdgeSettings())
     assert edge is not None and edge.kind == "prior" and edge.covariance is not None
     assert np.allclose(edge.S_v_u.translation, -moved[:3, 3]) and np.allclose(edge.S_v_u.rotation, np.eye(3))
+    jumped = imperfect(truth)  # the chunk before ends after the jump, and lies in the world behind it
+    behind = prior_edge(replace(u, last_frame=JUMP + 3), before, chunk(truth, jumped), 2, PriorEdgeSettings())
+    assert behind is not None
+    T_source_v = mean_alignment(truth[JUMP:], jumped[JUMP:])
+    assert np.allclose(behind.S_v_u.translation, np.linalg.inv(T_source_v)[:3, 3], atol=1e-9)
     far = truth.copy()
     far[:, :3, 3] *= 10.0
     loose = prior_edge(u, before, chunk(far, far), 2, PriorEdgeSettings())
@@ -120,6 +125,15 @@ def test_the_source_says_which_way_is_up_where_its_poses_are_used() -> None:
     used = {poses: resolve_settings(BuildSettings(poses=poses), info()).up for poses in ("given", "prior", "estimate")}
     assert used == {"given": "source", "prior": "source", "estimate": "planes"}
     assert resolve_settings(BuildSettings(poses="prior"), info(z_up=False)).up == "planes"
+
+
+def test_poses_that_drift_are_a_prior_unless_asked_otherwise() -> None:
+    chosen = {
+        (drift, depth): resolve_settings(BuildSettings(poses="auto"), info(poses_drift=drift, has_depth=depth)).poses
+        for drift in (True, False)
+        for depth in (True, False)
+    }
+    assert chosen == {(True, True): "prior", (True, False): "given", (False, True): "given", (False, False): "given"}
 
 
 @pytest.mark.parametrize(

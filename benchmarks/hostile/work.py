@@ -98,9 +98,9 @@ class Run:
         self._all[self.key] = {"asked": self.asked, **total(self.batches.values()), "batches": self.batches}
         write_json(self.path, self._all)
 
-    def finish(self) -> dict[str, Any]:
-        """Leave the batches out of the file, and return the sum."""
-        told = {"asked": self.asked, **total(self.batches.values())}
+    def finish(self, told: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Write what was told, or the sum of the batches without these, and return it."""
+        told = {"asked": self.asked, **(told or total(self.batches.values()))}
         self._all[self.key] = told
         write_json(self.path, self._all)
         return told

@@ -49,6 +49,12 @@ def make_return(preset: str, seed: int, size: tuple[int, int] = (64, 48)) -> Sim
 
     Raises `OptionError` for a preset that does not exist.
     """
+    take, later = film_return(preset, seed)
+    return _cast(preset, seed, take, later, size)
+
+
+def film_return(preset: str, seed: int) -> tuple[Take, SimulatedWorld | None]:
+    """Return the building and both runs of a preset, and the world of the second run where things were moved."""
     if preset not in RETURNS:
         raise OptionError(f"no preset {preset!r}: one of {', '.join(RETURNS)}")
     rng = np.random.default_rng([seed, 51, RETURNS.index(preset)])
@@ -59,8 +65,7 @@ def make_return(preset: str, seed: int, size: tuple[int, int] = (64, 48)) -> Sim
     others = [r for r in building.north + building.south if r is not room]
     others = [others[k] for k in rng.permutation(len(others))]
     _film(take, preset, room, others)
-    later = _rearranged(building.world, building, room, rng) if preset == "moved" else None
-    return _cast(preset, seed, take, later, size)
+    return take, _rearranged(building.world, room, rng) if preset == "moved" else None
 
 
 def _building(preset: str, seed: int, rng: np.random.Generator) -> Building:
@@ -138,9 +143,7 @@ def _near(director: Director, room: PlacedRoom, view: View) -> View:
     return View((float(spot[0]), float(spot[1])), view.targets)
 
 
-def _rearranged(
-    world: SimulatedWorld, building: Building, room: PlacedRoom, rng: np.random.Generator
-) -> SimulatedWorld:
+def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generator) -> SimulatedWorld:
     """Return the world with half of what stands on floors or on furniture of a room put elsewhere in it."""
     things = {t.id: t for t in world.things}
     floors = [k for k in room.things if things[k].structure == "floor"]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from benchmarks.simulation.changes import Change, apply_changes
 from benchmarks.simulation.presets import make_shot
-from benchmarks.simulation.takes import Shot
+from benchmarks.simulation.returns import film_return
+from benchmarks.simulation.takes import Shot, Take
 from list3r.memory.errors import OptionError
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.worlds.things import MovingThing, SimulatedThing
@@ -69,6 +70,37 @@ class PresetWalk(WalkSettings):
         if total - self.start < 2:
             raise OptionError(f"start {self.start} leaves nothing of a walk of {total} frames")
         return slice(self.start, total if self.frames is None else min(self.start + self.frames, total))
+
+
+@dataclass(frozen=True)
+class SeenAgainWalk(WalkSettings):
+    """The end of the first run and the whole second run of `benchmarks.simulation.returns`, where nothing was moved.
+
+    `seed` decides both; `path` and `walk_seed` are left aside.
+    """
+
+    preset: str = "opposite"
+    before: int = 160
+    """Frames of the first run."""
+
+    def world(self) -> SimulatedWorld:
+        """The world of the building."""
+        return _take(self.preset, self.seed).building.world
+
+    def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Seconds (F,) and T_world_cam (F, 4, 4) of the frames to be written."""
+        take = _take(self.preset, self.seed)
+        poses = np.concatenate([take.poses[0][-self.before :], take.poses[1]])
+        return np.arange(len(poses)) / take.path.fps, poses
+
+    def cut(self) -> int:
+        """The frame before which the camera jumps."""
+        return min(self.before, len(_take(self.preset, self.seed).poses[0]))
+
+
+@lru_cache(maxsize=2)
+def _take(preset: str, seed: int) -> Take:
+    return film_return(preset, seed)[0]
 
 
 @lru_cache(maxsize=2)

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError
 from list3r.memory.store.file import rename_exclusively
 
@@ -50,7 +51,7 @@ def read_text(where: str) -> str:
     """Return a text file. Raises `OptionError`."""
     try:
         if not is_remote(where):
-            return Path(where).read_text(encoding="utf-8")
+            return read_file(Path(where), MAX_TEXT_BYTES).decode("utf-8")
         fs, path = _filesystem(where)
         return bytes(fs.cat_file(path)).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -13,6 +13,7 @@ from typing import Any
 from list3r.batch.storage import children, is_remote, joined, listing, read_text
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.unpacking import parse_json
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 _VIDEOS = frozenset((".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".bag", ".mcap", ".r3d"))
@@ -101,7 +102,7 @@ def _lines(where: str) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def _object(text: str, at: str) -> dict[str, Any]:
     try:
-        found = json.loads(text)
+        found = parse_json(text)
     except ValueError as error:
         raise OptionError(f"{at}: {error}; a line is a path or a JSON object") from error
     if not isinstance(found, dict):

@@ -8,7 +8,6 @@ killed after publishing is known to be done.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import shutil
 import socket
@@ -168,6 +167,8 @@ def _finished(work: Path, before: Path | None) -> _Known | None:
 @contextlib.contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """Keep other processes from the files of a memory; one that is being ended is waited for."""
+    import fcntl
+
     with path.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

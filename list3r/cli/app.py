@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any
 
 import typer
+import typer.core
 
 from list3r.cli.answer import print_error, wants_json
 from list3r.cli.ask import memory as memory_commands
@@ -24,6 +25,7 @@ from list3r.cli.build import batch as batch_commands
 from list3r.cli.build import commands as build_commands
 from list3r.cli.build import exchange as exchange_commands
 from list3r.cli.build import update as update_commands
+from list3r.cli.catalog import commands as catalog_commands
 from list3r.cli.edit import commands as edit_commands
 from list3r.cli.edit import export as export_commands
 from list3r.cli.edit import files as file_commands
@@ -33,13 +35,40 @@ from list3r.cli.models import commands as model_commands
 from list3r.cli.models import detect as detect_commands
 from list3r.cli.models import embed as embed_commands
 from list3r.cli.serve import mcp as mcp_commands
+from list3r.cli.serve import service as service_commands
 from list3r.cli.serve import view as view_commands
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
 from list3r.memory.errors import List3rError, naming_extras
 
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
+    "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config"),
+    "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
+    "Export": ("export",),
+    "Measure": ("eval",),
+    "Keep": ("verify", "repair", "doctor", "models"),
+}
+"""What commands are for, in the order of the help."""
+
+
+class GroupedCommands(typer.core.TyperGroup):
+    """The commands in groups, each with the first sentence of its help."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands."""
+        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        others = tuple(n for n in commands if not any(n in names for names in GROUPS.values()))
+        for title, names in (*GROUPS.items(), ("Other", others)):
+            rows = [(n, c.get_short_help_str(limit=300)) for n in names if (c := commands.get(n)) is not None]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
 app = typer.Typer(
     name="list3r",
-    help="Object memory for long videos: build it, ask it, export it.",
+    cls=GroupedCommands,
+    help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -64,6 +93,8 @@ for module in (
     mcp_commands,
     view_commands,
     batch_commands,
+    catalog_commands,
+    service_commands,
 ):
     module.register(app)
 

@@ -41,6 +41,11 @@ _AT: ContextVar[int | None] = ContextVar("at", default=None)
 """The session after which the world is asked about, for the command that runs."""
 
 
+def asked_at() -> int | None:
+    """Return the session of `--at` of the command that runs."""
+    return _AT.get()
+
+
 @contextlib.contextmanager
 def open_memory(path: Path) -> Iterator[SceneMemory]:
     """The memory behind a path, for reading: as it is, or as it was after the session of `--at`.

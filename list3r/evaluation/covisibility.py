@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.frames.base import Camera
+from list3r.frames.files import check_ordinary
 from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.unpacking import open_archive
 
 Array = NDArray[np.float64]
 Shares = NDArray[np.float32]
@@ -158,6 +160,9 @@ def write_covisibility(path: str | Path, found: Covisibility) -> None:
 def read_covisibility(path: str | Path) -> Covisibility:
     """Read what `write_covisibility` wrote. Raises `SourceError` for a file that is absent or something else."""
     try:
+        check_ordinary(Path(path).stat(), Path(path))
+        with Path(path).open("rb") as file:
+            open_archive(file).close()
         with np.load(path, allow_pickle=False) as arrays:
             missing = [name for name in ("frame", "time_s", "share") if name not in arrays]
             if missing:

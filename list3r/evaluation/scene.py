@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,12 +16,13 @@ from list3r.evaluation.trajectory import Trajectory, align, associate
 from list3r.frames.files import read_file
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz
+from list3r.memory.unpacking import parse_json
 
 
 def read_scene(path: str | Path) -> dict[str, Any]:
     """Read a scene JSON or a `truth.json`. Raises `SourceError` for a file that is neither."""
     try:
-        scene = json.loads(read_file(Path(path)).decode("utf-8"))
+        scene = parse_json(read_file(Path(path)).decode("utf-8"))
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.files import read_file
+from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import DegenerateError, OptionError, SourceError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation, rotation_from_quat_wxyz, rotation_log, umeyama
 
@@ -138,7 +138,7 @@ def read_tum(path: str | Path) -> Trajectory:
     path = Path(path)
     rows: list[list[float]] = []
     try:
-        lines = read_file(path).decode("utf-8").splitlines()
+        lines = read_file(path, MAX_TEXT_BYTES).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f"cannot read the trajectory {path}: {_reason(error)}") from error
     for number, line in enumerate(lines, 1):

@@ -22,6 +22,8 @@ class Camera:
     cy: float
     distortion: tuple[float, ...] = ()
     """OpenCV's (k1, k2, p1, p2, k3), empty for none. Frames handed out by a source are already undistorted."""
+    fisheye: bool = False
+    """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4) of the angle from the axis (Kannala and Brandt)."""
 
     def matrix(self) -> NDArray[np.float64]:
         """Return the intrinsic matrix, px. Shape (3, 3)."""
@@ -29,7 +31,7 @@ class Camera:
 
     def pinhole(self) -> Camera:
         """Return the same camera without lens distortion."""
-        return replace(self, distortion=())
+        return replace(self, distortion=(), fisheye=False)
 
     def resized(self, height: int, width: int) -> Camera:
         """Return the camera of its pictures at another size."""
@@ -37,12 +39,16 @@ class Camera:
             return self
         x, y = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
-        return Camera(width, height, self.fx * x, self.fy * y, cx, cy, self.distortion)
+        return Camera(width, height, self.fx * x, self.fy * y, cx, cy, self.distortion, self.fisheye)
 
     def shrunk(self, width: int) -> Camera:
         """Return the pinhole camera of its pictures at most `width` px wide, of the same shape."""
+        return self.pinhole().shrunk_lens(width)
+
+    def shrunk_lens(self, width: int) -> Camera:
+        """Return the camera, with its lens, of its pictures at most `width` px wide, of the same shape."""
         width = min(width, self.width)
-        return self.pinhole().resized(max(1, round(self.height * width / self.width)), width)
+        return self.resized(max(1, round(self.height * width / self.width)), width)
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,8 @@ class SourceInfo:
     """Whether given poses are in metres; a model of COLMAP has a unit of its own."""
     z_up: bool = False
     """Whether the recorder's gravity makes z of the given poses' world point up."""
+    poses_drift: bool = False
+    """Whether given poses were followed as the recording went on and never put right: they drift, and may jump."""
     camera_guess: Camera | None = None
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 

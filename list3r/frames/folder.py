@@ -25,11 +25,15 @@ from list3r.frames.selection import select, sharpness
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
-_LATER = ("start_s", "end_s", "sharpest", "max_side", "topics")
+_LATER = ("start_s", "end_s", "sharpest", "max_side", "topics", "more")
 """Options that came later: unsaid, they leave the fingerprints of older memories as they were."""
 _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
 _POSES_TRIED = 50
+_MOST_OFF_CENTRE = 0.2
+"""Of a camera's centre from the middle of its picture, as a share of the side."""
+_LEAST_UPRIGHT = 0.4
+"""Least z of the cameras' mean up, where z is up: people film level or look down at most by some 60 degrees."""
 
 
 class FolderSource:
@@ -124,7 +128,7 @@ class FolderSource:
 
     def _frame(self, number: int) -> Frame:
         file = self._layout.files[number]
-        color = self._rig.color(self._color(file))
+        color = self._rig.color(self._color(file), file.lens)
         depth = None
         if self._has_depth:
             if file.depth is None:
@@ -186,7 +190,26 @@ class FolderSource:
 
     def _doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with depth, poses and times."""
-        return (*self._depth_doubts(), *self._pose_doubts(), *self._time_doubts())
+        return (*self._depth_doubts(), *self._pose_doubts(), *self._time_doubts(), *self._camera_doubts())
+
+    def _camera_doubts(self) -> tuple[str, ...]:
+        """Return what looks wrong with the camera: a centre far from the middle is that of another size."""
+        camera = self._rig.camera
+        if camera is None:
+            return ()
+        off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+        if off < _MOST_OFF_CENTRE:
+            return ()
+        size = f"{camera.width}x{camera.height}"
+        where = f"({camera.cx:.0f}, {camera.cy:.0f})"
+        return (f"the camera's centre {where} lies far from the middle of {size}: is it of pictures of another size?",)
+
+    def _upright(self) -> bool:
+        """Whether cameras stand upright on average in a world whose z is said to point up."""
+        given = [f for f in self._layout.files if f.pose is not None or f.T_source_camera is not None]
+        some = (self._pose(f) for f in given[:: max(1, len(given) // _POSES_TRIED)])
+        ups = [-T[:3, 1] for T in some if T is not None]
+        return bool(ups) and float(np.mean(ups, axis=0)[2]) > _LEAST_UPRIGHT
 
     def _depth_doubts(self) -> tuple[str, ...]:
         typical_m = self._typical_raw / self._rig.depth_scale
@@ -243,7 +266,8 @@ class FolderSource:
             image_size=rig.color_size,
             camera_guess=guess,
             poses_metric=layout.poses_metric,
-            z_up=layout.z_up,
+            z_up=layout.z_up and self._upright(),
+            poses_drift=layout.poses_drift,
         )
 
     def _camera_guess(self) -> Camera | None:

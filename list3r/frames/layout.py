@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.base import Camera
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.unpacking import parse_json
 
 MAX_LENGTH_M = 1e6
 """No camera stands further from where its numbers begin; single precision is 6 cm there."""
+_MOST_LINES, _LONGEST_LINE, _MOST_NUMBERS = 2**21, 2**22, 2**23
+"""Of one list: lines, characters of a line, numbers. A line of COLMAP has every feature of a picture."""
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
@@ -37,6 +42,8 @@ class FrameFile:
     """How sure the sensor is of each depth pixel, as whole numbers, see `Layout.least_confidence`."""
     mask: Stored | None = None
     """Where it is 0 the picture shows nothing that counts: depth is unknown there."""
+    lens: Camera | None = None
+    """The picture's own camera, where pictures differ; what it saw is carried to the camera of the source."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,8 @@ class Optics:
     """(height, width) of the pictures that `intrinsics` are stated for; None for the pictures as stored."""
     depth_intrinsics_size: tuple[int, int] | None = None
     """(height, width) of the images that `depth_intrinsics` are stated for; None for depth as stored."""
+    fisheye: bool = False
+    """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4)."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +87,19 @@ class FolderLayout:
     """Whether given poses are in metres."""
     z_up: bool = False
     """Whether the recorder's gravity makes z of the given poses' world point up."""
+    poses_drift: bool = False
+    """Whether given poses were followed as the recording went on and never put right: they drift, and may jump."""
     upright_tags: bool = True
     """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
+
+
+def usual_camera(cameras: Sequence[Camera]) -> Camera:
+    """Return the camera that stands for all: the only one, or the median pinhole of those of the most usual size."""
+    if len(cameras) == 1:
+        return cameras[0]
+    width, height = Counter((c.width, c.height) for c in cameras).most_common(1)[0][0]
+    same = [(c.fx, c.fy, c.cx, c.cy) for c in cameras if (c.width, c.height) == (width, height)]
+    return Camera(width, height, *np.median(np.array(same), axis=0).tolist())
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -90,8 +110,12 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def read_numbers(path: Path) -> list[list[float]]:
     """Rows of numbers of a text file; `#` starts a comment. Raises `SourceError` naming file and line."""
     rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    count = 0
+    for number, line in enumerate(read_lines(path), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
+        count += len(words)
+        if count > _MOST_NUMBERS:
+            raise SourceError(f"{path} holds over {_MOST_NUMBERS:,} numbers, more than a list of poses has")
         if not words:
             continue
         try:
@@ -107,6 +131,17 @@ def read_text(path: Path) -> str:
         return read_file(path, MAX_TEXT_BYTES).decode("utf-8", "replace")
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file. Raises `SourceError`, also for more and longer ones than any list has."""
+    text = read_text(path)
+    if text.count("\n") > _MOST_LINES:
+        raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
+    lines = text.splitlines()
+    if max(map(len, lines), default=0) > _LONGEST_LINE:
+        raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
+    return lines
 
 
 def pose_matrix(values: Iterable[float]) -> NDArray[np.float64] | None:
@@ -153,7 +188,7 @@ def inside(root: Path, name: str, stated_in: Path) -> Path:
 def read_json(path: Path) -> object:
     """Parsed JSON. Raises `SourceError`."""
     try:
-        return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "too deep or too large a number"
-        raise SourceError(f"{path} is not JSON ({where}); mend or remove it") from None
+        return parse_json(read_text(path))
+    except ValueError as error:
+        where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else str(error)
+        raise SourceError(f"{path} is not JSON that can be read ({where}); mend or remove it") from None

@@ -25,6 +25,7 @@ KINDS = (
     "polycam",
     "arkitscenes",
     "scannet",
+    "scannetpp",
     "rosbag",
     "euroc",
     "nerfstudio",
@@ -85,6 +86,8 @@ class SourceOptions:
     max_side: int | None = None
     """Longest side of the frames handed out, px; larger pictures are reduced. 0 for as stored; None: 960, 1280 with
     depth. Intrinsics are given for pictures as stored."""
+    more: tuple[str, ...] | None = None
+    """Further video files of the same recording, in order."""
 
     def check_fits(self, info: SourceInfo) -> None:
         """Raise `OptionError` for what is said of a depth camera that the source has not got."""

@@ -21,6 +21,7 @@ from list3r.frames.readers import (
     replica,
     rosbag,
     scannet,
+    scannetpp,
     seven_scenes,
     spool,
     stray,
@@ -68,6 +69,8 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
     if str(path) == "":
         raise SourceError(f"the name of the source is empty; {_WANTED}")
     root = Path(path).expanduser()
+    if options.more:
+        return _open_joined([root, *(Path(p).expanduser() for p in options.more)], options)
     try:
         if not root.exists():
             raise SourceError(f"{root} does not exist; {_WANTED}")
@@ -78,6 +81,18 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
         return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
         raise SourceError(f"{error.filename or root} may not be read; check its permissions") from None
+
+
+def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
+    """Open several video files as one. Raises `SourceError` for anything else."""
+    for path in paths:
+        if not path.is_file() or path.suffix.lower() in (*IMAGE_ENDINGS, *FILES):
+            raise SourceError(f"{path} is no video file; only video files of one recording can be given together")
+        if not os.access(path, os.R_OK) or path.stat().st_size == 0:
+            raise SourceError(f"{path} is empty or may not be read; check the copy and its permissions")
+    from list3r.frames.readers.joined import JoinedVideos
+
+    return JoinedVideos(paths, options)
 
 
 def require_camera(info: SourceInfo) -> Camera:
@@ -102,7 +117,9 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     if options.kind == "video":
         raise SourceError(f"{root} is a folder, not a video; name the video file in it or leave out the kind")
     if options.kind in ("auto", "stray") and stray.is_recording(root):
-        return stray.StraySource(root, options)
+        return stray.open_recording(root, options)
+    if options.kind in ("auto", "scannetpp") and scannetpp.is_recording(root):
+        return scannetpp.open_scan(root, options)
     for kind, find in FOLDERS.items():
         if options.kind in ("auto", kind):
             layout = find(root, options)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from list3r.frames.files import read_file
 from list3r.memory.errors import SourceError
 from list3r.memory.geometry import OrientedBox
+from list3r.memory.unpacking import parse_json
 
 MOST_BYTES = 2**30
 """Largest file that is read."""
@@ -52,11 +52,11 @@ class ImportedMap:
 def read_json_file(path: Path) -> Any:
     """Return parsed JSON. Raises `SourceError`."""
     try:
-        return json.loads(read_file(path, MOST_BYTES))
+        return parse_json(read_file(path, MOST_BYTES))
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check the file") from None
-    except (ValueError, RecursionError):
-        raise SourceError(f"{path} is not JSON; was it copied whole?") from None
+    except ValueError as error:
+        raise SourceError(f"{path} is not JSON that can be read ({error}); was it copied whole?") from None
 
 
 def box_surface(box: OrientedBox) -> NDArray[np.float32]:

@@ -10,9 +10,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import product
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from scipy.cluster.hierarchy import DisjointSet
+if TYPE_CHECKING:
+    from scipy.cluster.hierarchy import DisjointSet
+
 
 Key = tuple[int, int]
 """(chunk id, local id)."""
@@ -62,6 +64,8 @@ class LinkConstraints:
     """Sets of local instances that must be linked, and which of these sets must not."""
 
     def __init__(self) -> None:
+        from scipy.cluster.hierarchy import DisjointSet
+
         self._sets: DisjointSet = DisjointSet()
         self._apart: dict[Key, set[Key]] = {}
 
@@ -189,6 +193,8 @@ class Constraints:
         `components` by chunk id: what lies in two connected components cannot be one instance yet. Of several groups
         that come together the last one of which anything is known tells.
         """
+        from scipy.cluster.hierarchy import DisjointSet
+
         home = {key: n for n, group in enumerate(groups) for key in group}
         sets = DisjointSet(range(len(groups)))
         for together in self.links.sets():

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.transform import Rotation
 
 from list3r.memory.errors import DegenerateError
 
@@ -32,26 +30,40 @@ def skew(v: Array) -> Array:
 
 def rotation_exp(rotvec: Array) -> Array:
     """Return rotation matrices of rotation vectors in radians. Shape (..., 3) -> (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     flat = Rotation.from_rotvec(np.reshape(rotvec, (-1, 3))).as_matrix()
     return np.asarray(flat.reshape(*rotvec.shape[:-1], 3, 3))
 
 
 def rotation_log(rotation: Array) -> Array:
     """Return rotation vectors in radians of rotation matrices. Shape (..., 3, 3) -> (..., 3)."""
+    from scipy.spatial.transform import Rotation
+
     flat = Rotation.from_matrix(np.reshape(rotation, (-1, 3, 3))).as_rotvec()
     return np.asarray(flat.reshape(*rotation.shape[:-2], 3))
 
 
 def quat_wxyz_from_rotation(rotation: Array) -> Array:
     """Return unit quaternions, w >= 0. Shape (..., 3, 3) -> (..., 4)."""
+    from scipy.spatial.transform import Rotation
+
     xyzw = Rotation.from_matrix(np.reshape(rotation, (-1, 3, 3))).as_quat(canonical=True)
     return np.asarray(np.roll(xyzw, 1, axis=-1).reshape(*rotation.shape[:-2], 4))
 
 
 def rotation_from_quat_wxyz(quat_wxyz: Array) -> Array:
     """Return rotation matrices of quaternions (normalised here). Shape (..., 4) -> (..., 3, 3)."""
-    xyzw = np.roll(np.reshape(quat_wxyz, (-1, 4)), -1, axis=-1)
-    return np.asarray(Rotation.from_quat(xyzw).as_matrix().reshape(*quat_wxyz.shape[:-1], 3, 3))
+    norm = np.linalg.norm(quat_wxyz, axis=-1, keepdims=True)
+    if not (norm > 0).all():
+        raise ValueError("a quaternion of zero norm is no rotation")
+    w, x, y, z = np.moveaxis(np.asarray(quat_wxyz / norm, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _left_integral(omega: Array, sigma: Array) -> Array:
@@ -198,6 +210,8 @@ def upright_box(points: ArrayLike, trim: float = 0.0) -> OrientedBox:
 
 def _least_footprint_angle(xy: Array) -> float:
     """Return the direction of one side of the least-area rectangle round points in the plane, radians in [0, pi/2)."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         hull = xy[ConvexHull(xy).vertices]
     except (QhullError, ValueError):

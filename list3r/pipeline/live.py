@@ -124,6 +124,8 @@ def build_live(
     """
     started, run, watch, memory = time.monotonic(), run or RunOptions(), watch or Watch(), Path(memory)
     options, how = options or SourceOptions(), live or LiveSettings()
+    if options.more:
+        raise OptionError("a live source is one; several files together are of recordings")
     if run.resume:
         raise OptionError("a live source does not come again; --resume is of files, `update` adds a later session")
     if not run.force and memory.is_file() and memory.stat().st_size:
@@ -255,6 +257,7 @@ def _report(ours: LiveSession, state: FeedState, started: float) -> BuildReport:
     waiting = max(0, state.count - ours.stop)
     live = LiveReport(
         received=state.received,
+        thinned=state.thinned,
         dropped=state.dropped,
         waiting=waiting,
         reconnects=state.reconnects,

@@ -19,6 +19,8 @@ class LiveReport:
 
     received: int
     """Pictures that came."""
+    thinned: int
+    """Pictures left out by `--fps`."""
     dropped: int
     """Pictures that came while too many waited."""
     waiting: int

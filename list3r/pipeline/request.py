@@ -79,7 +79,7 @@ class BuildRequest:
     )
     poses: str = field(
         default="auto",
-        metadata=option("estimate, given, prior (given, but corrected) or auto (given where the source has them)."),
+        metadata=option("estimate, given, prior (given, but corrected) or auto (given; prior of phones with depth)."),
     )
     chunk: int | None = field(
         default=None, metadata=option("Frames in a chunk; default: 100, or what the GPU holds of a network.", "N")

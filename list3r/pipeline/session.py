@@ -13,9 +13,10 @@ from list3r.frames.base import SourceInfo
 from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.chunking.pace import depth_step
+from list3r.frames.pose_agreement import wrong_convention
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.records import ChunkResult
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
@@ -102,6 +103,8 @@ def prepare(
             check_beside(chosen, first)
     chosen = resolve_settings(chosen, info)
     check_buildable(info, chosen)
+    if chosen.poses != "estimate":
+        check_convention(source, options)
     return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes))
 
 
@@ -242,10 +245,11 @@ def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]
 def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings:
     """Settings with `auto` replaced by what the source offers."""
     poses, reconstruction = settings.poses, settings.reconstruction
-    if poses == "auto":
-        poses = "given" if info.has_poses else "estimate"
     if reconstruction == "auto":
         reconstruction = usual_model(info.has_depth)
+    if poses == "auto":
+        drift = info.poses_drift and info.poses_metric and entry(reconstruction).follows_prior
+        poses = ("prior" if drift else "given") if info.has_poses else "estimate"
     up = "source" if info.z_up and poses != "estimate" else "planes"
     return replace(settings, poses=poses, reconstruction=reconstruction, up=up)
 
@@ -279,6 +283,16 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         from list3r.models.pretrained import pick_device
 
         pick_device(settings.device)
+
+
+def check_convention(source: str | Path, options: SourceOptions) -> None:
+    """Raise `SourceError` where given poses fit the depth only in another convention than they are read in."""
+    found = wrong_convention(open_source(source, options))
+    if found is not None:
+        raise SourceError(
+            f"the poses of {source} do not fit its depth as they are read, but would {found}: whoever wrote them meant "
+            "another convention; write them anew, or use --poses estimate"
+        )
 
 
 def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:

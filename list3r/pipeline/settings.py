@@ -64,7 +64,8 @@ class BuildSettings:
     reconstruction: str = "auto"
     """The reconstruction model; auto: rgbd where the source has depth, else sfm."""
     poses: str = "estimate"
-    """given, prior (given, but corrected), estimate, or auto: given where the source has them."""
+    """given, prior (given, but corrected), estimate, or auto: given where the source has them,
+    prior where they drift (phones) and the model can correct them."""
     up: str = "planes"
     """Who says which way is up: planes (level surfaces), or source (given poses of a recorder that knows gravity)."""
     device: str = "auto"

@@ -135,7 +135,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
     out = []
     for n, i in search.things.items():
         if (i.structure is None or structure) and _bears(search, n, phrase.words):
-            score = float(np.mean([search.vocabulary[n][w] for w in phrase.words])) if phrase.words else 1.0
+            score = sum(search.vocabulary[n][w] for w in phrase.words) / len(phrase.words) if phrase.words else 1.0
             reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
             out.append(PhraseMatch(i, score, reasons))
     if not out and len(phrase.words) > 1:
@@ -191,7 +191,7 @@ def _sized(search: PhraseSearch, found: list[PhraseMatch], phrase: Phrase) -> li
     four."""
     size = phrase.size
     assert size is not None
-    edges = np.array([]) if search.gathered is None else search.gathered.sizes_of(search.store, phrase.words)
+    edges = np.array([]) if search.gathered is None else search.gathered.sizes_of(phrase.words)
     if len(edges) == 0:
         among = [c.instance for c in found]
         if len(among) < 4:

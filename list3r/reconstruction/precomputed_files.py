@@ -17,8 +17,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from list3r.frames.files import check_ordinary
+from list3r.frames.files import check_ordinary, read_file
 from list3r.memory.errors import OptionError
+from list3r.memory.unpacking import open_archive, parse_json
 
 MANIFEST = "precomputed.json"
 FORMAT = "list3r-precomputed"
@@ -81,7 +82,7 @@ def read_manifest(folder: Path) -> Manifest:
     if path.stat().st_size > _MAX_MANIFEST:
         raise OptionError(f"{path} is {path.stat().st_size} bytes long and no manifest")
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
+        said = parse_json(read_file(path, _MAX_MANIFEST))
     except (ValueError, RecursionError) as error:
         raise OptionError(f"{path} is no JSON ({str(error).splitlines()[0][:120]}); see docs/precomputed.md") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("version") != VERSION:
@@ -121,12 +122,12 @@ def write_piece(path: Path, piece: Piece) -> None:
 
 def read_frames(path: Path) -> NDArray[np.int64]:
     """Return the frame numbers of a file, without its large arrays. Raises `OptionError`."""
-    return _checked_frames(_arrays(path, ("frames",))["frames"], path)
+    return _checked_frames(read_arrays(path, ("frames",))["frames"], path)
 
 
 def read_piece(path: Path) -> Piece:
     """One file. Raises `OptionError`, naming the array that is wrong."""
-    found = _arrays(path, (*_NEEDED, *_OPTIONAL))
+    found = read_arrays(path, (*_NEEDED, *_OPTIONAL))
     missing = sorted(_NEEDED.keys() - found.keys())
     if missing:
         raise OptionError(f"{path} has no array {', '.join(missing)}; see docs/precomputed.md")
@@ -166,11 +167,11 @@ def _checked_frames(frames: NDArray[Any], path: Path) -> NDArray[np.int64]:
     return frames.astype(np.int64)
 
 
-def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return the named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
     try:
         check_ordinary(path.stat(), path, MAX_BYTES)
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             entries = {e.filename.removesuffix(".npy"): e for e in archive.infolist()}
             claimed = sum(e.file_size for e in entries.values())
             if claimed > min(MAX_BYTES, _FREE_BYTES + _MOST_RATIO * path.stat().st_size):

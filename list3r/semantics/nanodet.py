@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.description.coco import COCO_80
 from list3r.memory.errors import OptionError
 from list3r.semantics.detector import Detections
@@ -127,7 +128,7 @@ class NanoDet:
 def read_class_names(path: Path) -> tuple[str, ...]:
     """One class name a line, in the order of the network's outputs. Raises `OptionError`."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_file(path, MAX_TEXT_BYTES).decode("utf-8").splitlines()
     except OSError as error:
         raise OptionError(f"--detector-classes {path} cannot be read ({error.strerror or error})") from None
     except UnicodeDecodeError:
@@ -172,7 +173,7 @@ def _trained_side(param: Path) -> int:
 def _strides(param: Path) -> list[int]:
     """Strides of the grids that the network's description names. Raises `OptionError`."""
     try:
-        text = param.read_text(encoding="utf-8")
+        text = read_file(param, MAX_TEXT_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError):
         raise OptionError(f"--detector {param}: a .param file of ncnn is needed, with its .bin beside it") from None
     found = sorted({int(m[1]) for word in text.split() if (m := _GRID.match(word))})

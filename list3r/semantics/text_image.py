@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import OptionError
+from list3r.memory.unpacking import parse_json
 from list3r.models.images import HALF, InputShape, network_input
 from list3r.models.pretrained import load_pretrained, pick_device, space_name
 
@@ -85,10 +87,8 @@ class TextImageModel:
 
 def model_type(folder: Path) -> str:
     """The kind of network that a folder holds. Raises `OptionError` for one that no vectors of words can be had of."""
-    import json
-
     try:
-        kind = str(json.loads((folder / "config.json").read_text())["model_type"])
+        kind = str(parse_json(read_file(folder / "config.json", MAX_TEXT_BYTES))["model_type"])
     except (OSError, ValueError, KeyError, TypeError):
         raise OptionError(f"{folder} has no config.json that says what network it holds") from None
     if kind not in CLASSES:

@@ -1,7 +1,7 @@
 """The relation of two neighbouring chunks by poses that are given but imperfect, with their drift as its weight.
 
 A chunk that was reconstructed with such poses lies in the source's own world by its frames after the last jump. The
-next chunk lies there too, by frames of its own; up to its first jump both speak of one world.
+next chunk speaks of that world by the frames between the same two jumps.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class PriorEdgeSettings:
     tilt_deg: float = 0.3
     """and of pitch and roll, which gravity holds."""
     least_frames: int = 6
-    """Frames of a chunk before its first jump that place it."""
+    """Frames of the next chunk, between two jumps, that place it."""
     steps: PriorSettings = field(default_factory=PriorSettings)
 
 
@@ -47,9 +47,10 @@ def prior_edge(
     T_chunk_cam = np.where(result.posed[:, None, None], result.T_chunk_cam, np.nan)
     runs = steady_runs(T_chunk_cam, result.T_source_cam, settings.steps)
     there = [f for f in frames_u if f.state == "posed"]
-    if not runs or len(runs[0]) < settings.least_frames or not there:
+    shared = [run for run in runs if result.frame_indices[run[0]] <= u.last_frame]
+    head = (shared[-1:] or runs[:1] or [np.zeros(0, np.int64)])[0]
+    if len(head) < settings.least_frames or not there:
         return None
-    head = runs[0]
     T_source_v = mean_alignment(result.T_chunk_cam[head], result.T_source_cam[head])
     center = np.mean([f.T_chunk_cam[:3, 3] for f in there], axis=0)
     steps = np.linalg.norm(np.diff(result.T_source_cam[head][:, :3, 3], axis=0), axis=1)

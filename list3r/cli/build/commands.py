@@ -28,6 +28,7 @@ def register(app: typer.Typer) -> None:
 @spread
 def inspect(
     source: src.SourceArgument,
+    more: src.MoreArgument = None,
     *,
     words: src.SourceWords,
     calibrate: Annotated[
@@ -46,7 +47,7 @@ def inspect(
     from list3r.frames.inspection import describe, draw_registration, lines
     from list3r.frames.source import open_source
 
-    options = words.options()
+    options = words.options(more)
     if overlay is not None:
         _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
@@ -81,8 +82,9 @@ def _check_overlay(overlay: Path, source: Path) -> None:
 @spread
 def build(
     source: src.SourceArgument,
-    memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
+    more: src.MoreArgument = None,
     *,
+    memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
     request: BuildRequest,
     words: src.SourceWords,
     run: RunOptions,
@@ -95,7 +97,7 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    options = words.options()
+    options = words.options(more)
     from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:

@@ -24,7 +24,12 @@ def convert(
     source: src.SourceArgument,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write; it must not exist.")],
     *,
-    to: Annotated[str, typer.Option("--to", metavar="LAYOUT", help="tum, transforms, colmap, replica or r3d.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="LAYOUT", help="tum, transforms, colmap, replica, r3d; of predictions: precomputed."
+        ),
+    ],
     words: src.SourceWords,
     json: JsonOption = False,
 ) -> None:
@@ -32,6 +37,9 @@ def convert(
 
     Example: list3r convert walk.r3d walk-tum --to tum
     """
+    if to == "precomputed":
+        _convert_predictions(Path(source), folder, words.every, json)
+        return
     from list3r.frames.convert import convert as write
 
     report = write(source, to, folder, words.options())
@@ -42,6 +50,17 @@ def convert(
     if report.bad:
         say(f"note: {report.bad} frames could not be decoded")
     say(*(f"note: {line}" for line in report.notes))
+
+
+def _convert_predictions(source: Path, folder: Path, every: int, json: bool) -> None:
+    """Bring what VGGT or DA3 saved to the layout that `--reconstruction precomputed` reads."""
+    from list3r.reconstruction.predictions import convert_predictions
+
+    frames = convert_predictions(source, folder, every)
+    if json:
+        print_answer([{"layout": "precomputed", "path": str(folder), "frames": frames}])
+    else:
+        say(f"{folder}  {frames} frames; build with --reconstruction precomputed --weights {folder}")
 
 
 def import_map(

@@ -18,6 +18,10 @@ SourceArgument = Annotated[
         show_default=False,
     ),
 ]
+MoreArgument = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="MORE", help="Further video files of the same recording, in order.", show_default=False),
+]
 Kind = Annotated[str, typer.Option("--kind", help="What the source is: auto, or one of docs/sources.md.")]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Take every N-th frame.")]
 Frames = Annotated[
@@ -97,8 +101,8 @@ class SourceWords:
     sharpest: Sharpest = None
     max_side: MaxSide = None
 
-    def options(self) -> SourceOptions:
-        """What they mean. Raises `OptionError` naming the option."""
+    def options(self, more: list[str] | None = None) -> SourceOptions:
+        """What they mean, with further files of the recording. Raises `OptionError` naming the option."""
         from list3r.frames import options as words
 
         first, stop = words.parse_range(self.frames) if self.frames else (None, None)
@@ -120,4 +124,5 @@ class SourceWords:
             end_s=self.end,
             sharpest=self.sharpest,
             max_side=self.max_side,
+            more=tuple(more) if more else None,
         )

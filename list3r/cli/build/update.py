@@ -32,6 +32,7 @@ def register(app: typer.Typer) -> None:
 def update(
     memory: MemoryArgument,
     source: src.SourceArgument,
+    more: src.MoreArgument = None,
     *,
     request: BuildRequest,
     words: src.SourceWords,
@@ -42,7 +43,7 @@ def update(
 
     Example: list3r update house.l3r walk-2/
     """
-    options = words.options()
+    options = words.options(more)
     from list3r.pipeline.update import update as update_memory
 
     def interrupted(begun: bool) -> str:

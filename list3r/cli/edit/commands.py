@@ -156,9 +156,9 @@ def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool
     from list3r.api import open as open_scene
 
     with open_scene(path, writable=True) as scene:
-        report = verb(scene)
+        report, units = verb(scene), scene.units
     if json:
-        print_answer([report.as_dict()], scene.units)
+        print_answer([report.as_dict()], units)
         return
     say(f"{report.text} (entry {report.entry})")
     told = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]

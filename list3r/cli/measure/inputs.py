@@ -248,9 +248,9 @@ def align_by_path(truth: Path, estimate: Path, scale: str) -> Sim3:
 def mask_frames(store: Store, ids_folder: Path, every: int) -> Iterator[tuple[Any, list[tuple[int, Any]]]]:
     """True ids and the memory's masks of every n-th picture of `ids/`, which are in the order of Frame.index."""
     import numpy as np
-    from PIL import Image
 
-    from list3r.memory.errors import SourceError
+    from list3r.frames.decoding.decode import read_raw_depth
+    from list3r.memory.errors import FrameError, SourceError
     from list3r.memory.masks import decode_mask
 
     tracks = [
@@ -265,8 +265,8 @@ def mask_frames(store: Store, ids_folder: Path, every: int) -> Iterator[tuple[An
         raise SourceError(f"{ids_folder} holds no .png of true ids; a simulated walk writes them with write_ids")
     for index in range(0, len(pictures), every):
         try:
-            labels = np.asarray(Image.open(pictures[index])).astype(np.int64)
-        except OSError as error:
+            labels = read_raw_depth(pictures[index]).astype(np.int64)
+        except FrameError as error:
             raise SourceError(f"{pictures[index]} cannot be read as a picture of ids") from error
         masks = [
             (k, np.logical_or.reduce([decode_mask(m, size) for m, size in codes]))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 models = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="The networks that can be used: licences, weights in the cache, fetching.",
+    help="List the networks that can be used, with their licences and cached weights, and fetch weights.",
 )
 
 

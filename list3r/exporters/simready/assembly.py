@@ -74,6 +74,9 @@ def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[I
     UsdPhysics.Scene.Define(stage, "/World/PhysicsScene").CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
     UsdGeom.Scope.Define(stage, "/World/Looks")
     material = add_vertex_material(stage, Sdf.Path("/World/Looks/seen"))
+    for group, members in (("Props", props), ("Structure", fixed)):
+        if members:
+            Usd.ModelAPI(UsdGeom.Xform.Define(stage, f"/World/{group}").GetPrim()).SetKind("group")
     for prop in props:
         xform = UsdGeom.Xform.Define(stage, f"/World/Props/{prop.name}")
         xform.GetPrim().GetReferences().AddReference(f"./{prop.file}")
@@ -86,9 +89,6 @@ def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[I
         body = add_mesh(stage, xform.GetPath().AppendChild("mesh"), mesh, T_world_prim)
         bind(body.GetPrim(), material)
         add_collider(body, fixed=True)
-    for group in ("Props", "Structure"):
-        if prim := stage.GetPrimAtPath(f"/World/{group}"):
-            Usd.ModelAPI(prim).SetKind("group")
 
 
 def _place(xform: UsdGeom.Xform, T_world_prim: Sim3) -> None:

@@ -164,7 +164,7 @@ def _add_surface(stage: Usd.Stage, path: Sdf.Path, instance: Instance, store: St
     box = instance.box
     T_world_object = Sim3(np.ones(()), box.rotation, box.center) if has_box(instance) else Sim3.identity()
     prim = add_mesh(stage, path.AppendChild("mesh"), mesh, T_world_object)
-    looks = Sdf.Path("/World/Looks/seen")
+    looks = UsdGeom.Scope.Define(stage, "/World/Looks").GetPath().AppendChild("seen")
     material = UsdShade.Material.Get(stage, looks) or add_vertex_material(stage, looks)
     bind(prim.GetPrim(), material)
     points = stage.GetPrimAtPath(path.AppendChild("points"))

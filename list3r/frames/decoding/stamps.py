@@ -14,6 +14,8 @@ from typing import Any
 
 import av
 
+from list3r.frames.decoding.boxes import check_index
+from list3r.frames.files import MAX_PIXELS
 from list3r.frames.folder import DEFAULT_FPS
 from list3r.memory.errors import SourceError
 
@@ -127,7 +129,12 @@ def open_container(path: Path, words: dict[str, str]) -> Any:
 
     Its name is made absolute, because FFmpeg takes what stands before a colon for a protocol.
     """
-    return av.open(str(path.absolute()), options=words)
+    check_index(path)
+    container = av.open(str(path.absolute()), options=words)
+    for stream in container.streams.video:
+        if stream.codec_context is not None:
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    return container
 
 
 def picture_stream(container: Any) -> Any | None:

@@ -38,6 +38,8 @@ class FeedState:
     ended: bool
     """Whether no more will come."""
     received: int = 0
+    thinned: int = 0
+    """Frames that came sooner than is asked for."""
     dropped: int = 0
     """Frames that came while too many were waiting."""
     reconnects: int = 0

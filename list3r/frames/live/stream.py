@@ -130,7 +130,7 @@ class StreamFeed:
             number, waiting = self._state.count, self._state.count - self._taken
             received = self._state.received + 1
             if self._arrived and not self._gap and now - self._arrived[-1] < self._least_gap_s:
-                self._state = replace(self._state, received=received)
+                self._state = replace(self._state, received=received, thinned=self._state.thinned + 1)
                 return
             if waiting >= self._settings.most_waiting:
                 self._gap = True

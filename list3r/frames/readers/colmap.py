@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout, FrameFile, Optics, inside, natural_key
-from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
+from list3r.frames.base import Camera
+from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout, FrameFile, Optics, inside, natural_key, usual_camera
+from list3r.frames.options import SourceOptions, check_distortion, check_intrinsics
 from list3r.memory.errors import OptionError, SourceError
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -34,16 +35,21 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if folder is None:
         raise SourceError(f"{model} poses {len(posed)} pictures, none of which lies in {root / 'images'}")
     names = sorted({*posed, *_pictures(folder)}, key=natural_key)
-    files = tuple(FrameFile(inside(folder, n, model), T_source_camera=_pose(posed.get(n))) for n in names)
-    cameras = {posed[name].camera_id for name in posed}
-    camera = found.cameras[posed[next(iter(sorted(posed, key=natural_key)))].camera_id]
-    intrinsics, distortion = _camera(camera, model)
+    cameras = {posed[name].camera_id for name in sorted(posed, key=natural_key)}
+    lenses = {k: _lens(found.cameras[k], model) for k in sorted(cameras)}
+    shared = usual_camera(list(lenses.values()))
+    own = {n: lenses[posed[n].camera_id] for n in posed} if len(lenses) > 1 and options.intrinsics is None else {}
+    files = tuple(
+        FrameFile(inside(folder, n, model), T_source_camera=_pose(posed.get(n)), lens=own.get(n)) for n in names
+    )
+    intrinsics = (shared.fx, shared.fy, shared.cx, shared.cy)
     notes = [
         f"camera and poses of {model.relative_to(root) if model != root else model.name}, lengths as the model has"
     ]
     if len(cameras) > 1:
-        notes.append(f"the model has {len(cameras)} cameras; the first serves all pictures")
-    optics = Optics(options.intrinsics or intrinsics, distortion, intrinsics_size=(camera.height, camera.width))
+        notes.append(f"the model has {len(cameras)} cameras; every picture is carried to their median")
+    size = (shared.height, shared.width)
+    optics = Optics(intrinsics, shared.distortion, intrinsics_size=size, fisheye=shared.fisheye)
     if options.intrinsics is not None:
         optics = Optics(options.intrinsics, options.distortion or ())
     return FolderLayout(
@@ -68,9 +74,9 @@ def _pose(image: Any) -> Any:
     return T
 
 
-def _camera(camera: Any, model: Path) -> tuple[Intrinsics, tuple[float, ...]]:
-    """fx, fy, cx, cy for pixel centres at whole numbers, and OpenCV's lens. Raises `SourceError` for a fisheye."""
-    lens = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}
+def _lens(camera: Any, model: Path) -> Camera:
+    """The camera with OpenCV's lens, for pixel centres at whole numbers. Raises `SourceError`."""
+    lens = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4}
     name = camera.model.name
     if name not in lens:
         raise SourceError(f"{model} has a {name} camera; undistort its pictures first (colmap image_undistorter)")
@@ -78,6 +84,7 @@ def _camera(camera: Any, model: Path) -> tuple[Intrinsics, tuple[float, ...]]:
         centre = (camera.principal_point_x - 0.5, camera.principal_point_y - 0.5)
         intrinsics = check_intrinsics([camera.focal_length_x, camera.focal_length_y, *centre])
         values = [float(v) for v in camera.params[len(camera.params) - lens[name] :]] if lens[name] else []
-        return intrinsics, check_distortion(values) if values else ()
+        distortion = check_distortion(values) if values else ()
     except OptionError as error:
         raise SourceError(f"{model}: {error}") from None
+    return Camera(int(camera.width), int(camera.height), *intrinsics, distortion, name == "OPENCV_FISHEYE")

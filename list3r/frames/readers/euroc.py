@@ -12,7 +12,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, pose_matrix, read_numbers, read_text
+from list3r.frames.layout import (
+    FolderLayout,
+    FrameFile,
+    Optics,
+    inside,
+    pose_matrix,
+    read_lines,
+    read_numbers,
+    read_text,
+)
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.readers.tum import poses_at
 from list3r.memory.errors import OptionError, SourceError
@@ -27,7 +36,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if base is None:
         return None
     listing = base / "cam0" / "data.csv"
-    rows = [line.split(",") for line in read_text(listing).splitlines() if line.strip() and not line.startswith("#")]
+    rows = [line.split(",") for line in read_lines(listing) if line.strip() and not line.startswith("#")]
     try:
         named = sorted((int(row[0]), row[1].strip()) for row in rows)
     except (ValueError, IndexError):

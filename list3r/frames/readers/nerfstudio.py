@@ -7,17 +7,22 @@ up, pixel centres lie at whole numbers, depth is in millimetres unless `depth_un
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from list3r.frames.base import Camera
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, natural_key, pose_matrix, read_json
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
 from list3r.memory.errors import OptionError, SourceError
 
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "")
+_FISHEYE = "OPENCV_FISHEYE"
+_LENS = {False: ("k1", "k2", "p1", "p2", "k3"), True: ("k1", "k2", "k3", "k4")}
+"""Names of the lens's numbers, of a pinhole camera and of a fisheye."""
 _VARIES = 0.01
 """Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
 
@@ -33,16 +38,21 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         raise SourceError(f"{path} names no frames; is it nerfstudio's?")
     rows = sorted((_row(path, number, frame) for number, frame in enumerate(frames)), key=_order)
     model = str(rows[0].get("camera_model", content.get("camera_model", ""))).upper()
-    if model not in _PINHOLE:
+    if model not in (*_PINHOLE, _FISHEYE):
         raise SourceError(f"{path} states a {model} camera; undistort the pictures first, for instance with COLMAP")
     files = tuple(_file(root, path, row) for row in rows)
-    intrinsics, distortion, size, spread = _camera(path, content, rows, options)
+    fisheye = model == _FISHEYE and options.distortion is None
+    intrinsics, distortion, size, spread = _camera(path, content, rows, options, _LENS[fisheye])
     notes = ["poses and cameras of transforms.json"]
     if spread > _VARIES:
-        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: their median serves all of them")
+        carried = options.intrinsics is None and not any(f.depth for f in files)
+        what = "every picture is carried to their median" if carried else "their median serves all of them"
+        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: {what}")
+        if carried:
+            files, distortion, fisheye = _with_lenses(files, content, rows, fisheye), (), False
     units = _units_per_metre(path, content)
-    optics = Optics(intrinsics, distortion, depth_scale=units, intrinsics_size=size)
-    if intrinsics is not None and not distortion:  # depth of another size has the same camera
+    optics = Optics(intrinsics, distortion, depth_scale=units, intrinsics_size=size, fisheye=fisheye)
+    if intrinsics is not None and not distortion and not fisheye:  # depth of another size has the same camera
         optics = Optics(intrinsics, (), intrinsics, np.eye(4), units, size, size)
     return FolderLayout(
         "nerfstudio",
@@ -102,10 +112,14 @@ def _numbers(matrix: object) -> list[float]:
 
 
 def _camera(
-    path: Path, content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], options: SourceOptions
+    path: Path,
+    content: Mapping[str, Any],
+    rows: Sequence[Mapping[str, Any]],
+    options: SourceOptions,
+    names: Sequence[str],
 ) -> tuple[Intrinsics | None, tuple[float, ...], tuple[int, int] | None, float]:
     """The camera, for which (height, width) it is stated, and by what share focal lengths of frames differ."""
-    known = [v for v in (_stated({**content, **row}) for row in rows) if v is not None]
+    known = [v for v in (_stated({**content, **row}, names) for row in rows) if v is not None]
     if options.intrinsics is not None or not known:
         return options.intrinsics, options.distortion or (), None, 0.0
     fx, fy, cx, cy, width, height, *lens = np.median(np.array(known), axis=0).tolist()
@@ -117,14 +131,29 @@ def _camera(
     return intrinsics, distortion, size, float(np.ptp([v[0] for v in known]) / fx)
 
 
-def _stated(values: Mapping[str, Any]) -> tuple[float, ...] | None:
-    """fx, fy, cx, cy, width, height, k1, k2, p1, p2, k3 of a frame, None where its focal length is not stated."""
+def _with_lenses(
+    files: tuple[FrameFile, ...], content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], fisheye: bool
+) -> tuple[FrameFile, ...]:
+    """The files, each with the camera that its frame states for pictures of a size."""
+    out = []
+    for file, row in zip(files, rows, strict=True):
+        stated = _stated({**content, **row}, _LENS[fisheye])
+        if stated is not None and min(stated[4:6]) >= 1:
+            width, height = round(stated[4]), round(stated[5])
+            fx, fy, cx, cy = stated[:4]
+            file = replace(file, lens=Camera(width, height, fx, fy, cx, cy, tuple(stated[6:]), fisheye))
+        out.append(file)
+    return tuple(out)
+
+
+def _stated(values: Mapping[str, Any], names: Sequence[str]) -> tuple[float, ...] | None:
+    """fx, fy, cx, cy, width, height and the lens of a frame, None where its focal length is not stated."""
     try:
         width, height = float(values.get("w", 0)), float(values.get("h", 0))
         fx = float(values["fl_x"]) if "fl_x" in values else 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", (width - 1) / 2)), float(values.get("cy", (height - 1) / 2))
-        lens = [float(values.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
+        lens = [float(values.get(name, 0.0)) for name in names]
     except (KeyError, TypeError, ValueError):
         return None
     return (fx, fy, cx, cy, width, height, *lens)

@@ -62,6 +62,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         tuple(notes),
         least_confidence=LEAST_CONFIDENCE,
         z_up=True,
+        poses_drift=not optimised,
         upright_tags=False,
     )
 

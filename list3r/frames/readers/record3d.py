@@ -7,7 +7,6 @@ NaN where unknown; `rgbd/N.conf` is 0, 1 or 2. Recordings of the front camera ha
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import zipfile
@@ -18,16 +17,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.files import MAX_TEXT_BYTES
 from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_json
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
 from list3r.frames.recordings.stored import CodedArray, Stored, ZipMember
 from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.unpacking import open_archive, parse_json
 
 LEAST_CONFIDENCE = 2
 """Only what the sensor is most sure of (stored 0, 1, 2); lesser depth lies along edges."""
 _PICTURE = re.compile(r"rgbd/(\d{1,9})\.jpg")
-_MOST_METADATA = 256 * 2**20
+_MOST_METADATA = MAX_TEXT_BYTES
+_MOST_DEPTH_PIXELS = 2**19
+"""Of one depth image; phones have up to 640x480."""
 _VARIES = 0.01
 """Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
 
@@ -43,17 +46,17 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
 def find_file(path: Path, options: SourceOptions) -> FolderLayout:
     """The frames of an `.r3d` file; they stay in it. Raises `SourceError` for a file that is none."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             members = set(archive.namelist())
             if "metadata" not in members:
                 raise SourceError(f"{path} holds no `metadata`; export it from Record3D as .r3d")
             if archive.getinfo("metadata").file_size > _MOST_METADATA:
                 raise SourceError(f"{path}: its metadata unpacks to more than {_MOST_METADATA} bytes")
-            content = json.loads(archive.read("metadata"))
+            content = parse_json(archive.read("metadata"))
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise SourceError(f"{path} is no whole zip file ({error}); was the upload finished?") from None
-    except ValueError:
-        raise SourceError(f"{path}: its metadata is not JSON; export it from Record3D again") from None
+    except ValueError as error:
+        raise SourceError(f"{path}: its metadata is not JSON ({error}); export it from Record3D again") from None
     return _layout(path, content, members, lambda name: ZipMember(path, name), options)
 
 
@@ -100,6 +103,7 @@ def _layout(
         tuple(notes),
         least_confidence=LEAST_CONFIDENCE,
         z_up=True,
+        poses_drift=True,
         upright_tags=False,
     )
 
@@ -113,7 +117,7 @@ def _cameras(where: Path, content: Mapping[str, Any]) -> tuple[int, int, tuple[i
         intrinsics = check_intrinsics([k[0], k[4], k[6], k[7]])  # column by column
     except (KeyError, TypeError, ValueError, IndexError, OptionError):
         raise SourceError(f"{where}: its metadata states no camera K with w and h; export it again") from None
-    if width < 1 or height < 1 or (depth is not None and not 0 < depth[0] * depth[1] <= 2**24):
+    if width < 1 or height < 1 or (depth is not None and not 0 < depth[0] * depth[1] <= _MOST_DEPTH_PIXELS):
         raise SourceError(f"{where}: its metadata states pictures of {width}x{height} and depth of {depth}")
     return width, height, depth, intrinsics
 

@@ -20,6 +20,7 @@ from list3r.frames.folder import fingerprint
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
+from list3r.frames.recordings.bag_chunks import bound_rosbags
 from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
 from list3r.frames.recordings.ros_transforms import TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
@@ -199,6 +200,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise OptionError(f"{path} is a ROS recording, which takes: pip install 'list3r[ros]'") from None
+    bound_rosbags()
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         with AnyReader([path], default_typestore=known) as reader:

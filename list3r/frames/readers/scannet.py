@@ -26,6 +26,8 @@ _SIZES = struct.Struct("<iiIIIIfQ")
 _FRAME = struct.Struct("<16fQQQQ")
 _JPEG, _ZLIB = 2, 1
 _LONGEST_NAME = 4096
+_MOST_FRAMES = 2**18
+"""Of one file: two hours."""
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:
@@ -73,20 +75,20 @@ def _frames(file: BinaryIO, path: Path, count: int, size: tuple[int, int]) -> tu
     """The frames that the file holds, and whether these are all."""
     end = path.stat().st_size
     files: list[FrameFile] = []
-    while len(files) < count:
+    while len(files) < min(count, _MOST_FRAMES):
         head = file.read(_FRAME.size)
         if len(head) < _FRAME.size:
             return files, False
         *pose, color_us, _, color_bytes, depth_bytes = _FRAME.unpack(head)
         start, number = file.tell(), len(files)
-        if start + color_bytes + depth_bytes > end:
+        if not color_bytes or start + color_bytes + depth_bytes > end:
             return files, False
         color = FileSlice(path, start, color_bytes, f"frame-{number:06d}.jpg")
         depth = FileSlice(path, start + color_bytes, depth_bytes, f"frame-{number:06d}.depth")
         packed = CodedArray(depth, "zlib", "<u2", size)
         files.append(FrameFile(color, packed, T_source_camera=pose_matrix(pose), time_s=1e-6 * color_us or None))
         file.seek(color_bytes + depth_bytes, 1)
-    return files, True
+    return files, len(files) == count
 
 
 def _exactly(file: BinaryIO, count: int, path: Path) -> bytes:

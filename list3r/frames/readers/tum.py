@@ -20,8 +20,8 @@ from list3r.frames.layout import (
     FrameFile,
     Optics,
     read_calibration,
+    read_lines,
     read_numbers,
-    read_text,
 )
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
 from list3r.memory.errors import SourceError
@@ -117,7 +117,7 @@ def _nearest(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.int64
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[str]]:
     """Times and file names of a list `timestamp filename`, ascending in time."""
     rows: list[tuple[float, str]] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         text = line.strip()
         if not text or text.startswith("#"):
             continue

@@ -69,6 +69,11 @@ class VideoSource:
         """(height, width) of the pictures as stored, upright."""
         return self._rig.stored_size
 
+    @property
+    def stored_count(self) -> int:
+        """Frames of the file, before any is left out."""
+        return len(self._stamps)
+
     def number(self, position: int) -> int:
         """The number of the first frame of a position's window."""
         return int(self._chosen.starts[position])

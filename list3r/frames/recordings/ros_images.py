@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
 from list3r.memory.errors import FrameError, SourceError
 
@@ -75,13 +76,10 @@ def _rows(message: Any, kind: np.dtype[Any], channels: int) -> NDArray[Any]:
 
 
 def _decoded(data: Any, flags: int) -> NDArray[Any]:
-    try:
-        image = cv2.imdecode(np.frombuffer(bytes(data), np.uint8), flags)
-    except cv2.error:
-        image = None
+    image = decode_picture(bytes(data), flags, "a compressed image")
     if image is None:
         raise FrameError("a compressed image cannot be decoded")
-    return np.asarray(image)
+    return image
 
 
 def camera_of(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import FrameError, OptionError
+from list3r.memory.unpacking import open_archive
 
 MOST_BYTES = 256 * 2**20
 """Largest member that is unpacked; a depth image of 30 megapixels is half of it."""
@@ -63,7 +64,7 @@ class ZipMember:
 @lru_cache(maxsize=4)
 def _archive(path: Path) -> zipfile.ZipFile:
     """Return the archive, its list read once in a process."""
-    return zipfile.ZipFile(path)
+    return open_archive(path)
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class CodedArray:
     """Depth or confidence as bare numbers, compressed."""
 
     data: Stored
-    codec: Literal["zlib", "lzfse"]
+    codec: Literal["zlib", "deflate", "lz4", "lzfse"]
     dtype: str
     """Little-endian, as NumPy writes it: "<u2", "<f4", "|u1"."""
     shape: tuple[int, int]
@@ -127,22 +128,47 @@ class CodedArray:
             raise FrameError(
                 f"{self.name} has {len(data)} bytes, more than {self.shape[1]}x{self.shape[0]} numbers take"
             )
-        raw = _inflated(data, count) if self.codec == "zlib" else _lzfse(data)
+        raw = _unpacked(data, count, self.codec)
         if raw is None or len(raw) != count:
             had = "damaged" if raw is None else f"{len(raw)} bytes"
             raise FrameError(f"{self.name} is {had}; {self.shape[1]}x{self.shape[0]} numbers are {count} bytes")
         return np.frombuffer(raw, self.dtype).reshape(self.shape)
 
 
-def _inflated(data: bytes, count: int) -> bytes | None:
+def _unpacked(data: bytes, count: int, codec: str) -> bytes | None:
+    """What is packed, hardly more than what is expected; None where it is damaged."""
+    if codec == "lzfse":
+        return _lzfse(data, count)
+    return _lz4(data, count) if codec == "lz4" else _inflated(data, count, -zlib.MAX_WBITS * (codec == "deflate"))
+
+
+def _lz4(data: bytes, count: int) -> bytes | None:
+    try:
+        from lz4.block import LZ4BlockError, decompress
+    except ImportError:
+        raise OptionError("depth of ScanNet++ is packed with LZ4: pip install 'list3r[scannetpp]'") from None
+    try:
+        return bytes(decompress(data, uncompressed_size=count))
+    except LZ4BlockError:
+        return None
+
+
+def _inflated(data: bytes, count: int, bits: int = 0) -> bytes | None:
     """At most one byte more than what is expected, so that a bomb does no harm; None where it is damaged."""
     try:
-        return zlib.decompressobj().decompress(data, count + 1)
+        return zlib.decompressobj(bits or zlib.MAX_WBITS).decompress(data, count + 1)
     except zlib.error:
         return None
 
 
-def _lzfse(data: bytes) -> bytes | None:
+def _lzfse(data: bytes, count: int) -> bytes | None:
+    """The bytes; None where they are damaged, or come in more blocks than so many bytes do.
+
+    A block begins with 40,000 bytes that are new or 10,000 that repeat, and unpacks to 24 MB at most, whatever it
+    claims: there is no other bound.
+    """
+    if sum(data.count(magic) for magic in (b"bvx1", b"bvx2", b"bvxn", b"bvx-")) > 4 + count // 40_000:
+        return None
     try:
         import lzfse
     except ImportError:

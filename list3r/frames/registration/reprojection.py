@@ -150,14 +150,20 @@ def _refine_axis(depth: NDArray[np.float32], factor: int, jump: float, axis: int
 
 
 class Undistortion:
-    """Takes images of a lens to those of the pinhole camera with the same focal length and centre."""
+    """Takes images of a lens to those of a pinhole camera."""
 
-    def __init__(self, camera: Camera) -> None:
-        size = (camera.width, camera.height)
+    def __init__(self, camera: Camera, target: Camera | None = None) -> None:
+        """Without a `target` the pinhole camera has the focal length and centre of the lens."""
+        pinhole = target or camera.pinhole()
+        size = (pinhole.width, pinhole.height)
         coefficients = np.array(camera.distortion, dtype=np.float64)
-        matrix = camera.matrix()
-        self._maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_16SC2)
-        self.seen = self._remap(np.ones(size[::-1], np.uint8), cv2.INTER_NEAREST) > 0
+        matrix, new = camera.matrix(), pinhole.matrix()
+        if camera.fisheye:
+            angles = np.resize([*coefficients, 0.0, 0.0, 0.0, 0.0], 4)
+            self._maps = cv2.fisheye.initUndistortRectifyMap(matrix, angles, np.eye(3), new, size, cv2.CV_16SC2)
+        else:
+            self._maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), new, size, cv2.CV_16SC2)
+        self.seen = self._remap(np.ones((camera.height, camera.width), np.uint8), cv2.INTER_NEAREST) > 0
         """False where the pinhole image looks beyond the lens's picture. Shape (H, W)."""
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -33,6 +33,8 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
         "depth_scale": options.depth_scale,
     }
     optics = replace(optics, **{name: value for name, value in given.items() if value is not None})
+    if options.distortion is not None:
+        optics = replace(optics, fisheye=False)
     if options.intrinsics is not None:
         optics = replace(optics, intrinsics_size=None)
     if options.depth_intrinsics is not None:
@@ -63,13 +65,27 @@ class Rig:
     undistortion: Undistortion | None
     registration: DepthReprojection | None
 
-    def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistorted colour. Shape (H, W, 3). Raises `FrameError` for another size than the first frame's."""
+    def color(self, image: NDArray[np.uint8], lens: Camera | None = None) -> NDArray[np.uint8]:
+        """Undistorted colour of a picture, which may have a camera of its own. Shape (H, W, 3).
+
+        Raises `FrameError` for another size than the first frame's, or than its own camera states.
+        """
+        if lens is not None and self.camera is not None:
+            return self._carried(image, lens, self.camera)
         if image.shape[:2] != self.stored_size:
             raise FrameError(f"colour is {_size(image.shape)}, most frames {_size(self.stored_size)}")
         if self.color_size != self.stored_size:
             image = np.asarray(cv2.resize(image, self.color_size[::-1], interpolation=cv2.INTER_AREA))
         return self.straight(image)
+
+    def _carried(self, image: NDArray[np.uint8], lens: Camera, camera: Camera) -> NDArray[np.uint8]:
+        """What a camera of its own saw, as the camera of the source would have seen it. Shape (H, W, 3)."""
+        if image.shape[:2] != (lens.height, lens.width):
+            raise FrameError(f"colour is {_size(image.shape)}, its camera is stated for {lens.width}x{lens.height}")
+        if lens.width > camera.width:
+            lens = lens.shrunk_lens(camera.width)
+            image = np.asarray(cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA))
+        return Undistortion(lens, camera).color(image)
 
     def straight(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorted colour of a picture that has the size of the frames handed out. Shape (H, W, 3)."""
@@ -108,10 +124,12 @@ def build_rig(
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
     stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
+    if stated is not None and optics.fisheye:
+        stated = replace(stated, fisheye=True)
     whole = _of_size(stated, stored_size, "the colour pictures")
     lens = None if whole is None else whole.resized(*color_size)
     camera = lens.pinhole() if lens else None
-    undistortion = Undistortion(lens) if lens and lens.distortion else None
+    undistortion = Undistortion(lens) if lens and (lens.distortion or lens.fisheye) else None
     registration = None
     if depth_size is not None:
         if optics.depth_scale is None:
@@ -136,7 +154,7 @@ def _registration(
     said = _camera(optics.depth_intrinsics, optics.depth_intrinsics_size or depth_size, "depth intrinsics", ())
     depth_camera = _of_size(said, depth_size, "the depth images")
     assert depth_camera is not None and optics.T_color_depth is not None
-    same = replace(camera, distortion=()) == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
+    same = camera.pinhole() == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
     return None if same else DepthReprojection(depth_camera, camera, optics.T_color_depth)
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from scipy.cluster.hierarchy import DisjointSet
-
 from list3r.memory.change.records import Changes
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.records import ChunkRow
@@ -74,6 +72,8 @@ class ChangeLedger:
         places as they have become; what it says of instances that are not among the groups stands. `components` by
         chunk id.
         """
+        from scipy.cluster.hierarchy import DisjointSet
+
         home = {key: n for n, group in enumerate(groups) for key in group}
         sets = DisjointSet(range(len(groups)))
         owners: list[tuple[int, MovedInstance]] = []

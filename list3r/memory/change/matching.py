@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from list3r.memory.change.places import Places, difference
 from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
@@ -239,6 +238,8 @@ class ChangeMatching:
 
     def _moves(self, gone: Sequence[tuple[_PlacedInstance, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
         """Return pairs of what is gone and what is new, one to one, of least difference in all."""
+        from scipy.optimize import linear_sum_assignment
+
         if not gone or not fresh:
             return []
         p = self._p

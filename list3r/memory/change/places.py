@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from list3r.memory.change.records import ChangeSettings
 from list3r.memory.geometry import Array, OrientedBox
@@ -142,6 +141,8 @@ class Places:
         """Return the share of the surface that an instance had which is seen through or lies at what is new there, of
         what is told.
         """
+        from scipy.spatial import cKDTree
+
         points = self.points(n, session, before=True)
         free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
         known = free + met > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 VERSION = 1
 """Goes up with every change of what words an instance bears: the index of words in a file is then made anew."""
@@ -50,7 +51,13 @@ def vocabulary(label: str | None, structure: str | None, description: str, color
 
 def split_words(text: str) -> list[str]:
     """Return the words of a text in lower case, plurals as singulars, synonyms as one word."""
-    return [_singular(w) for w in re.findall(r"[^\W_]+", text.lower())]
+    return list(_split(text))
+
+
+@lru_cache(maxsize=4096)
+def _split(text: str) -> tuple[str, ...]:
+    """Descriptions repeat: thousands of instances are a small red box."""
+    return tuple(_singular(w) for w in re.findall(r"[^\W_]+", text.lower()))
 
 
 def _singular(word: str) -> str:

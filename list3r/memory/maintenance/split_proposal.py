@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.spatial.distance import squareform
 
 from list3r.memory.constraints import Key
 from list3r.memory.geometry import Array
@@ -23,6 +21,9 @@ def propose_split(store: Store, keys: Sequence[Key]) -> tuple[Key, ...]:
     """Return the smaller of the two parts, by average linkage over how little two local instances cover each other, how
     far apart they lie for their size, how unlike they look, and whether they were seen side by side.
     """
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial.distance import squareform
+
     distance = _distances(store, keys)
     part = fcluster(linkage(squareform(distance, checks=False), "average"), 2, "maxclust")
     if part.max() < 2:

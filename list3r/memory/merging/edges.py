@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.memory.constraints import ConstraintCheck, Constraints
 from list3r.memory.geometry import Array, Sim3
@@ -219,6 +218,8 @@ class _Clusters:
     """Groups of nodes that grow: members, boxes, and the nodes that must stay out."""
 
     def __init__(self, t: Nodes, enemies: list[set[int]]) -> None:
+        from scipy.cluster.hierarchy import DisjointSet
+
         count = range(len(t.keys))
         self._sets = DisjointSet(count)
         self.members = {n: [n] for n in count}

@@ -13,7 +13,6 @@ from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou
@@ -116,6 +115,8 @@ def join_movers(
     Returns all groups, in order; what is known of those that moved, by their first member; and the decisions. Edges are
     taken best first, ties by key, so the order of groups does not matter.
     """
+    from scipy.cluster.hierarchy import DisjointSet
+
     if not tracks.motions:
         return [list(g) for g in groups], {}, []
     scene = _Scene(placed, tracks, settings or MovingSettings())

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.store.tables.local_instances import LocalNode
@@ -72,6 +71,8 @@ def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
 
 def planar_area(points: Array, normal: Array) -> float:
     """Return the area of the convex hull of points seen along a normal, square units; 0 for fewer than three."""
+    from scipy.spatial import ConvexHull, QhullError
+
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from list3r.memory.geometry import Array
 from list3r.memory.relations.instance_geometry import InstanceGeometry, neighbours_of
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.relations.symmetry import round_axis, turned
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 T = TypeVar("T")
 
@@ -88,6 +90,8 @@ class RelationScene:
 
     def tree(self, n: int) -> cKDTree:
         """Return the KD-tree of an instance's points."""
+        from scipy.spatial import cKDTree
+
         if n not in self._trees:
             self._trees[n] = cKDTree(self.instances[n].points)
         return self._trees[n]
@@ -106,6 +110,8 @@ class RelationScene:
 
     def surface(self, n: int) -> SampledSurface:
         """Return what is known of an instance's surface: its points, and for what is round its hidden sides too."""
+        from scipy.spatial import cKDTree
+
         if n not in self._surfaces:
             points = self.instances[n].points
             axis = self.measure("axis", n, n, _axis) if self._upright and self.in_room[n] else None
@@ -119,6 +125,8 @@ class RelationScene:
 
     def plan(self, n: int) -> Footprint:
         """Return an instance as it is seen from above."""
+        from scipy.spatial import cKDTree
+
         if n not in self._plans:
             points = self.instances[n].points
             sample = points[:: -(-len(points) // _SAMPLE)]
@@ -210,6 +218,8 @@ def contact_of(scene: RelationScene, a: int) -> float:
 
 def spacing_of(points: Array) -> float:
     """Return the typical distance between neighbouring points of a layer."""
+    from scipy.spatial import cKDTree
+
     if len(points) < 3:
         return 0.0
     sample = points[:: max(1, len(points) // 100)]
@@ -220,6 +230,8 @@ def hull_under(point: Array, xy: Array) -> tuple[float, float]:
     """Return how far a point lies outside the convex hull of others in the plane, 0 inside, and the area of the
     hull.
     """
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         hull = ConvexHull(xy)
     except (QhullError, ValueError):

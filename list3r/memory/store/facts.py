@@ -6,7 +6,6 @@ layer keeps of a type of its own is a `Fact` declared beside that type: `store.f
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Generic, Self, TypeVar, overload
@@ -17,6 +16,7 @@ from list3r.memory.records import UpEstimate
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.rows.json_values import plain, typed
+from list3r.memory.unpacking import parse_json
 
 T = TypeVar("T")
 
@@ -77,7 +77,7 @@ class Facts:
         """Return a fact. Raises `MemoryFileError` for damaged text."""
         found = self._connection.rows("SELECT value FROM memory WHERE key = ?", (fact.key,))
         try:
-            value = json.loads(found[0][0]) if found else None
+            value = parse_json(found[0][0]) if found else None
             return fact.default if value is None else typed(fact.kind, value)  # type: ignore[no-any-return]
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             what = f"{self._connection.path}: the value {fact.key} cannot be read ({error})"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import socket
@@ -18,7 +17,7 @@ from list3r.memory.errors import MemoryFileError
 
 _MOST_BYTES = 4096
 """Of a lock file; a longer one is not ours."""
-_OPEN = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+_OPEN = os.O_RDWR | sum(getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"))
 
 
 class WriterLock:
@@ -30,7 +29,9 @@ class WriterLock:
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises `MemoryFileError` naming the holder when another process, or this one, writes the memory."""
+        """Raises `MemoryFileError` naming the holder when another process, or this one, writes the memory; also where
+        the system has no locks that end with their process (Windows): memories are only read there.
+        """
         self._path = lock_path(path)
         descriptor, ours = self._take(path)
         os.ftruncate(descriptor, 0)
@@ -39,6 +40,10 @@ class WriterLock:
 
     def _take(self, memory: Path) -> tuple[int, bool]:
         """The descriptor that holds the lock, and whether its file is ours to remove: one that was empty is not."""
+        try:
+            import fcntl
+        except ImportError:
+            raise MemoryFileError(f"{memory} can only be read on this system; write it on Linux or macOS") from None
         while True:
             descriptor, made = self._opened(memory)
             if descriptor < 0:

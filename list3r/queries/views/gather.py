@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,27 +35,31 @@ _KEPT = 20
 class Gathered:
     """Ids to look at."""
 
+    store: Store
     ids: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     """What was left out."""
     _bearing: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
-    sample: list[int] = field(default_factory=list)
-    """Some of all things, spread evenly."""
 
-    def bearing(self, store: Store, words: tuple[str, ...]) -> list[int]:
+    @cached_property
+    def sample(self) -> list[int]:
+        """Ids of some of all things, spread evenly."""
+        return self.store.ids.sample(_SAMPLE)
+
+    def bearing(self, words: tuple[str, ...]) -> list[int]:
         """Return ids that bear all of some words, the best first."""
         if words not in self._bearing:
-            found = store.words.bearing(words, _MOST_BEARING + 1)
+            found = self.store.words.bearing(words, _MOST_BEARING + 1)
             if len(found) > _MOST_BEARING:
                 self.notes.append(f"more than {_MOST_BEARING} instances match {' '.join(words)}; add words")
             self._bearing[words] = found[:_MOST_BEARING]
         return self._bearing[words]
 
-    def sizes_of(self, store: Store, words: tuple[str, ...]) -> NDArray[np.float64]:
+    def sizes_of(self, words: tuple[str, ...]) -> NDArray[np.float64]:
         """Return longest edges of some of things that bear some words, of any where fewer than four do; ascending."""
-        bearing = self.bearing(store, words) if words else []
+        bearing = self.bearing(words) if words else []
         ids = bearing[:: -(-len(bearing) // _SAMPLE)] if len(bearing) >= 4 else self.sample
-        edges = [float(np.max(i.box.size)) for i in store.instances.of(ids) if i.structure is None]
+        edges = [float(np.max(i.box.size)) for i in self.store.instances.of(ids) if i.structure is None]
         return np.sort(np.array(edges))
 
 
@@ -72,7 +77,7 @@ def gather(store: Store, phrase: Phrase) -> Gathered | None:
     """Collect what to search for a question; None where that is everything."""
     if not is_large(store):
         return None
-    out = Gathered(sample=store.ids.sample(_SAMPLE))
+    out = Gathered(store)
     own = _candidates(store, phrase, out)
     _keep(out, phrase, out.sample if own is None else own)
     return out
@@ -84,7 +89,7 @@ def _candidates(store: Store, phrase: Phrase, out: Gathered) -> list[int] | None
     if phrase.instance_id is not None:
         found = [checked_instance(store, phrase.instance_id).id]
     elif phrase.words:
-        found = out.bearing(store, phrase.words)
+        found = out.bearing(phrase.words)
     for clause in phrase.where:
         objects = _candidates(store, clause.object, out)
         if clause.other is not None:

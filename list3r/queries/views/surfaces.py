@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from list3r.memory.records import Instance
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _MAX_POINTS = 4000
 """More points of one instance are thinned out: that is finer than the surfaces are known."""
@@ -46,6 +49,8 @@ class InstanceSurface:
     @cached_property
     def tree(self) -> cKDTree:
         """KD-tree of the points."""
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.points)
 
     @cached_property

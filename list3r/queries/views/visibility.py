@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
@@ -193,6 +192,8 @@ def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], flo
     """Return the surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie
     apart: of most of them the second neighbour is nearer, so that squares of that width close the surface.
     """
+    from scipy.spatial import cKDTree
+
     points = inside_box(store.surfaces.of(instance.id).points.astype(np.float64), instance)
     if len(points) < _FEW:
         side = np.linspace(-0.5, 0.5, _FEW)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
 import zlib
 from collections.abc import Mapping
 from functools import lru_cache
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
+from list3r.memory.unpacking import open_archive, parse_json
 
 MAX_BLOB_BYTES = 256 * 2**20
 """No array of one row is larger than this; a blob that claims more is damaged or hostile."""
@@ -45,7 +45,7 @@ def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
     Only numbers and booleans are read, and an array takes no more memory than the bytes that are really there.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(blob)) as archive:
+        with open_archive(io.BytesIO(blob)) as archive:
             entries = archive.infolist()
             if sum(entry.file_size for entry in entries) > MAX_BLOB_BYTES or len(entries) > MAX_ARRAYS:
                 raise MemoryFileError(f"{where} claims more than {MAX_BLOB_BYTES >> 20} MiB; the file is damaged")
@@ -126,6 +126,6 @@ def from_json(text: object, where: str) -> Any:
     try:
         if not isinstance(text, str):
             raise TypeError(f"{type(text).__name__} instead of text")
-        return json.loads(text)
-    except (ValueError, TypeError, RecursionError) as error:
+        return parse_json(text)
+    except (ValueError, TypeError) as error:
         raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error

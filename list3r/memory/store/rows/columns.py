@@ -7,7 +7,6 @@ What older schemas cut otherwise is said by a `Column`: several fields in one co
 
 from __future__ import annotations
 
-import json
 import types
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -24,6 +23,7 @@ from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import Shape
 from list3r.memory.store.rows.codec import pack, pack_sim3, raw_array, to_json, unpack, unpack_sim3
 from list3r.memory.store.rows.json_values import plain, typed
+from list3r.memory.unpacking import parse_json
 
 R = TypeVar("R")
 Value = str | int | float | bytes | None
@@ -181,7 +181,7 @@ def _kind(hint: Any) -> tuple[Encode, Decode]:
         return _numbers(get_args(inner[0])[1], shape)
     if is_dataclass(hint) and all(get_origin(h) is np.ndarray for h in get_type_hints(hint).values()):
         return arrays(hint)  # type: ignore[arg-type]
-    return (lambda v: to_json(plain(v))), (lambda v: typed(hint, json.loads(v)))
+    return (lambda v: to_json(plain(v))), (lambda v: typed(hint, parse_json(v)))
 
 
 def _exactly(kind: Any) -> Decode:

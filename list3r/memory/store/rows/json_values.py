@@ -28,54 +28,54 @@ def plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def typed(hint: Any, value: object) -> Any:
-    """Return what `plain` made of a value of that type. Raises `ValueError` for anything else."""
+def typed(hint: Any, value: object, *, lenient: bool = False) -> Any:
+    """Return what `plain` made of a value of that type; a field that is not there keeps its default.
+
+    Raises `ValueError` for anything else. Where it is `lenient`, fields that a record does not know are left out.
+    """
     origin, inner = get_origin(hint), get_args(hint)
     if hint in (Any, object):
         return value
     if origin in (Union, types.UnionType):
-        return None if value is None else typed(next(h for h in inner if h is not type(None)), value)
-    return _plain(hint, value) if origin is None else _generic(origin, inner, value)
+        one = next(h for h in inner if h is not type(None))
+        return None if value is None and type(None) in inner else typed(one, value, lenient=lenient)
+    return _plain(hint, value, lenient) if origin is None else _generic(origin, inner, value, lenient)
 
 
-def _plain(hint: Any, value: object) -> Any:
+def _plain(hint: Any, value: object, lenient: bool) -> Any:
     if hint is Sim3:
         return Sim3.from_matrix(np.array(value, np.float64).reshape(4, 4))
     if is_dataclass(hint):
-        return _record(hint, _checked(dict, value))
+        return _record(hint, _checked(Mapping, value), lenient)
     return _checked((int, float) if hint is float else hint, value)
 
 
-def _generic(origin: Any, inner: tuple[Any, ...], value: object) -> Any:
+def _generic(origin: Any, inner: tuple[Any, ...], value: object, lenient: bool) -> Any:
     if origin is np.ndarray:
         return np.array(value, get_args(inner[1])[0])
     if origin in (dict, Mapping):
-        return {_key(inner[0], k): typed(inner[1], v) for k, v in _checked(dict, value).items()}
-    if origin is tuple:
-        return _tuple(inner, _checked(list, value))
-    return origin(typed(inner[0], v) for v in _checked(list, value))
+        return {_key(inner[0], k): typed(inner[1], v, lenient=lenient) for k, v in _checked(dict, value).items()}
+    values = _checked((list, tuple), value)
+    if origin is not tuple:
+        return origin(typed(inner[0], v, lenient=lenient) for v in values)
+    each = inner[:1] * len(values) if inner[1:] == (...,) else inner
+    if len(values) != len(each):
+        raise ValueError(f"{len(values)} values instead of {len(each)}")
+    return tuple(typed(h, v, lenient=lenient) for h, v in zip(each, values, strict=True))
 
 
-def _tuple(inner: tuple[Any, ...], values: list[Any]) -> tuple[Any, ...]:
-    if len(inner) == 2 and inner[1] is ...:
-        return tuple(typed(inner[0], v) for v in values)
-    if len(values) != len(inner):
-        raise ValueError(f"{len(values)} values instead of {len(inner)}")
-    return tuple(typed(h, v) for h, v in zip(inner, values, strict=True))
-
-
-def _record(record: Any, values: dict[str, Any]) -> Any:
+def _record(record: Any, values: Mapping[str, Any], lenient: bool) -> Any:
     hints = _hints(record)
     unknown = values.keys() - hints.keys()
-    if unknown:
+    if unknown and not lenient:
         raise ValueError(f"{sorted(unknown)[0]!r} is not known")
-    return record(**{name: typed(hints[name], v) for name, v in values.items()})
+    return record(**{name: typed(hints[name], values[name], lenient=lenient) for name in hints if name in values})
 
 
 @cache
 def _hints(record: Any) -> dict[str, Any]:
     hints = get_type_hints(record)
-    return {f.name: hints[f.name] for f in fields(record)}
+    return {f.name: hints[f.name] for f in fields(record) if f.init}
 
 
 def _key(hint: Any, key: str) -> Any:
@@ -84,5 +84,6 @@ def _key(hint: Any, key: str) -> Any:
 
 def _checked(kind: Any, value: object) -> Any:
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{type(value).__name__} instead of {getattr(kind, '__name__', 'a number')}")
+        names = {(int, float): "number", (list, tuple): "list"}
+        raise ValueError(f"{repr(value)[:40]} is no {names.get(kind) or kind.__name__}")
     return value

@@ -6,7 +6,6 @@ rest of the program then takes for granted. The conditions run inside SQLite, on
 
 from __future__ import annotations
 
-import json
 import math
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from list3r.memory.store.checksums import BadRow, summed_tables
+from list3r.memory.unpacking import parse_json
 
 _MOST_TEXT = 4000
 """Characters of a label, description or reason."""
@@ -346,31 +346,31 @@ def _is_text(data: bytes) -> bool:
 
 
 def _is_object(text: str) -> bool:
-    return isinstance(json.loads(text), dict)
+    return isinstance(parse_json(text), dict)
 
 
 def _are_numbers(text: str) -> bool:
-    held = json.loads(text)
+    held = parse_json(text)
     return isinstance(held, dict) and all(v is None or _finite(v) for v in held.values())
 
 
 def _are_pairs(text: str) -> bool:
-    held = json.loads(text)
+    held = parse_json(text)
     return isinstance(held, list) and all(len(p) == 2 and all(type(n) is int and 0 <= n < _ID for n in p) for p in held)
 
 
 def _are_wholes(text: str) -> bool:
-    held = json.loads(text)
+    held = parse_json(text)
     return isinstance(held, list) and all(type(n) is int and 0 <= n < _ID for n in held)
 
 
 def _are_texts(text: str) -> bool:
-    held = json.loads(text)
+    held = parse_json(text)
     return isinstance(held, list) and all(isinstance(t, str) and len(t) <= _MOST_TEXT for t in held)
 
 
 def _are_votes(text: str) -> bool:
-    held = json.loads(text)
+    held = parse_json(text)
     return isinstance(held, dict) and all(len(pair) == 2 and all(map(_finite, pair)) for pair in held.values())
 
 
@@ -432,7 +432,7 @@ def _is_vector(blob: bytes) -> bool:
 
 
 def _is_value(key: str, text: str) -> bool:
-    value = json.loads(text)
+    value = parse_json(text)
     check = _VALUES.get(key)
     return check is None or value is None or bool(check(value))
 

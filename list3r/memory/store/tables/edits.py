@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.rows.columns import Columns, joined, nested
 from list3r.memory.store.rows.json_values import plain
 from list3r.memory.store.rows.table import Table
+from list3r.memory.unpacking import parse_json
 
 EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "undo")
 
@@ -89,7 +89,7 @@ def _pack(kind: str, *values: object) -> tuple[str, str]:
 
 
 def _unpack(kind: str, arguments: str) -> tuple[object, ...]:
-    told = json.loads(arguments)
+    told = parse_json(arguments)
     parts = tuple(_keys(part) for part in told["parts"])
     if kind not in EDIT_KINDS or (kind in ("merge", "split") and len(parts) != 2):
         raise ValueError(f"{kind} of {len(parts)} parts")

@@ -58,11 +58,14 @@ class Ids:
         return int(self._connection.rows("SELECT coalesce(max(id), 0) FROM instances")[0][0])
 
     def sample(self, count: int) -> list[int]:
-        """Return about `count` ids, spread evenly over those given so far, found one by one."""
+        """Return about `count` ids, ascending, spread evenly over those given so far."""
         last = self.largest()
-        query = "SELECT id FROM instances WHERE id >= ? ORDER BY id LIMIT 1"
-        starts = range(0, last + 1, max(1, last // max(count, 1)))
-        return sorted({int(row[0]) for start in starts for row in self._connection.rows(query, (start,))})
+        step = max(1, last // max(count, 1))
+        query = (
+            "WITH RECURSIVE starts(x) AS (SELECT 0 UNION ALL SELECT x + ?1 FROM starts WHERE x + ?1 <= ?2)"
+            " SELECT DISTINCT (SELECT id FROM instances WHERE id >= x ORDER BY id LIMIT 1) FROM starts"
+        )
+        return [int(row[0]) for row in self._connection.rows(query, (step, last)) if row[0] is not None]
 
     def aliases(self) -> dict[int, int]:
         """Return every retired id and the id it was merged into."""

@@ -1,0 +1,199 @@
+"""What every export takes as a memory grows: processor seconds, peak memory, bytes.
+
+python benchmarks/exporters.py --instances 0,1,1000,100000 --json benchmarks/results/exporters.json
+
+The memories are made up: things of 60 points with labels in several scripts, six to a table, in rooms side by side, all
+written through the store's verbs; they have no stored pictures. Each export is the program in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from list3r.exporters.registry import FORMATS
+from list3r.memory.geometry import OrientedBox, Sim3
+from list3r.memory.records import (
+    ChunkResult,
+    FrameSamples,
+    Instance,
+    LocalInstance,
+    LocalLibrary,
+    MaskTrack,
+    Observation,
+    Relation,
+    Support,
+)
+from list3r.memory.store.store import Store
+
+NAMES = ("mug", "Stuhl", "écran", "книга", "椅子", "كوب", "🪴 plant", 'a <b> & "c"')
+POINTS = 60
+IN_CHUNK = 2000
+OPTIONS = {"simready": ("--density", "300")}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--instances", default="0,1,1000,100000")
+    parser.add_argument("--formats", default=",".join(FORMATS))
+    parser.add_argument("--limit", type=float, default=600.0, help="Processor seconds of one export, at most.")
+    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    words = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for count in (int(word) for word in words.instances.split(",")):
+            memory = Path(folder) / f"made-{count}.l3r"
+            write_memory(memory, count)
+            for name in words.formats.split(","):
+                package = FORMATS[name].package
+                if not package or importlib.util.find_spec(package):
+                    rows.append({"instances": count, **measure(memory, name, Path(folder) / "out", words.limit)})
+                    print(rows[-1], flush=True)
+            memory.unlink()
+    if words.json:
+        words.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, Any]:
+    """Export in a process of its own; its processor seconds, peak memory and what it wrote."""
+    folder.mkdir()
+    suffixes = FORMATS[name].suffixes
+    out = folder / f"out{suffixes[0] if suffixes else ''}"
+    command = [sys.executable, "-m", "list3r", "export", str(memory), "--to", name, "--out", str(out)]
+    began = time.monotonic()
+    process = subprocess.Popen([*command, *OPTIONS.get(name, ())], stdout=subprocess.DEVNULL, preexec_fn=_limit(limit))
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    files = [p for p in folder.rglob("*") if p.is_file()]
+    row: dict[str, Any] = {
+        "format": name,
+        "done": process.returncode == 0,
+        "cpu_s": round(used.ru_utime + used.ru_stime, 2),
+        "wall_s": round(time.monotonic() - began, 1),
+        "peak_mb": round(used.ru_maxrss / 1024),
+        "files": len(files),
+        "mb": round(sum(p.stat().st_size for p in files) / 1e6, 3),
+    }
+    subprocess.run(["rm", "-r", str(folder)], check=True)
+    return row
+
+
+def _limit(seconds: float) -> Any:
+    def limited() -> None:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 5))
+
+    return limited
+
+
+def write_memory(path: Path, count: int) -> None:
+    """Write a finished memory of so many things."""
+    rng = np.random.default_rng(count)
+    with Store.create(path) as store, store.transaction():
+        session = store.sessions.add("made", "made", {}, 10 * (count // IN_CHUNK + 1))
+        store.facts.scale_kind, store.facts.scale_source, store.facts.gravity = "metric", "made", "known"
+        chunks = []
+        for index, first in enumerate(range(0, max(count, 1), IN_CHUNK)):
+            ids = range(first + 1, min(count, first + IN_CHUNK) + 1)
+            instances = [thing(n, rng) for n in ids]
+            local = tuple(local_thing(k, i, 10 * index, rng) for k, i in enumerate(instances))
+            chunk = store.chunks.add(session, chunk_of(index, local))
+            chunks.append(chunk)
+            store.instances.put(instances)
+            store.observations.set(Observation(i.id, chunk, k) for k, i in enumerate(instances))
+        store.chunks.place({c: Sim3.identity() for c in chunks}, dict.fromkeys(chunks, chunks[0]))
+        tables = ((n, n - (n - 1) % 7) for n in range(1, count + 1))
+        on = [Relation(n, "on", table, 0.9, 0.02) for n, table in tables if n != table]
+        both = [r for a in on for r in (a, Relation(a.object, "supports", a.subject, a.confidence, a.margin))]
+        store.relations.replace(None, both)
+        store.sessions.complete(session)
+
+
+def thing(n: int, rng: np.random.Generator) -> Instance:
+    """A table, or a thing on the table before it."""
+    place, k = divmod(n - 1, 7)
+    room = np.array([2.0 * (place % 200), 2.0 * (place // 200), 0.0])
+    size = np.array([1.2, 0.8, 0.7]) if k == 0 else rng.uniform(0.05, 0.3, 3)
+    center = room + ([0, 0, 0.35] if k == 0 else [*rng.uniform(-0.4, 0.4, 2), 0.7 + size[2] / 2])
+    rgb = tuple(int(v) for v in rng.integers(0, 256, 3))
+    return Instance(
+        id=n,
+        label=NAMES[n % len(NAMES)] if n % 3 else None,
+        description="large brown table, 1.2 m" if k == 0 else "small red box, 20 cm",
+        center=center,
+        aabb=np.stack([center - size / 2, center + size / 2]),
+        box=OrientedBox(center, size, np.eye(3)),
+        confidence=float(rng.uniform(0.3, 1.0)),
+        observations=int(rng.integers(3, 60)),
+        first_seen_s=0.0,
+        last_seen_s=1.0,
+        state="present",
+        structure=None,
+        color_rgb=(rgb[0], rgb[1], rgb[2]),
+        color_name="red",
+        component=1,
+        best_view=None,
+    )
+
+
+def local_thing(k: int, i: Instance, frame: int, rng: np.random.Generator) -> LocalInstance:
+    """What a chunk saw of it: points on its box, a mask in one frame."""
+    unit = rng.uniform(-0.5, 0.5, (POINTS, 3))
+    axis = rng.integers(0, 3, POINTS)
+    unit[np.arange(POINTS), axis] = np.sign(unit[np.arange(POINTS), axis]) * 0.5
+    points = (i.center + unit * i.box.size).astype(np.float32)
+    support = Support(points, np.full(POINTS, 0.8, np.float32), np.tile(np.array(i.color_rgb, np.uint8), (POINTS, 1)))
+    track = MaskTrack(
+        frames=np.array([frame]),
+        boxes_xyxy=np.array([[10, 20, 30, 30]], np.float32),
+        centers_xy=np.array([[20, 25]], np.float32),
+        areas_px=np.array([200], np.int32),
+        visible_fraction=np.array([0.9], np.float32),
+        masks=(np.array([20 * 64 + 10, 20], np.uint32),),
+        image_size=(48, 64),
+    )
+    return LocalInstance(k, track, np.eye(1, 16, k % 16, dtype=np.float32)[0], support, stability=0.9)
+
+
+def chunk_of(index: int, local: tuple[LocalInstance, ...]) -> ChunkResult:
+    """A chunk of ten frames, the camera at rest."""
+    frames = np.arange(10 * index, 10 * index + 10)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    nothing = FrameSamples(
+        frame=np.zeros(0, np.int64),
+        pixel=np.zeros(0, np.int32),
+        points=np.zeros((0, 3), np.float32),
+        confidence=np.zeros(0, np.float32),
+        instance=np.zeros(0, np.int32),
+        camera_frames=frames,
+        T_chunk_cam=poses,
+    )
+    return ChunkResult(
+        index=index,
+        frame_indices=frames,
+        times_s=frames / 30.0,
+        posed=np.ones(10, bool),
+        T_chunk_cam=poses,
+        T_source_cam=None,
+        intrinsics=(60.0, 60.0, 32.0, 24.0),
+        image_size=(48, 64),
+        scale_kind="metric",
+        keyframes=(),
+        samples=nothing,
+        library=LocalLibrary(local, np.zeros((0, 2), np.int32), "made@1/16"),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,367 @@
+"""Small files that unpack to much, and large claims in small files: each is refused quickly and in little memory.
+
+Every bomb is met by a process of its own; processor time and the peak of its memory are what the system says of it.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import json
+import os
+import sqlite3
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hostile.lies import sign
+from hostile.subject import write_source, write_subject
+from list3r.memory.store.rows.codec import pack
+
+MOST_S, MOST_MB = 2.0, 500
+Bomb = tuple[list[str], Path]
+"""Words of a command, and the file that it must survive."""
+
+
+def run_bombs(folder: Path) -> dict[str, Any]:
+    """Return how each bomb ended: status, seconds of a processor, megabytes; and what is not as it must be."""
+    rows: dict[str, dict[str, Any]] = {}
+    problems = []
+    for name, make in BOMBS.items():
+        here = folder / name.replace(" ", "-").replace("/", "-")
+        here.mkdir()
+        words = make(here)
+        rows[name] = row = _met(words)
+        print(f"{name}: {row}", flush=True)
+        refused = row["status"] in (1, 2) and "Traceback" not in row["said"]
+        if not refused or row["cpu_s"] > MOST_S or row["peak_mb"] > MOST_MB:
+            problems.append({"what": name, **row})
+    return {"tries": len(rows), "bombs": rows, "problems": problems}
+
+
+def _met(words: list[str]) -> dict[str, Any]:
+    command = [sys.executable, "-m", "list3r", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None
+        said = process.stdout.read()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    return {
+        "status": process.returncode,
+        "cpu_s": round(used.ru_utime + used.ru_stime, 2),
+        "peak_mb": used.ru_maxrss // 1024,
+        "said": " ".join(said.replace(words[1], "SOURCE").split())[-160:],
+    }
+
+
+def png(width: int, height: int, bits: int = 8, colors: int = 1) -> bytes:
+    """Return a black PNG: a thousand times smaller than what it shows."""
+    packer, row = zlib.compressobj(9), bytes(1 + width * colors * bits // 8)
+    data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    kind = 2 if colors == 3 else 0
+    head = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in ((b"IHDR", head), (b"IDAT", data), (b"IEND", b"")))
+
+
+def _chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def jpeg(width: int, height: int) -> bytes:
+    """Return a small JPEG that says it is larger."""
+    out = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(out, "JPEG")
+    data = bytearray(out.getvalue())
+    at = data.index(b"\xff\xc0")
+    data[at + 5 : at + 9] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+def mp4(frames: int, size: tuple[int, int] = (640, 480), *, fragments: bool = False) -> bytes:
+    """Return a video of a kilobyte whose index claims so many frames."""
+    unit = struct.pack(">9I", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
+    width, height = size
+    times = struct.pack(">4I", 0, 0, 1000, 1000)
+    movie = _full(b"mvhd", 0, times, struct.pack(">IH", 0x10000, 0x100), bytes(10), unit, bytes(24), b"\0\0\0\2")
+    shown = struct.pack(">2I", width << 16, height << 16)
+    track = _full(b"tkhd", 3, struct.pack(">5I", 0, 0, 1, 0, 1000), bytes(16), unit, shown)
+    clock = _full(b"mdhd", 0, struct.pack(">4I2H", 0, 0, 30, frames, 0x55C4, 0))
+    kind = _full(b"hdlr", 0, bytes(4), b"vide", bytes(13))
+    sides = struct.pack(">2H3IH", width, height, 0x480000, 0x480000, 0, 1)
+    entry = _box(b"mp4v", bytes(6), b"\0\1", bytes(16), sides, bytes(32), struct.pack(">Hh", 24, -1))
+    n = 0 if fragments else frames
+    rows = 1 if n else 0
+    tables = (
+        _full(b"stsd", 0, struct.pack(">I", 1), entry),
+        _full(b"stts", 0, struct.pack(">I", rows), struct.pack(">2I", n, 1) * rows),
+        _full(b"stsc", 0, struct.pack(">I", rows), struct.pack(">3I", 1, n, 1) * rows),
+        _full(b"stsz", 0, struct.pack(">2I", rows, n)),
+        _full(b"stco", 0, struct.pack(">I", rows), struct.pack(">I", 48) * rows),
+    )
+    here = _box(b"dinf", _full(b"dref", 0, struct.pack(">I", 1), _full(b"url ", 1)))
+    media = _box(b"mdia", clock, kind, _box(b"minf", _full(b"vmhd", 1, bytes(8)), here, _box(b"stbl", *tables)))
+    more = _box(b"mvex", _full(b"trex", 0, struct.pack(">5I", 1, 1, 1, 1, 0))) if fragments else b""
+    head = _box(b"ftyp", b"isom\0\0\2\0isomiso2mp41") + _box(b"mdat", bytes(100))
+    out = head + _box(b"moov", movie, _box(b"trak", track, media), more)
+    if not fragments:
+        return out
+    run = _full(b"tfhd", 0x020000, struct.pack(">I", 1)) + _full(b"trun", 0, struct.pack(">I", frames))
+    return out + _box(b"moof", _full(b"mfhd", 0, struct.pack(">I", 1)), _box(b"traf", run)) + _box(b"mdat", bytes(100))
+
+
+def _box(name: bytes, *parts: bytes) -> bytes:
+    body = b"".join(parts)
+    return struct.pack(">I", 8 + len(body)) + name + body
+
+
+def _full(name: bytes, flags: int, *parts: bytes) -> bytes:
+    return _box(name, struct.pack(">I", flags), *parts)
+
+
+# ------------------------------------------------------------------------------------------- sources
+
+
+def _walk(here: Path, name: str, data: bytes, command: str = "inspect") -> list[str]:
+    """A folder of which one file is the bomb."""
+    write_source(here / "walk")
+    for path in sorted((here / "walk").glob(name)):
+        path.write_bytes(data)
+    more = ["--memory", str(here / "m.l3r"), "--workers", "0"] if command == "build" else []
+    return [command, str(here / "walk"), *more]
+
+
+def _file(here: Path, name: str, data: bytes, command: str = "inspect", *more: str) -> list[str]:
+    (here / name).write_bytes(data)
+    return [command, str(here / name), *more]
+
+
+def _zipped(*members: tuple[str, bytes | int], packing: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """An archive; a number stands for so many zeros."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", packing) as archive:
+        for name, data in members:
+            with archive.open(name, "w", force_zip64=True) as member:
+                left = data if isinstance(data, int) else 0
+                member.write(b"" if isinstance(data, int) else data)
+                while left > 0:
+                    left -= member.write(bytes(min(left, 2**22)))
+    return out.getvalue()
+
+
+def _r3d(here: Path, metadata: bytes | int, packing: int = zipfile.ZIP_DEFLATED) -> list[str]:
+    data = _zipped(("rgbd/0.jpg", jpeg(16, 16)), ("metadata", metadata), packing=packing)
+    return _file(here, "walk.r3d", data)
+
+
+def _r3d_depth(here: Path) -> list[str]:
+    """Depth of LZFSE that unpacks to two gigabytes, in an archive of a megabyte."""
+    try:
+        import lzfse
+    except ImportError:
+        return _r3d(here, 2**32)
+    camera = {"K": [10, 0, 0, 0, 10, 0, 8, 8, 1], "w": 16, "h": 16, "dw": 256, "dh": 192, "poses": []}
+    block = lzfse.compress(bytes(20_000_000))[:-4]  # without the end
+    return _file(
+        here,
+        "walk.r3d",
+        _zipped(
+            ("metadata", json.dumps(camera).encode()),
+            *((f"rgbd/{k}.jpg", jpeg(16, 16)) for k in range(2)),
+            *((f"rgbd/{k}.depth", block * 12 + b"bvx$") for k in range(2)),
+        ),
+    )
+
+
+def _crowded_zip(here: Path) -> list[str]:
+    """An archive whose list has 600,000 members, all the same bytes."""
+    entry = struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0)
+    listing = b"".join(entry + b"%07d" % k for k in range(600_000))
+    end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, len(listing), 0, 0)
+    return _file(here, "walk.r3d", listing + end)
+
+
+def _sens(here: Path) -> list[str]:
+    """Four gigabytes of frames of nothing, a file with a hole."""
+    head = struct.pack("<IQ", 4, 0) + struct.pack("<16f", *np.eye(4).ravel()) * 4
+    head += struct.pack("<iiIIIIfQ", 2, 1, 640, 480, 640, 480, 1000.0, 2**40)
+    words = _file(here, "scene.sens", head)
+    os.truncate(here / "scene.sens", 2**32)
+    return words
+
+
+def _sens_depth(here: Path) -> list[str]:
+    head = struct.pack("<IQ", 4, 0) + struct.pack("<16f", *np.eye(4).ravel()) * 4
+    head += struct.pack("<iiIIIIfQ", 2, 1, 16, 16, 65535, 65535, 1000.0, 1)
+    depth, picture = zlib.compress(bytes(10_000_000), 9), jpeg(16, 16)
+    frame = struct.pack("<16f", *np.eye(4).ravel()) + struct.pack("<4Q", 1, 1, len(picture), len(depth))
+    return _file(here, "scene.sens", head + frame + picture + depth)
+
+
+def _bag(here: Path) -> list[str]:
+    """A bag of ROS 1 whose one chunk of bzip2 unpacks to a gigabyte."""
+    chunk = bz2.compress(bytes(10**9))
+
+    def record(head: dict[str, bytes], data: bytes) -> bytes:
+        fields = b"".join(struct.pack("<I", len(k) + 1 + len(v)) + k.encode() + b"=" + v for k, v in head.items())
+        return struct.pack("<I", len(fields)) + fields + struct.pack("<I", len(data)) + data
+
+    start = b"#ROSBAG V2.0\n"
+    body = record({"op": b"\5", "compression": b"bz2", "size": struct.pack("<I", 10**9)}, chunk)
+    at = len(start) + 4096
+    kind = {"topic": b"/rgb", "type": b"sensor_msgs/Image", "md5sum": b"060021388200f6f0f447d0fcd9c64743"}
+    words = b"".join(struct.pack("<I", len(k) + 1 + len(v)) + k.encode() + b"=" + v for k, v in kind.items())
+    definition = b"message_definition=uint32 x\n"
+    words += struct.pack("<I", len(definition)) + definition
+    number = struct.pack("<I", 0)
+    index = record(
+        {"op": b"\4", "ver": struct.pack("<I", 1), "conn": number, "count": struct.pack("<I", 1)},
+        struct.pack("<IIi", 1, 0, 0),
+    )
+    known = record({"op": b"\7", "conn": number, "topic": b"/rgb"}, words)
+    told = {"op": b"\6", "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", at), "count": struct.pack("<I", 1)}
+    told |= {"start_time": struct.pack("<II", 1, 0), "end_time": struct.pack("<II", 2, 0)}
+    chunks = record(told, number + struct.pack("<I", 1))
+    counts = {"op": b"\3", "index_pos": struct.pack("<Q", at + len(body) + len(index))}
+    counts |= {"conn_count": struct.pack("<I", 1), "chunk_count": struct.pack("<I", 1)}
+    head = record(counts, b"")
+    padded = record(counts, b" " * (4096 - len(head)))
+    return _file(here, "walk.bag", start + padded + body + index + known + chunks)
+
+
+def _precomputed(here: Path) -> list[str]:
+    write_source(here / "walk")
+    (here / "made").mkdir()
+    (here / "made" / "precomputed.json").write_text(
+        '{"format": "list3r-precomputed", "version": 1, "scale": "metric", "model": "x"}'
+    )
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": (2**31,)})
+    data = _zipped(("frames.npy", _npy(np.arange(4))), ("depth.npy", 2**31), ("confidence.npy", head.getvalue()))
+    (here / "made" / "chunk_000.npz").write_bytes(data)
+    how = f"precomputed={here / 'made'}"
+    return ["build", str(here / "walk"), "-m", str(here / "m.l3r"), "--reconstruction", "precomputed", "--weights", how]
+
+
+def _npy(array: Any) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
+def _lying_npy(count: int) -> bytes:
+    out = io.BytesIO()
+    np.lib.format.write_array_header_1_0(out, {"descr": "<f8", "fortran_order": False, "shape": (count, 3)})
+    return out.getvalue() + bytes(2400)
+
+
+def _manifest(here: Path) -> list[str]:
+    (here / "videos.txt").write_text('{"source": ' + "[" * 2_000_000 + "}\n")
+    return ["batch", str(here / "videos.txt"), "--out", str(here / "out")]
+
+
+# ------------------------------------------------------------------------------------------- memories
+
+
+def _memory(here: Path, *statements: tuple[str, tuple[Any, ...]], command: str = "list", more: str = "") -> list[str]:
+    path = write_subject(here / "m.l3r")
+    with sqlite3.connect(path) as database:
+        for sql, arguments in statements:
+            database.execute(sql, arguments)
+        sign(database)
+    return [*command.split(), str(path), *more.split()]
+
+
+def _track(here: Path) -> list[str]:
+    """A mask track whose arrays unpack to two gigabytes."""
+    blob = _zipped(*((f"{k}.npy", 2**27) for k in range(16)))
+    return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="query seen", more="2")
+
+
+def _claimed(here: Path) -> list[str]:
+    blob = pack({"frames": np.zeros(2**25, np.int64)})
+    return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="query seen", more="2")
+
+
+def _aliases(here: Path) -> list[str]:
+    numbers = "WITH RECURSIVE n(k) AS (VALUES(1000) UNION ALL SELECT k + 1 FROM n LIMIT 100000)"
+    chain = f"{numbers} INSERT INTO aliases SELECT k, k + 1 FROM n"
+    return _memory(
+        here, (chain, ()), ("UPDATE aliases SET instance = 1000 WHERE id = 100999", ()), command="show", more="1000"
+    )
+
+
+def _values(here: Path) -> list[str]:
+    text = "[" + "[]," * 15_000_000 + "[]]"
+    return _memory(here, ("UPDATE sessions SET cuts = ?", (text,)), command="info")
+
+
+def _label(here: Path) -> list[str]:
+    return _memory(here, ("UPDATE instances SET label = ?", ("x" * 20_000_000,)))
+
+
+def _sparse(here: Path) -> list[str]:
+    path = write_subject(here / "m.l3r")
+    os.truncate(path, 2**40)
+    return ["repair", str(path), "--out", str(here / "mended.l3r")]
+
+
+def _picture(here: Path) -> list[str]:
+    path = write_subject(here / "m.l3r")
+    (here / "bomb.png").write_bytes(png(20_000, 20_000))
+    return ["query", "similar", str(path), "--image", str(here / "bomb.png")]
+
+
+def _stored_picture(here: Path) -> list[str]:
+    change = ("UPDATE keyframes SET jpeg = ?", (png(20_000, 20_000),))
+    return _memory(here, change, command="picture", more=f"2 --out {here / 'out.jpg'}")
+
+
+BOMBS: dict[str, Callable[[Path], list[str]]] = {
+    "PNG of 400 megapixels": lambda h: _walk(h, "rgb/*.png", png(20_000, 20_000)),
+    "PNG of 400 megapixels, colour, build": lambda h: _walk(h, "rgb/*.png", png(20_000, 20_000, 8, 3), "build"),
+    "depth PNG of 900 megapixels": lambda h: _walk(h, "depth/*.png", png(30_000, 30_000, 16)),
+    "PNG to ask with": _picture,
+    "PNG stored in a memory": _stored_picture,
+    "JPEG that claims 65,500 x 65,500": lambda h: _walk(h, "rgb/*.png", jpeg(65_500, 65_500)),
+    "depth npy that claims 48 GB": lambda h: _walk(h, "depth/*.png", _lying_npy(2**31)),
+    "npz of precomputed depth": _precomputed,
+    "blob of arrays in a memory": _track,
+    "array of 256 MiB in a memory": _claimed,
+    "label of 20 MB": _label,
+    "100,000 chained aliases in a circle": _aliases,
+    "JSON of 15 million lists in a memory": _values,
+    "repair of a file of a terabyte with a hole": _sparse,
+    "JSON of 12 million lists": lambda h: (
+        [*_file(h, "transforms.json", b"[" + b"[]," * 12000000 + b"[]]")[:1], str(h)]
+    ),
+    "JSON 2 million deep": lambda h: [*_file(h, "transforms.json", b"[" * 2000000)[:1], str(h)],
+    "list of 60 million lines": lambda h: _walk(h, "rgb.txt", b"\n" * 60_000_000),
+    "line of 30 million numbers": lambda h: _walk(h, "groundtruth.txt", b"1 " * 30_000_000),
+    "zip: metadata of 4 GB": lambda h: _r3d(h, 2**32),
+    "zip: metadata of bzip2": lambda h: _r3d(h, 2**30, zipfile.ZIP_BZIP2),
+    "zip: metadata of 60 MB of lists": lambda h: _r3d(h, b"[" + b"[]," * 20_000_000 + b"[]]"),
+    "zip: 600,000 members": _crowded_zip,
+    "zip: depth of LZFSE": _r3d_depth,
+    "sens: frames of nothing in a hole of 4 GB": _sens,
+    "sens: depth that claims 65,535 x 65,535": _sens_depth,
+    "bag: chunk of bzip2": _bag,
+    "video that claims 50 million frames": lambda h: _file(h, "walk.mp4", mp4(50_000_000)),
+    "video that claims 2 billion frames": lambda h: _file(h, "walk.mp4", mp4(2_000_000_000)),
+    "video whose fragment claims 50 million": lambda h: _file(h, "walk.mp4", mp4(50_000_000, fragments=True)),
+    "video that claims 65,535 x 65,535": lambda h: _file(h, "walk.mp4", mp4(10, (65_535, 65_535))),
+    "manifest of JSON 2 million deep": _manifest,
+    "cloud npy that claims 48 GB": lambda h: [
+        "eval",
+        "cloud",
+        *_file(h, "a.npy", _lying_npy(2**31))[1:],
+        *_file(h, "b.npy", _lying_npy(2**31))[1:],
+    ],
+}

@@ -1,0 +1,135 @@
+"""What a database of a catalogue does, and which one a URL means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
+
+MOST_RANKED = 2_000
+"""Instances that words name which are ranked; of more, any so many are."""
+
+
+class Backend(Protocol):
+    """A database that holds a catalogue. Each call sees one state of it. Raises `CatalogError`."""
+
+    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+        """Write a memory in place of what has its name; of the same file only when it is asked for `anew`.
+
+        Return its entry, whose revision is the next one where the file is another.
+        """
+        ...
+
+    def drop(self, name: str) -> bool:
+        """Forget a memory; whether there was one."""
+        ...
+
+    def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
+        """Return entries by name, all or those of some names."""
+        ...
+
+    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+        """Return one instance."""
+        ...
+
+    def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
+        """Return the k instances whose axis-aligned boxes are nearest to a point, the nearest first."""
+        ...
+
+    def inside(
+        self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
+    ) -> list[CatalogThing]:
+        """Return instances whose axis-aligned boxes meet a box."""
+        ...
+
+    def named(
+        self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
+    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+        """Return the k that are wanted with how well the words name them, the best first, and how many were ranked."""
+        ...
+
+    def related(
+        self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
+    ) -> list[tuple[str, int, str, str, int, str, float, float]]:
+        """Return memory, subject and its name, predicate, object and its name, confidence, margin."""
+        ...
+
+    def spaces(self, memory: str | None) -> list[str]:
+        """Return the names of spaces that hold vectors."""
+        ...
+
+    def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
+        """Return the vector of an instance. Shape (D,)."""
+        ...
+
+    def alike(
+        self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
+    ) -> list[tuple[CatalogThing, float]]:
+        """Return the k whose vectors are most like one, with the cosine, the most alike first."""
+        ...
+
+    def alive(self) -> bool:
+        """Whether the database answers."""
+        ...
+
+    def close(self) -> None:
+        """Let the database go."""
+        ...
+
+
+def open_backend(url: str, connections: int = 1) -> Backend:
+    """Return the database of a URL: postgresql://host/name, or a path or sqlite:///path for the embedded one."""
+    kind, told, rest = url.partition("://")
+    if not told or kind == "sqlite":
+        from list3r.catalog.sqlite import SqliteBackend
+
+        return SqliteBackend(rest.removeprefix("/") if told else url)
+    if kind in ("postgresql", "postgres"):
+        from list3r.catalog.postgres import PostgresBackend
+
+        return PostgresBackend(url, connections)
+    raise CatalogError(f"{kind}:// is no catalogue; give postgresql://host/name, or a file such as catalog.sqlite")
+
+
+def wanted_sql(wanted: Wanted, alias: str, words: Any, depth: int = 0) -> tuple[str, list[Any]]:
+    """Return the condition (with `?` for values) that an instance is wanted, and its values.
+
+    `words` makes the condition of bearing words, of an alias and the words.
+    """
+    parts, values = ["TRUE"], []
+    if wanted.words:
+        text, given = words(alias, wanted.words)
+        parts.append(text)
+        values += given
+    if wanted.instance_id is not None:
+        parts.append(f"{alias}.id = ?")
+        values.append(wanted.instance_id)
+    for predicates, object in wanted.where:
+        o, r = f"o{depth}", f"r{depth}"
+        text, given = wanted_sql(object, o, words, depth + 1)
+        marks = ", ".join("?" for _ in predicates)
+        parts.append(
+            f"EXISTS (SELECT 1 FROM relation {r} "
+            f"JOIN instance {o} ON {o}.memory_id = {r}.memory_id AND {o}.id = {r}.object "
+            f"WHERE {r}.memory_id = {alias}.memory_id AND {r}.subject = {alias}.id AND {r}.predicate IN ({marks}) "
+            f"AND {text})"
+        )
+        values += [*predicates, *given]
+    return " AND ".join(parts), values
+
+
+def filters_sql(filters: CatalogFilters, alias: str) -> tuple[str, list[Any]]:
+    """Return the condition (with `?` for values) that an instance passes the filters, and its values."""
+    parts, values = [f"{alias}.confidence >= ?"], [filters.min_confidence]
+    if not filters.structure:
+        parts.append(f"{alias}.structure IS NULL")
+    if filters.state is None:
+        parts.append(f"{alias}.state <> 'removed'")
+    elif filters.state != "any":
+        parts.append(f"{alias}.state = ?")
+        values.append(filters.state)  # type: ignore[arg-type]
+    return " AND ".join(parts), values

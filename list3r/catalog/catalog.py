@@ -1,0 +1,377 @@
+"""The face of a catalogue: the questions that one memory answers, asked of one of many or of all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from list3r.batch.storage import Output, is_remote
+from list3r.catalog.base import MOST_RANKED, Backend, open_backend
+from list3r.catalog.reading import read_content
+from list3r.catalog.records import (
+    CatalogAnswers,
+    CatalogError,
+    CatalogFilters,
+    CatalogMatch,
+    CatalogRelation,
+    CatalogThing,
+    MemoryEntry,
+    UnknownMemoryError,
+    Wanted,
+)
+from list3r.memory.errors import OptionError, UnknownIdError, naming_extras
+from list3r.queries.finding.grammar import Phrase, parse
+from list3r.queries.finding.words import STRUCTURE, wanted_words
+from list3r.queries.match import checked_count, checked_length, checked_point
+from list3r.queries.relations import ALL_PREDICATES
+from list3r.queries.views.viewpoint import VIEWPOINT
+
+MOST_ANSWERS = 1_000
+"""Answers of one question."""
+_LARGEST_ID = 2**63 - 1
+
+
+class Catalog:
+    """A catalogue that is open; use it as a context manager or call `close`.
+
+    Answers come from the catalogue alone: distances are to oriented boxes. The surfaces are in the file that each
+    answer names.
+    """
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+
+    @staticmethod
+    @naming_extras()
+    def open(url: str, connections: int = 1) -> Catalog:
+        """Open postgresql://host/name, or a file of the embedded catalogue, which is made where there is none.
+
+        Raises `CatalogError`.
+        """
+        return Catalog(open_backend(url, connections))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let the database go."""
+        self._backend.close()
+
+    def alive(self) -> bool:
+        """Whether the database answers."""
+        return self._backend.alive()
+
+    # ------------------------------------------------------------------ memories
+
+    def add(self, path: str | Path, name: str | None = None, store: str | None = None) -> MemoryEntry:
+        """Take a memory file into the catalogue, in place of what has its name; its entry, with the new revision.
+
+        With a `store`, a folder or URL, the file is copied there under a name that no other file ever gets, and the
+        catalogue names the copy. Raises `CatalogError`, `MemoryFileError`.
+        """
+        content = read_content(str(path), name)
+        if store is not None:
+            kept = f"{content.entry.name}-{content.entry.sha256[:16]}"
+            output = Output(store)
+            output.prepare()
+            if output.size(kept) is None:
+                if is_remote(str(path)):
+                    raise CatalogError(f"{path} lies in a store already; catalogue it where it is, without --store")
+                output.publish(Path(path), kept, replace=False)
+            content = read_content(output.place(kept), content.entry.name)
+        return self._backend.put(content)
+
+    def again(self, path: str, name: str | None = None) -> MemoryEntry:
+        """Write a memory anew from its file; its revision stays where the file is the same."""
+        return self._backend.put(read_content(path, name), anew=True)
+
+    def remove(self, name: str) -> None:
+        """Forget a memory; its file stays. Raises `CatalogError` where there is none of that name."""
+        if not self._backend.drop(name):
+            raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
+
+    def memories(self) -> list[MemoryEntry]:
+        """Return all memories by name."""
+        return self._backend.memories()
+
+    def memory(self, name: str) -> MemoryEntry:
+        """Return one memory. Raises `CatalogError` where there is none of that name."""
+        found = self._backend.memories([name])
+        if not found:
+            raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
+        return found[0]
+
+    # ------------------------------------------------------------------ questions
+
+    def nearest(
+        self,
+        memory: str,
+        *,
+        point: ArrayLike | None = None,
+        instance_id: int | None = None,
+        k: int = 5,
+        filters: CatalogFilters | None = None,
+    ) -> CatalogAnswers:
+        """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
+        entry, k, filters = self.memory(memory), _count(k), filters or CatalogFilters()
+        if (point is None) == (instance_id is None):
+            raise OptionError("give a point or an instance to be near to, one of the two")
+        at = checked_point(point, "point") if point is not None else self._known(memory, instance_id).box.center
+        count, own = 4 * k + 8, instance_id
+        while True:
+            near = self._backend.near(memory, at.tolist(), count, filters)
+            found = sorted(((box_distance(t, at), t.id, t) for t in near if t.id != own), key=lambda f: f[:2])[:k]
+            # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
+            if len(near) < count or (len(found) == k and found[-1][0] <= aabb_distance(near[-1], at)):
+                break
+            count *= 4
+        whence = "the point" if own is None else f"the centre of #{own}"
+        return self._answers(((t, 1.0 / (1.0 + d), d, f"box {d:.2f} from {whence}") for d, _, t in found), [entry])
+
+    def within(
+        self,
+        memory: str,
+        *,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        center: ArrayLike | None = None,
+        radius: float | None = None,
+        filters: CatalogFilters | None = None,
+    ) -> CatalogAnswers:
+        """Find the things of one memory whose boxes meet a box or a sphere, those nearest to its middle first."""
+        entry, filters = self.memory(memory), filters or CatalogFilters()
+        box, sphere = lower is not None and upper is not None, center is not None and radius is not None
+        if box == sphere:
+            raise OptionError("give one region: a box (lower and upper corner) or a sphere (center and radius)")
+        if box:
+            assert lower is not None and upper is not None
+            low, high = checked_point(lower, "lower corner"), checked_point(upper, "upper corner")
+            middle, reach = (low + high) / 2.0, np.inf
+            if (low > high).any():
+                raise OptionError(f"the lower corner {low.tolist()} must not lie beyond the upper one {high.tolist()}")
+        else:
+            assert center is not None and radius is not None
+            middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
+            low, high = middle - reach, middle + reach
+        met = self._backend.inside(memory, low.tolist(), high.tolist(), filters, MOST_ANSWERS + 1)
+        found = sorted(((box_distance(t, middle), t.id, t) for t in met), key=lambda f: f[:2])
+        notes = [f"more than {MOST_ANSWERS} things are there; so many are told"] if len(met) > MOST_ANSWERS else []
+        rows = (
+            (t, 1.0 / (1.0 + d), d, f"box {d:.2f} from the middle") for d, _, t in found[:MOST_ANSWERS] if d <= reach
+        )
+        return self._answers(rows, [entry], notes)
+
+    def find(
+        self, text: str, memory: str | None = None, *, k: int = 5, filters: CatalogFilters | None = None
+    ) -> CatalogAnswers:
+        """Find things by a phrase, in one memory or over all: words, and stored relations to what other words name.
+
+        Sizes, superlatives and what depends on a viewpoint are questions to one file. Raises `OptionError`.
+        """
+        k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
+        wanted = _wanted(parse(text))
+        if not STRUCTURE.isdisjoint(wanted.words):
+            filters = CatalogFilters(True, filters.min_confidence, filters.state)
+        found, ranked = self._backend.named(memory, wanted, k, filters)
+        notes = [f"{ranked} things match {text!r} or more; so many were ranked"] if ranked >= MOST_RANKED else []
+        said = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
+        return self._answers(((t, score, None, said) for t, score in found), entries, notes)
+
+    def similar(
+        self,
+        memory: str | None = None,
+        *,
+        instance_id: int | None = None,
+        vector: ArrayLike | None = None,
+        space: str | None = None,
+        anywhere: bool = True,
+        k: int = 5,
+        filters: CatalogFilters | None = None,
+    ) -> CatalogAnswers:
+        """Find things that look like an instance of a memory, or like a vector of a space: over all memories, or in
+        that one alone where not `anywhere`.
+        """
+        k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
+        if (instance_id is None) == (vector is None):
+            raise OptionError("give an instance or a vector to compare with, one of the two")
+        chosen = self._space(memory, space)
+        if instance_id is not None:
+            if memory is None:
+                raise OptionError("an instance has its number in one memory; name that")
+            self._known(memory, instance_id)
+            asked = self._backend.vector(memory, instance_id, chosen)
+            if asked is None:
+                raise CatalogError(f"{memory} has no vector of #{instance_id} in {chosen}; `list3r embed` makes them")
+        else:
+            asked = np.asarray(vector, np.float32)
+            if asked.ndim != 1 or not np.isfinite(asked).all() or not np.linalg.norm(asked):
+                raise OptionError("the vector to compare with must be a row of finite numbers, not all zero")
+        found = self._backend.alike(None if anywhere else memory, chosen, asked, k + (instance_id is not None), filters)
+        others = [(t, c) for t, c in found if (t.memory, t.id) != (memory, instance_id)][:k]
+        rows = ((t, c, None, f"cosine {c:.3f} in {chosen}") for t, c in others)
+        return self._answers(rows, [] if anywhere else entries)
+
+    def relations(
+        self,
+        memory: str | None = None,
+        *,
+        subject: int | str | None = None,
+        predicate: str | None = None,
+        object: int | str | None = None,
+        k: int = 100,
+    ) -> CatalogAnswers:
+        """Return stored relations by any of subject, predicate and object (words, or ids within one memory)."""
+        k, entries = _count(k), self._entries(memory)
+        if predicate is not None and (
+            predicate in VIEWPOINT or predicate not in ALL_PREDICATES or predicate == "between"
+        ):
+            stored = ", ".join(p for p in ALL_PREDICATES if p not in VIEWPOINT and p != "between")
+            raise OptionError(f"predicate {predicate!r} is not one that is stored; choose one of: {stored}")
+        if subject is None and object is None and memory is None:
+            raise OptionError("over all memories a subject or an object is needed: words, such as mug")
+        ends = self._end(subject, memory), self._end(object, memory)
+        rows = self._backend.related(memory, ends[0], predicate, ends[1], k)
+        by_name = self._by_name(entries, [r[0] for r in rows])
+        return CatalogAnswers(
+            CatalogRelation(r[0], by_name[r[0]][0].revision, by_name[r[0]][0].path, by_name[r[0]][1], *r[1:])
+            for r in rows
+            if r[0] in by_name
+        )
+
+    # ------------------------------------------------------------------ parts
+
+    def _entries(self, memory: str | None) -> list[MemoryEntry]:
+        return [] if memory is None else [self.memory(memory)]
+
+    def _known(self, memory: str, instance_id: int | None) -> CatalogThing:
+        assert instance_id is not None
+        found = self._backend.thing(memory, instance_id) if 0 <= instance_id <= _LARGEST_ID else None
+        if found is None:
+            raise UnknownIdError(f"the catalogue has no instance {instance_id} in {memory}")
+        return found
+
+    def _end(self, what: int | str | None, memory: str | None) -> Wanted:
+        """Return what a subject or an object stands for."""
+        if what is None:
+            return Wanted()
+        if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):
+            return Wanted(tuple(wanted_words(what)))
+        if memory is None:
+            raise OptionError(f"{what} has its number in one memory; name that, or give words")
+        number = int(what.removeprefix("#")) if isinstance(what, str) else what
+        return Wanted(instance_id=self._known(memory, number).id)
+
+    def _space(self, memory: str | None, space: str | None) -> str:
+        if space is not None:
+            return space
+        spaces = self._backend.spaces(memory)
+        if len(spaces) != 1:
+            which = f"name one of: {', '.join(spaces)}" if spaces else "`list3r embed` makes vectors"
+            what = memory or "the catalogue"
+            raise OptionError(f"{what} has vectors of {len(spaces)} spaces; {which}")
+        return spaces[0]
+
+    def _by_name(
+        self, known: Iterable[MemoryEntry], names: Iterable[str]
+    ) -> dict[str, tuple[MemoryEntry, bool | None]]:
+        """Return the entries of some memories, with whether their files have changed since."""
+        wanted, entries = set(names), {e.name: e for e in known}
+        missing = sorted(wanted - entries.keys())
+        entries |= {e.name: e for e in (self._backend.memories(missing) if missing else ())}
+        return {n: (entries[n], is_stale(entries[n])) for n in wanted if n in entries}
+
+    def _answers(
+        self,
+        rows: Iterable[tuple[CatalogThing, float, float | None, str]],
+        known: Sequence[MemoryEntry],
+        notes: Sequence[str] = (),
+    ) -> CatalogAnswers:
+        held = list(rows)
+        by_name = self._by_name(known, (t.memory for t, *_ in held))
+        found = [_match(t, *by_name[t.memory], told) for t, *told in held if t.memory in by_name]
+        stale = sorted({m.memory for m in found if m.stale})
+        told = [f"{n} has changed since it was catalogued; `list3r catalog add` takes it in again" for n in stale]
+        return CatalogAnswers(found, [*notes, *told])
+
+
+def is_stale(entry: MemoryEntry) -> bool | None:
+    """Tell whether a file is another one than the catalogue knows; None for one that does not lie on this machine."""
+    if is_remote(entry.path) or not entry.mtime_ns:
+        return None
+    try:
+        now = Path(entry.path).stat()
+    except OSError:
+        return True
+    return (now.st_size, now.st_mtime_ns) != (entry.bytes, entry.mtime_ns)
+
+
+def box_distance(thing: CatalogThing, point: NDArray[np.float64]) -> float:
+    """Return the distance of a point from an oriented box, 0 inside, world units."""
+    local = (point - thing.box.center) @ thing.box.rotation
+    return float(np.linalg.norm(np.maximum(np.abs(local) - thing.box.size / 2.0, 0.0)))
+
+
+def aabb_distance(thing: CatalogThing, point: NDArray[np.float64]) -> float:
+    """Return the distance of a point from the axis-aligned box of a thing, 0 inside, world units."""
+    low, high = map(np.array, thing.bounds())
+    return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))
+
+
+def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, told: Sequence[Any]) -> CatalogMatch:
+    score, distance, reason = told
+    return CatalogMatch(
+        t.memory,
+        entry.revision,
+        entry.path,
+        stale,
+        t.id,
+        t.label,
+        t.description,
+        t.state,
+        round(t.confidence, 4),
+        tuple(round(x, 4) for x in t.box.center.tolist()),
+        tuple(round(x, 4) for x in t.box.size.tolist()),
+        entry.units,
+        round(score, 4),
+        None if distance is None else round(distance, 4),
+        reason,
+    )
+
+
+def _wanted(phrase: Phrase) -> Wanted:
+    """Return a phrase as what the database can look for. Raises `OptionError` for what only a file can tell."""
+    for what, beyond in (
+        (phrase.size, phrase.size is not None),
+        (phrase.superlative, phrase.superlative is not None),
+        (f"#{phrase.instance_id}", phrase.instance_id is not None),
+        ("between", any(c.other for c in phrase.where)),
+    ):
+        if beyond:
+            raise OptionError(f"{phrase.text!r}: a catalogue cannot tell {what!r}; ask the memory's file")
+    where = []
+    for clause in phrase.where:
+        stored = tuple(p for p in clause.predicates if p not in VIEWPOINT)
+        if not stored:
+            raise OptionError(f"{phrase.text!r}: {clause.said!r} depends on the viewpoint; ask the memory's file")
+        where.append((stored, _wanted(clause.object)))
+    if not phrase.words and not where:
+        raise OptionError(f"{phrase.text!r} has no word to search for; name an object, a colour or a shape")
+    return Wanted(phrase.words, None, tuple(where))
+
+
+def _count(k: int) -> int:
+    k = checked_count(k)
+    if k > MOST_ANSWERS:
+        raise OptionError(f"k = {k}: a catalogue gives at most {MOST_ANSWERS} answers")
+    return k

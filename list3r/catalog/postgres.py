@@ -1,0 +1,366 @@
+"""A catalogue in PostgreSQL: boxes by `cube` and `btree_gist`, words by GIN, vectors by `pgvector`."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, fields, replace
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import psycopg
+from numpy.typing import NDArray
+
+from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
+from list3r.catalog.postgres_connections import Connections
+from list3r.catalog.postgres_schema import MIGRATIONS, vector_table
+from list3r.catalog.records import (
+    CatalogError,
+    CatalogFilters,
+    CatalogThing,
+    MemoryContent,
+    MemoryEntry,
+    SpaceVectors,
+    Wanted,
+)
+from list3r.catalog.sqlite import thing_of
+
+_ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
+_THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
+_THING_OF_ONE = _THING.replace("m.name", "?::text")
+"""Of the instances of one memory, whose name is given as a value."""
+_PROBED = 100
+"""Candidates that a search for vectors keeps at each step; more finds more and takes longer."""
+_MOST_ALIKE = 10_000
+"""Vectors that are looked at because few of the most alike pass the filters."""
+_SCHEMA_LOCK = 0x4C334331
+"""Number of the advisory lock under which the schema is made."""
+
+
+class PostgresBackend:
+    """A catalogue that many read and write at once. Credentials come from the environment or a service file."""
+
+    def __init__(self, url: str, connections: int = 1) -> None:
+        """Connect, and bring the schema up to date where this user may. Raises `CatalogError`."""
+        self._where = _checked(url)
+        self._connections = Connections(url, connections)
+        with self._connected("opened") as connection, connection.transaction():
+            self.has_vectors = _migrated(connection)
+
+    # ------------------------------------------------------------------ writing
+
+    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+        """Write a memory in place of what has its name, in one transaction."""
+        with self._connected("written; nothing was changed") as connection, connection.transaction():
+            spaces = self._spaces_for(connection, content.spaces)
+            names, marks = ", ".join(f.name for f in fields(MemoryEntry)), ", ".join("%s" for _ in fields(MemoryEntry))
+            statement = (
+                f"INSERT INTO memory ({names}) VALUES ({marks}) ON CONFLICT (name) DO UPDATE SET name = excluded.name "
+                f"RETURNING memory_id, {_ENTRY.replace('m.', 'memory.')}"
+            )
+            row = _first(connection.execute(statement, astuple(content.entry)))
+            memory, known = int(row[0]), MemoryEntry(*row[1:])
+            if known.revision and not anew and replace(content.entry, revision=known.revision) == known:
+                return known
+            same = known.revision and known.sha256 == content.entry.sha256
+            entry = replace(content.entry, revision=known.revision + (not same))
+            own = ", ".join(f"{f.name} = %s" for f in fields(MemoryEntry))
+            connection.execute(
+                f"UPDATE memory SET {own}, added_at = now() WHERE memory_id = %s", (*astuple(entry), memory)
+            )
+            if known.revision:
+                self._forget(connection, memory)
+            _copy_things(connection, memory, content)
+            for space, held in spaces:
+                _copy_vectors(connection, memory, space, held)
+            return entry
+
+    def _spaces_for(
+        self, connection: psycopg.Connection[Any], spaces: Sequence[SpaceVectors]
+    ) -> list[tuple[int, SpaceVectors]]:
+        """Return the number of each space that has vectors here; the table of a new one is made."""
+        out = []
+        for held in spaces if self.has_vectors else ():
+            dimension = held.vectors.shape[1]
+            known = _first(connection.execute("SELECT space_id, dimension FROM space WHERE name = %s", (held.space,)))
+            if not known:
+                connection.execute("SELECT pg_advisory_xact_lock(%s)", (_SCHEMA_LOCK,))
+                known = _first(
+                    connection.execute("SELECT space_id, dimension FROM space WHERE name = %s", (held.space,))
+                )
+            if not known:
+                statement = "INSERT INTO space (name, dimension) VALUES (%s, %s) RETURNING space_id, dimension"
+                known = _first(connection.execute(statement, (held.space, dimension)))
+                connection.execute(vector_table(known[0], dimension).encode())
+            if known[1] != dimension:
+                raise CatalogError(f"vectors of {dimension} numbers are none of {held.space}, which has {known[1]}")
+            out.append((int(known[0]), held))
+        return out
+
+    def drop(self, name: str) -> bool:
+        """Forget a memory; whether there was one."""
+        with self._connected("written; nothing was changed") as connection, connection.transaction():
+            known = _first(connection.execute("DELETE FROM memory WHERE name = %s RETURNING memory_id", (name,)))
+            if known:
+                self._forget(connection, int(known[0]))
+            return bool(known)
+
+    def _forget(self, connection: psycopg.Connection[Any], memory: int) -> None:
+        tables = ["instance", "relation"]
+        tables += [f"vector_{int(n)}" for (n,) in connection.execute("SELECT space_id FROM space").fetchall()]
+        for table in tables:
+            connection.execute(f"DELETE FROM {table} WHERE memory_id = %s", (memory,))
+
+    # ------------------------------------------------------------------ asking
+
+    def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
+        """Return entries by name."""
+        where, values = ("", ()) if names is None else (" WHERE m.name = ANY(?)", (list(names),))
+        rows = self._rows(f"SELECT {_ENTRY} FROM memory m{where} ORDER BY m.name", values)
+        return [MemoryEntry(*row) for row in rows]
+
+    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+        """Return one instance."""
+        query = f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? AND i.id = ?"
+        rows = self._rows(query, (memory, self._number(memory), instance_id))
+        return _thing(rows[0]) if rows else None
+
+    def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
+        """Return the k nearest by axis-aligned boxes, through the index of boxes."""
+        passing, values = filters_sql(filters, "i")
+        query = (
+            f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? AND {passing} "
+            "ORDER BY i.bounds <-> cube(?::float8[]) LIMIT ?"
+        )
+        asked = (memory, self._number(memory), *values, list(point), k)
+        return [_thing(row) for row in self._rows(query, asked)]
+
+    def inside(
+        self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
+    ) -> list[CatalogThing]:
+        """Return instances whose axis-aligned boxes meet a box."""
+        passing, values = filters_sql(filters, "i")
+        query = (
+            f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? "
+            f"AND i.bounds && cube(?::float8[], ?::float8[]) AND {passing} ORDER BY i.id LIMIT ?"
+        )
+        asked = (memory, self._number(memory), list(lower), list(upper), *values, None if limit < 0 else limit)
+        return [_thing(row) for row in self._rows(query, asked)]
+
+    def named(
+        self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
+    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+        """Return the k that are wanted with how well the words name them."""
+        (a, values), (b, more) = wanted_sql(wanted, "i", _bearing), filters_sql(filters, "i")
+        only, given = ("", ()) if memory is None else (" AND i.memory_id = ?", (self._number(memory),))
+        weight = "(SELECT avg(w.n) FROM unnest(i.words, i.weights) w (word, n) WHERE w.word = ANY(?))"
+        query = (
+            f"WITH chosen AS MATERIALIZED (SELECT i.* FROM instance i WHERE {a} AND {b}{only} LIMIT {MOST_RANKED}) "
+            f"SELECT {_THING}, coalesce({weight}, 100) AS weight, (SELECT count(*) FROM chosen) "
+            "FROM chosen i JOIN memory m USING (memory_id) "
+            "ORDER BY weight DESC, i.confidence DESC, m.name, i.id LIMIT ?"
+        )
+        rows = self._rows(query, (*values, *more, *given, list(wanted.words), k))
+        return [(_thing(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
+
+    def related(
+        self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
+    ) -> list[tuple[str, int, str, str, int, str, float, float]]:
+        """Return relations, the surest first."""
+        (a, values), (b, more) = wanted_sql(subject, "s", _bearing), wanted_sql(object, "o", _bearing)
+        parts, given = [a, b], [*values, *more]
+        if memory is not None:
+            parts.append("r.memory_id = ?")
+            given.append(self._number(memory))
+        if predicate is not None:
+            parts.append("r.predicate = ?")
+            given.append(predicate)
+        query = (
+            "SELECT m.name, r.subject, coalesce(s.label, s.description), r.predicate, r.object, "
+            "coalesce(o.label, o.description), r.confidence, r.margin FROM relation r "
+            "JOIN instance s ON s.memory_id = r.memory_id AND s.id = r.subject "
+            "JOIN instance o ON o.memory_id = r.memory_id AND o.id = r.object "
+            "JOIN memory m ON m.memory_id = r.memory_id "
+            f"WHERE {' AND '.join(parts)} ORDER BY r.confidence DESC, m.name, r.subject, r.predicate, r.object LIMIT ?"
+        )
+        return self._rows(query, (*given, k))
+
+    def spaces(self, memory: str | None) -> list[str]:
+        """Return the names of spaces that hold vectors. Raises `CatalogError` where the server has no pgvector."""
+        if not self.has_vectors:
+            raise CatalogError(f"the server at {self._where} has no pgvector; with it, `list3r catalog rebuild`")
+        known = self._rows("SELECT name, space_id FROM space ORDER BY name", ())
+        if memory is None:
+            return [str(name) for name, _ in known]
+        query, number = "SELECT EXISTS (SELECT 1 FROM vector_{} WHERE memory_id = ?)", self._number(memory)
+        return [str(name) for name, n in known if self._rows(query.format(int(n)), (number,))[0][0]]
+
+    def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
+        """Return the vector of an instance."""
+        query = f"SELECT v::real[] FROM vector_{self._space(space)} WHERE memory_id = ? AND id = ?"
+        rows = self._rows(query, (self._number(memory), instance_id))
+        return np.array(rows[0][0], np.float32) if rows else None
+
+    def alike(
+        self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
+    ) -> list[tuple[CatalogThing, float]]:
+        """Return the k most alike: in one memory exactly, over all through the index of vectors."""
+        table, asked, count = f"vector_{self._space(space)}", _halfvec(vector), k
+        only, given = ("", ()) if memory is None else (" WHERE memory_id = ?", (self._number(memory),))
+        query = _marked(
+            f"SELECT memory_id, id, 1 - (v <=> ?::halfvec) FROM {table}{only} ORDER BY v <=> ?::halfvec LIMIT ?"
+        )
+        while True:
+            with self._connected("asked") as connection, connection.transaction():
+                connection.execute(f"SET LOCAL hnsw.ef_search = {max(_PROBED, min(2 * count, 1000))}")
+                connection.execute("SET LOCAL hnsw.iterative_scan = strict_order")
+                rows = connection.execute(query, (asked, *given, asked, count)).fetchall()
+            found = self._passing([row[:2] for row in rows], filters)
+            out = [(found[n, i], float(c)) for n, i, c in rows if (n, i) in found]
+            if len(out) >= k or len(rows) < count or count >= _MOST_ALIKE:
+                return out[:k]
+            count *= 4
+
+    def _passing(self, ids: Sequence[Any], filters: CatalogFilters) -> dict[tuple[int, int], CatalogThing]:
+        """Return those of some instances that pass the filters, by memory and id."""
+        passing, values = filters_sql(filters, "i")
+        query = (
+            f"SELECT {_THING}, i.memory_id FROM unnest(?::integer[], ?::bigint[]) a (memory_id, id) "
+            f"JOIN instance i USING (memory_id, id) JOIN memory m USING (memory_id) WHERE {passing}"
+        )
+        rows = self._rows(query, ([n for n, _ in ids], [i for _, i in ids], *values))
+        return {(int(row[-1]), int(row[1])): _thing(row[:-1]) for row in rows}
+
+    def _number(self, memory: str) -> int:
+        """Return the number of a memory, 0 where there is none of that name."""
+        rows = self._rows("SELECT memory_id FROM memory WHERE name = ?", (memory,))
+        return int(rows[0][0]) if rows else 0
+
+    def _space(self, space: str) -> int:
+        rows = self._rows("SELECT space_id FROM space WHERE name = ?", (space,))
+        if not rows:
+            raise CatalogError(f"the catalogue at {self._where} has no vectors of {space}")
+        return int(rows[0][0])
+
+    def alive(self) -> bool:
+        """Whether the database answers."""
+        try:
+            self._rows("SELECT 1", ())
+        except CatalogError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Let the connections go."""
+        self._connections.close()
+
+    def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
+        """Ask; once more where the connection was lost, as when the server was started again meanwhile."""
+        try:
+            with self._connections.one() as connection:
+                return _asked(connection, query, values)
+        except psycopg.OperationalError as error:
+            if error.sqlstate is not None and not error.sqlstate.startswith(("57P", "08")):
+                raise self._failed("asked", error) from error
+        except psycopg.Error as error:
+            raise self._failed("asked", error) from error
+        with self._connected("asked") as connection:
+            return _asked(connection, query, values)
+
+    @contextlib.contextmanager
+    def _connected(self, what: str) -> Iterator[psycopg.Connection[Any]]:
+        try:
+            with self._connections.one() as connection:
+                yield connection
+        except psycopg.Error as error:
+            raise self._failed(what, error) from error
+
+    def _failed(self, what: str, error: Exception) -> CatalogError:
+        return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_said(error)}")
+
+
+def _asked(connection: psycopg.Connection[Any], query: str, values: Sequence[Any]) -> list[Any]:
+    found: list[Any] = connection.execute(_marked(query), values).fetchall()
+    return found
+
+
+def _checked(url: str) -> str:
+    """Return host and name of a URL for messages. Raises `CatalogError` for one that carries a password."""
+    parts = urlsplit(url)
+    if parts.password is not None or "password=" in parts.query:
+        raise CatalogError(
+            "a password in the URL can be read by everyone on this machine; "
+            "put it into PGPASSWORD, ~/.pgpass or a service file"
+        )
+    return f"{parts.hostname or 'this machine'}{parts.path}"
+
+
+def _said(error: Exception) -> str:
+    """Return in one line what the server or the library says."""
+    text = getattr(getattr(error, "diag", None), "message_primary", None) or str(error).strip() or type(error).__name__
+    return str(text).splitlines()[0]
+
+
+def _migrated(connection: psycopg.Connection[Any]) -> bool:
+    """Bring the schema up to date; return whether the database has vectors. Raises `CatalogError`."""
+    known = _first(connection.execute("SELECT to_regclass('list3r.version')"))[0]
+    done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0) if known else 0
+    if done > len(MIGRATIONS):
+        raise CatalogError(f"the catalogue has schema {done}, of a newer list3r; this one knows {len(MIGRATIONS)}")
+    if done < len(MIGRATIONS):
+        connection.execute("SELECT pg_advisory_xact_lock(%s)", (_SCHEMA_LOCK,))
+        connection.execute("CREATE SCHEMA IF NOT EXISTS list3r")
+        connection.execute("CREATE TABLE IF NOT EXISTS version (number integer PRIMARY KEY)")
+        done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0)
+        for name in ("cube", "btree_gist"):
+            connection.execute(f"CREATE EXTENSION IF NOT EXISTS {name} SCHEMA public")
+        if connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'vector'").fetchone():
+            connection.execute("CREATE EXTENSION IF NOT EXISTS vector SCHEMA public")
+        for number, statements in enumerate(MIGRATIONS[done:], done + 1):
+            connection.execute(statements.encode())
+            connection.execute("INSERT INTO version VALUES (%s)", (number,))
+    return connection.execute("SELECT 1 FROM pg_extension WHERE extname = 'vector'").fetchone() is not None
+
+
+def _copy_things(connection: psycopg.Connection[Any], memory: int, content: MemoryContent) -> None:
+    with connection.cursor() as cursor:
+        with cursor.copy("COPY instance FROM STDIN") as copy:
+            for t in content.things:
+                low, high = t.bounds()
+                bounds = f"({','.join(map(repr, low))}),({','.join(map(repr, high))})"
+                told = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
+                words = list(t.words), list(t.words.values())
+                copy.write_row((memory, t.id, *told, t.box_numbers(), bounds, *words))
+        with cursor.copy("COPY relation FROM STDIN") as copy:
+            for row in content.relations:
+                copy.write_row((memory, *row))
+
+
+def _copy_vectors(connection: psycopg.Connection[Any], memory: int, space: int, held: SpaceVectors) -> None:
+    with connection.cursor() as cursor, cursor.copy(f"COPY vector_{space} FROM STDIN") as copy:
+        for n, vector in zip(held.ids.tolist(), held.vectors, strict=True):
+            copy.write_row((memory, n, _halfvec(vector)))
+
+
+def _halfvec(vector: NDArray[np.float32]) -> str:
+    """Return a vector of unit length as pgvector writes it."""
+    unit = vector / max(float(np.linalg.norm(vector)), 1e-12)
+    return "[" + ",".join(f"{x:.5g}" for x in unit.tolist()) + "]"
+
+
+def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
+    return f"{alias}.words @> ?::text[]", [list(words)]
+
+
+def _marked(query: str) -> bytes:
+    """Return a query with the marks of values that this database takes. What is given never stands in its text."""
+    return query.replace("?", "%s").encode()
+
+
+def _first(cursor: psycopg.Cursor[Any]) -> Any:
+    return cursor.fetchone() or ()
+
+
+def _thing(row: Sequence[Any]) -> CatalogThing:
+    return thing_of(row, np.array(row[9], np.float64))

@@ -1,0 +1,51 @@
+"""The schema of a catalogue in PostgreSQL: numbered migrations, append-only, each in a transaction."""
+
+from __future__ import annotations
+
+PARTITIONS = 16
+"""Of the tables of instances and relations, by memory."""
+
+
+def _partitioned(table: str) -> str:
+    return "".join(
+        f"CREATE TABLE {table}_{n} PARTITION OF {table} FOR VALUES WITH (MODULUS {PARTITIONS}, REMAINDER {n});"
+        for n in range(PARTITIONS)
+    )
+
+
+MIGRATIONS: tuple[str, ...] = (
+    f"""
+    CREATE TABLE memory (
+        memory_id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, name text NOT NULL UNIQUE, path text NOT NULL,
+        revision integer NOT NULL, sha256 text NOT NULL, bytes bigint NOT NULL, mtime_ns bigint NOT NULL,
+        scale_kind text NOT NULL, gravity text NOT NULL, instances integer NOT NULL, sessions integer NOT NULL,
+        added_at timestamptz NOT NULL DEFAULT now());
+    CREATE TABLE instance (
+        memory_id integer NOT NULL, id bigint NOT NULL, label text, description text NOT NULL, state text NOT NULL,
+        structure text, confidence real NOT NULL, sigma real, component integer NOT NULL, box real[] NOT NULL,
+        bounds cube NOT NULL, words text[] NOT NULL, weights smallint[] NOT NULL,
+        PRIMARY KEY (memory_id, id)) PARTITION BY HASH (memory_id);
+    {_partitioned("instance")}
+    CREATE INDEX instance_bounds ON instance USING gist (memory_id, bounds);
+    CREATE INDEX instance_words ON instance USING gin (words) WITH (fastupdate = off);
+    CREATE TABLE relation (
+        memory_id integer NOT NULL, subject bigint NOT NULL, predicate text NOT NULL, object bigint NOT NULL,
+        confidence real NOT NULL, margin real NOT NULL,
+        PRIMARY KEY (memory_id, subject, predicate, object)) PARTITION BY HASH (memory_id);
+    {_partitioned("relation")}
+    CREATE INDEX relation_by_object ON relation (memory_id, object);
+    CREATE TABLE space (
+        space_id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, name text NOT NULL UNIQUE,
+        dimension integer NOT NULL);
+    """,
+)
+
+
+def vector_table(space_id: int, dimension: int) -> str:
+    """Return the statements that make the table of the vectors of one space."""
+    table = f"vector_{int(space_id)}"
+    return (
+        f"CREATE TABLE {table} (memory_id integer NOT NULL, id bigint NOT NULL, v halfvec({int(dimension)}) NOT NULL, "
+        f"PRIMARY KEY (memory_id, id)); "
+        f"CREATE INDEX {table}_alike ON {table} USING hnsw (v halfvec_cosine_ops)"
+    )

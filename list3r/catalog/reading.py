@@ -1,0 +1,81 @@
+"""Read what a catalogue takes from a memory file."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from pathlib import Path
+
+from list3r.batch.storage import fetched, is_remote
+from list3r.catalog.records import CatalogError, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
+from list3r.memory.description.words import vocabulary
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
+
+
+def read_content(path: str, name: str | None = None) -> MemoryContent:
+    """Return the content of a memory file, under its own name unless another is given.
+
+    Raises `MemoryFileError` for what is no memory, `CatalogError` for one that is being written.
+    """
+    if is_remote(path):
+        with tempfile.TemporaryDirectory() as folder:
+            local = fetched(path, Path(folder) / "memory")
+            return _content(local, path, 0, name)
+    local = Path(path).resolve()
+    if not local.is_file():
+        raise CatalogError(f"{path} is no file; name a memory, such as house.l3r")
+    return _content(local, str(local), local.stat().st_mtime_ns, name)
+
+
+def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryContent:
+    log = local.with_name(f"{local.name}-wal")
+    if log.exists() and log.stat().st_size:
+        raise CatalogError(f"{path} is being written; wait for it to end, or `list3r repair` folds its log in")
+    name = printable(name or Path(path).stem)
+    with Store.open(local) as store, store.snapshot():
+        things = [_thing(name, i) for i in store.instances.all()]
+        relations = [
+            (r.subject, r.predicate, r.object, float(r.confidence), float(r.margin)) for r in store.relations.all()
+        ]
+        spaces = [SpaceVectors(printable(s), *store.embeddings.all(s)) for s in store.embeddings.spaces()]
+        entry = MemoryEntry(
+            name,
+            path,
+            0,
+            _sha256(local),
+            local.stat().st_size,
+            mtime_ns,
+            store.facts.scale_kind or "relative",
+            store.facts.gravity,
+            sum(t.structure is None for t in things),
+            len(store.sessions.all()),
+        )
+    return MemoryContent(entry, things, relations, spaces)
+
+
+def _thing(memory: str, i: Instance) -> CatalogThing:
+    known = vocabulary(i.label, i.structure, i.description, i.color_name)
+    return CatalogThing(
+        memory,
+        i.id,
+        None if i.label is None else printable(i.label),
+        printable(i.description),
+        i.state,
+        i.structure,
+        float(i.confidence),
+        i.position_sigma_m,
+        i.component,
+        i.box,
+        {word: round(100 * weight) for word, weight in known.items()},
+    )
+
+
+def printable(text: str) -> str:
+    """Return a text without what a database cannot hold: NUL, and halves of characters."""
+    return text.replace("\x00", "\ufffd").encode("utf-8", "replace").decode("utf-8")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

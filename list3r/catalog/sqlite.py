@@ -1,0 +1,339 @@
+"""The embedded catalogue: one SQLite file on one machine."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
+from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
+from list3r.memory.geometry import OrientedBox
+
+_APPLICATION_ID = 0x4C334331
+"""ASCII "L3C1"."""
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS memory (
+    memory_id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, path TEXT NOT NULL, revision INTEGER NOT NULL,
+    sha256 TEXT NOT NULL, bytes INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, scale_kind TEXT NOT NULL,
+    gravity TEXT NOT NULL, instances INTEGER NOT NULL, sessions INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS instance (
+    number INTEGER PRIMARY KEY, memory_id INTEGER NOT NULL REFERENCES memory, id INTEGER NOT NULL, label TEXT,
+    description TEXT NOT NULL, state TEXT NOT NULL, structure TEXT, confidence REAL NOT NULL, sigma REAL,
+    component INTEGER NOT NULL, box BLOB NOT NULL, UNIQUE (memory_id, id));
+CREATE VIRTUAL TABLE IF NOT EXISTS bounds USING rtree (
+    number, min_x, max_x, min_y, max_y, min_z, max_z, min_memory, max_memory);
+CREATE TABLE IF NOT EXISTS word (
+    word TEXT NOT NULL, number INTEGER NOT NULL REFERENCES instance, weight INTEGER NOT NULL,
+    PRIMARY KEY (word, number)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS relation (
+    memory_id INTEGER NOT NULL REFERENCES memory, subject INTEGER NOT NULL, predicate TEXT NOT NULL,
+    object INTEGER NOT NULL, confidence REAL NOT NULL, margin REAL NOT NULL,
+    PRIMARY KEY (memory_id, subject, predicate, object)) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS relation_by_object ON relation (memory_id, object);
+CREATE TABLE IF NOT EXISTS vector (
+    space TEXT NOT NULL, memory_id INTEGER NOT NULL REFERENCES memory, id INTEGER NOT NULL, v BLOB NOT NULL,
+    PRIMARY KEY (space, memory_id, id)) WITHOUT ROWID;
+"""
+_ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
+_THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
+_FROM = "FROM instance i JOIN memory m ON m.memory_id = i.memory_id"
+_OF_MEMORY = "i.memory_id = (SELECT memory_id FROM memory WHERE name = ?)"
+_BATCH = 20_000
+_GROW = 4.0
+"""How much further is looked where too little lies within a distance."""
+
+
+class SqliteBackend:
+    """A catalogue in a file; one process writes while others read."""
+
+    def __init__(self, path: str) -> None:
+        """Make the file where there is none. Raises `CatalogError` for one that is no catalogue."""
+        self._path = Path(path)
+        self._turn = threading.RLock()
+        try:
+            self._database = sqlite3.connect(path, timeout=30.0, isolation_level=None, check_same_thread=False)
+            known = self._database.execute("PRAGMA application_id").fetchone()[0]
+            if known not in (0, _APPLICATION_ID) or (known == 0 and self._tables()):
+                raise CatalogError(f"{path} is no catalogue; name another file")
+            if known == 0:
+                self._database.execute("PRAGMA journal_mode = WAL")
+                self._database.executescript(
+                    f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA application_id = {_APPLICATION_ID}; COMMIT"
+                )
+        except sqlite3.Error as error:
+            raise CatalogError(f"{path} cannot be opened as a catalogue: {error}; name another file") from error
+
+    def _tables(self) -> bool:
+        return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
+
+    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+        """Write a memory in place of what has its name."""
+        with self._writing():
+            known = self.memories([content.entry.name])
+            before = known[0] if known else content.entry
+            if known and not anew and replace(content.entry, revision=before.revision) == before:
+                return before
+            same = bool(known) and before.sha256 == content.entry.sha256
+            entry = replace(content.entry, revision=before.revision + (not same))
+            if known:
+                self._forget(entry.name)
+            names = ", ".join(f.name for f in fields(MemoryEntry))
+            marks = ", ".join("?" for _ in fields(MemoryEntry))
+            row = self._database.execute(f"INSERT INTO memory ({names}) VALUES ({marks})", astuple(entry))
+            self._write(int(row.lastrowid or 0), content)
+            return entry
+
+    def _write(self, memory: int, content: MemoryContent) -> None:
+        database = self._database
+        first = int(database.execute("SELECT coalesce(max(number), 0) + 1 FROM instance").fetchone()[0])
+        things = list(enumerate(content.things, first))
+        marks = ", ".join("?" for _ in range(11))
+        rows = ((n, memory, *_told(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in things)
+        database.executemany(f"INSERT INTO instance VALUES ({marks})", rows)
+        boxes = ((n, *(v for pair in zip(*t.bounds(), strict=True) for v in pair), memory, memory) for n, t in things)
+        database.executemany("INSERT INTO bounds VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", boxes)
+        database.executemany(
+            "INSERT INTO word VALUES (?, ?, ?)",
+            sorted((w, n, weight) for n, t in things for w, weight in t.words.items()),
+        )
+        database.executemany(
+            "INSERT INTO relation VALUES (?, ?, ?, ?, ?, ?)", ((memory, *r) for r in content.relations)
+        )
+        for space in content.spaces:
+            held = zip(space.ids.tolist(), _unit(space.vectors).astype("<f2"), strict=True)
+            database.executemany(
+                "INSERT INTO vector VALUES (?, ?, ?, ?)", ((space.space, memory, n, v.tobytes()) for n, v in held)
+            )
+
+    def drop(self, name: str) -> bool:
+        """Forget a memory; whether there was one."""
+        with self._writing():
+            known = bool(self.memories([name]))
+            if known:
+                self._forget(name)
+            return known
+
+    def _forget(self, name: str) -> None:
+        (memory,) = self._database.execute("SELECT memory_id FROM memory WHERE name = ?", (name,)).fetchone()
+        own = "SELECT number FROM instance WHERE memory_id = ?"
+        for table in ("bounds", "word"):
+            self._database.execute(f"DELETE FROM {table} WHERE number IN ({own})", (memory,))
+        for table in ("instance", "relation", "vector", "memory"):
+            self._database.execute(f"DELETE FROM {table} WHERE memory_id = ?", (memory,))
+
+    def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
+        """Return entries by name."""
+        if names is None:
+            rows = self._rows(f"SELECT {_ENTRY} FROM memory m ORDER BY m.name", ())
+        else:
+            rows = [
+                r
+                for n in sorted(set(names))
+                for r in self._rows(f"SELECT {_ENTRY} FROM memory m WHERE m.name = ?", (n,))
+            ]
+        return [MemoryEntry(*row) for row in rows]
+
+    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+        """Return one instance."""
+        rows = self._rows(f"SELECT {_THING} {_FROM} WHERE {_OF_MEMORY} AND i.id = ?", (memory, instance_id))
+        return _thing(rows[0]) if rows else None
+
+    def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
+        """Return the k nearest by axis-aligned boxes: of those within a distance that grows until they are enough."""
+        at, reach = np.asarray(point, np.float64), 1.0
+        whole = self._rows(
+            f"SELECT min(b.min_x), min(b.min_y), min(b.min_z), max(b.max_x), max(b.max_y), max(b.max_z) "
+            f"FROM bounds b JOIN instance i ON i.number = b.number WHERE {_OF_MEMORY}",
+            (memory,),
+        )[0]
+        if whole[0] is None:
+            return []
+        corners = np.array(whole, np.float64).reshape(2, 3)
+        farthest = float(np.linalg.norm(np.maximum(np.abs(corners - at), 0.0).max(axis=0))) + 1.0
+        while True:
+            found = self.inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
+            gaps = [_gap(t, at) for t in found]
+            if sum(g <= reach for g in gaps) >= k or reach >= farthest:
+                order = sorted(range(len(found)), key=lambda n: (gaps[n], found[n].id))
+                return [found[n] for n in order[:k]]
+            reach *= _GROW
+
+    def inside(
+        self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
+    ) -> list[CatalogThing]:
+        """Return instances whose axis-aligned boxes meet a box; all with a negative limit."""
+        passing, values = filters_sql(filters, "i")
+        low, high = lower, upper
+        query = (
+            f"SELECT {_THING} FROM bounds b JOIN instance i ON i.number = b.number JOIN memory m USING (memory_id) "
+            "WHERE b.min_memory <= (SELECT memory_id FROM memory WHERE name = ?) "
+            "AND b.max_memory >= (SELECT memory_id FROM memory WHERE name = ?) "
+            "AND b.max_x >= ? AND b.min_x <= ? AND b.max_y >= ? AND b.min_y <= ? AND b.max_z >= ? AND b.min_z <= ? "
+            f"AND {passing} ORDER BY i.id LIMIT ?"
+        )
+        ends = [v for pair in zip(low, high, strict=True) for v in pair]
+        return [_thing(row) for row in self._rows(query, (memory, memory, *ends, *values, limit))]
+
+    def named(
+        self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
+    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+        """Return the k that are wanted with how well the words name them."""
+        where, values = _where(memory, wanted, filters)
+        marks = ", ".join("?" for _ in wanted.words)
+        weight = (
+            f"(SELECT avg(weight) FROM word w WHERE w.number = i.number AND w.word IN ({marks}))" if marks else "100"
+        )
+        query = (
+            f"WITH chosen AS MATERIALIZED (SELECT i.number {_FROM} WHERE {where} LIMIT {MOST_RANKED}) "
+            f"SELECT {_THING}, {weight} AS weight, (SELECT count(*) FROM chosen) "
+            "FROM chosen JOIN instance i USING (number) JOIN memory m USING (memory_id) "
+            "ORDER BY weight DESC, i.confidence DESC, m.name, i.id LIMIT ?"
+        )
+        rows = self._rows(query, (*values, *wanted.words, k))
+        return [(_thing(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
+
+    def related(
+        self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
+    ) -> list[tuple[str, int, str, str, int, str, float, float]]:
+        """Return relations, the surest first."""
+        (a, values), (b, more) = wanted_sql(subject, "s", _bearing), wanted_sql(object, "o", _bearing)
+        parts, given = [a, b], [*values, *more]
+        if memory is not None:
+            parts.append("m.name = ?")
+            given.append(memory)
+        if predicate is not None:
+            parts.append("r.predicate = ?")
+            given.append(predicate)
+        query = (
+            "SELECT m.name, r.subject, coalesce(s.label, s.description), r.predicate, r.object, "
+            "coalesce(o.label, o.description), r.confidence, r.margin FROM relation r JOIN memory m USING (memory_id) "
+            "JOIN instance s ON s.memory_id = r.memory_id AND s.id = r.subject "
+            "JOIN instance o ON o.memory_id = r.memory_id AND o.id = r.object "
+            f"WHERE {' AND '.join(parts)} ORDER BY r.confidence DESC, m.name, r.subject, r.predicate, r.object LIMIT ?"
+        )
+        return [tuple(row) for row in self._rows(query, (*given, k))]
+
+    def spaces(self, memory: str | None) -> list[str]:
+        """Return the names of spaces that hold vectors."""
+        where, values = ("", ()) if memory is None else (f"WHERE {_OF_MEMORY.replace('i.', '')}", (memory,))
+        return [str(s) for (s,) in self._rows(f"SELECT DISTINCT space FROM vector {where} ORDER BY space", values)]
+
+    def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
+        """Return the vector of an instance."""
+        query = f"SELECT v FROM vector i WHERE space = ? AND {_OF_MEMORY} AND id = ?"
+        rows = self._rows(query, (space, memory, instance_id))
+        return np.frombuffer(rows[0][0], "<f2").astype(np.float32) if rows else None
+
+    def alike(
+        self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
+    ) -> list[tuple[CatalogThing, float]]:
+        """Return the k most alike: all vectors are compared, so the answer is exact."""
+        passing, values = filters_sql(filters, "i")
+        only, given = ("", ()) if memory is None else (f" AND {_OF_MEMORY}", (memory,))
+        query = (
+            "SELECT i.number, v.v FROM vector v JOIN instance i ON i.memory_id = v.memory_id AND i.id = v.id "
+            f"WHERE v.space = ? AND {passing}{only}"
+        )
+        best = np.zeros((0, 2))
+        unit = _unit(vector[None])[0]
+        with self._reading():
+            rows = self._database.execute(query, (space, *values, *given))
+            while some := rows.fetchmany(_BATCH):
+                held = np.frombuffer(b"".join(v for _, v in some), "<f2").reshape(len(some), -1).astype(np.float32)
+                if held.shape[1] != len(unit):
+                    raise CatalogError(f"a vector of {len(unit)} numbers is none of {space}, which has {held.shape[1]}")
+                both = np.column_stack([held @ unit, [n for n, _ in some]])
+                best = np.concatenate([best, both])
+                best = best[np.lexsort((best[:, 1], -best[:, 0]))[:k]]
+            query = f"SELECT {_THING} {_FROM} WHERE i.number = ?"
+            return [(_thing(self._database.execute(query, (int(n),)).fetchone()), float(c)) for c, n in best]
+
+    def alive(self) -> bool:
+        """Whether the file can be read."""
+        try:
+            self._rows("SELECT 1 FROM memory LIMIT 1", ())
+        except CatalogError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+    def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
+        with self._reading():
+            return self._database.execute(query, values).fetchall()
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            with self._turn:
+                yield
+        except sqlite3.Error as error:
+            raise CatalogError(
+                f"{self._path} cannot be read: {error}; `list3r catalog rebuild` makes it anew"
+            ) from error
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            self._database.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+            except BaseException:
+                if self._database.in_transaction:  # SQLite ends it itself where the disk is full
+                    self._database.execute("ROLLBACK")
+                raise
+            self._database.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise CatalogError(f"{self._path} cannot be written: {error}; nothing was changed") from error
+
+
+def _told(t: CatalogThing) -> tuple[object, ...]:
+    return t.id, t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component
+
+
+def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
+    one = f"{alias}.number IN (SELECT number FROM word WHERE word = ?)"
+    return " AND ".join([one] * len(words)), list(words)
+
+
+def _where(memory: str | None, wanted: Wanted, filters: CatalogFilters) -> tuple[str, list[Any]]:
+    (a, values), (b, more) = wanted_sql(wanted, "i", _bearing), filters_sql(filters, "i")
+    if memory is None:
+        return f"{a} AND {b}", [*values, *more]
+    return f"{a} AND {b} AND {_OF_MEMORY}", [*values, *more, memory]
+
+
+def _thing(row: Sequence[Any]) -> CatalogThing:
+    return thing_of(row, np.frombuffer(row[9], "<f4").astype(np.float64))
+
+
+def thing_of(row: Sequence[Any], box: NDArray[np.float64]) -> CatalogThing:
+    """Return an instance of a row of its fields and the 15 numbers of its box."""
+    memory, id, label, description, state, structure, confidence, sigma, component = row[:9]
+    told = (label, description, state, structure, confidence, sigma, component)
+    return CatalogThing(memory, id, *told, box_of(box), {})
+
+
+def box_of(numbers: NDArray[np.float64]) -> OrientedBox:
+    """Return the box of its 15 numbers: centre, size, rotation."""
+    return OrientedBox(numbers[:3], numbers[3:6], numbers[6:].reshape(3, 3))
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float32)
+
+
+def _gap(thing: CatalogThing, point: NDArray[np.float64]) -> float:
+    low, high = map(np.array, thing.bounds())
+    return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))

@@ -1,0 +1,162 @@
+"""catalog add, remove, list, check, rebuild: many memories in one catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from list3r.cli.answer import print_answer
+from list3r.cli.common import JsonOption, note, print_table
+from list3r.cli.terminal import say
+
+if TYPE_CHECKING:
+    from list3r.catalog import Catalog
+
+VARIABLE = "LIST3R_CATALOG"
+CatalogOption = Annotated[
+    str,
+    typer.Option(
+        "--catalog",
+        metavar="URL",
+        envvar=VARIABLE,
+        show_envvar=False,
+        help="postgresql://host/name, or a file; default: LIST3R_CATALOG, else catalog.sqlite here.",
+    ),
+]
+Files = Annotated[list[str], typer.Argument(metavar="FILE...", help="Memory files, or folders of them.")]
+_DEFAULT = "catalog.sqlite"
+_app = typer.Typer(help="Many memories in one catalogue.", no_args_is_help=True, rich_markup_mode=None)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    for name, command in (("add", add), ("remove", remove), ("list", list_), ("check", check), ("rebuild", rebuild)):
+        _app.command(name)(command)
+    app.add_typer(_app, name="catalog")
+
+
+def add(
+    files: Files,
+    catalog: CatalogOption = _DEFAULT,
+    name: Annotated[str | None, typer.Option("--name", help="Of one memory; default: that of its file.")] = None,
+    store: Annotated[
+        str | None,
+        typer.Option("--store", metavar="DIR", help="Keep a copy there that never changes: a folder or URL."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Take memories into the catalogue; one of a name that is there takes its place, with the next revision.
+
+    Example: list3r catalog add memories/ --catalog postgresql://db.example/list3r
+    """
+    from list3r.memory.errors import OptionError
+
+    found = list(_memories(files))
+    if name is not None and len(found) != 1:
+        raise OptionError(f"--name {name} is of one memory; {len(found)} are given")
+    with _opened(catalog) as opened:
+        entries = [asdict(opened.add(path, name, store)) for path in found]
+    if json:
+        print_answer(entries)
+        return
+    print_table([[e["name"], e["revision"], e["instances"], e["path"]] for e in entries], _HEADER)
+
+
+def remove(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of memories.")],
+    catalog: CatalogOption = _DEFAULT,
+    json: JsonOption = False,
+) -> None:
+    """Forget memories; their files stay.
+
+    Example: list3r catalog remove kitchen
+    """
+    with _opened(catalog) as opened:
+        for name in names:
+            opened.remove(name)
+    if json:
+        print_answer([{"name": name} for name in names])
+    else:
+        say(f"forgot {', '.join(names)}")
+
+
+def list_(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
+    """All memories of the catalogue.
+
+    Example: list3r catalog list --catalog catalog.sqlite
+    """
+    with _opened(catalog) as opened:
+        entries = opened.memories()
+    if json:
+        print_answer(map(asdict, entries), total=len(entries))
+        return
+    print_table([[e.name, e.revision, e.instances, e.path] for e in entries], _HEADER)
+
+
+def check(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
+    """Tell which files have changed or gone since they were catalogued; status 1 where any has.
+
+    Example: list3r catalog check
+    """
+    from list3r.catalog.catalog import is_stale
+
+    with _opened(catalog) as opened:
+        stale = [e for e in opened.memories() if is_stale(e)]
+    if json:
+        print_answer(map(asdict, stale), total=len(stale))
+    else:
+        print_table([[e.name, e.revision, e.instances, e.path] for e in stale], _HEADER)
+    if stale:
+        note(f"{len(stale)} changed or gone; `list3r catalog add FILE` takes one in again")
+        raise typer.Exit(1)
+
+
+def rebuild(
+    files: Annotated[
+        list[str] | None, typer.Argument(metavar="[FILE...]", help="Memory files, or folders; default: those it knows.")
+    ] = None,
+    catalog: CatalogOption = _DEFAULT,
+    json: JsonOption = False,
+) -> None:
+    """Write the catalogue anew from the files; what is not among them is forgotten.
+
+    Example: list3r catalog rebuild memories/
+    """
+    with _opened(catalog) as opened:
+        known = opened.memories()
+        found = {e.path: e.name for e in known} if files is None else dict.fromkeys(_memories(files))
+        entries = [opened.again(path, name) for path, name in found.items()]
+        gone = sorted({e.name for e in known} - {e.name for e in entries})
+        for name in gone:
+            opened.remove(name)
+    if json:
+        print_answer(map(asdict, entries), removed=gone)
+        return
+    note(f"{len(entries)} memories; forgot {', '.join(gone) or 'none'}")
+
+
+_HEADER = ("memory", "revision", "things", "file")
+
+
+def _opened(url: str) -> Catalog:
+    from list3r.catalog import Catalog
+
+    return Catalog.open(url)
+
+
+def _memories(files: Sequence[str]) -> Iterator[str]:
+    """Yield memory files, those in folders too. Raises `OptionError` for a folder without any."""
+    from list3r.memory.errors import OptionError
+
+    for file in files:
+        if "://" in file or not Path(file).is_dir():
+            yield file
+            continue
+        found = sorted(str(p) for p in Path(file).glob("*.l3r"))
+        if not found:
+            raise OptionError(f"{file} holds no memory (*.l3r)")
+        yield from found

@@ -1,0 +1,175 @@
+"""The questions of `query` asked of a catalogue: `--catalog URL`, in one memory or over all."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from list3r.cli.answer import print_answer
+from list3r.cli.common import asked_at, note, parse_point, print_table
+
+if TYPE_CHECKING:
+    from list3r.catalog import Catalog
+    from list3r.catalog.records import CatalogAnswers, CatalogFilters
+
+ALL = "@all"
+"""In the place of the memory: all memories of the catalogue."""
+_TOLD = {
+    "nearest": ("words", "point", "id", "k", "min_confidence", "state", "structure"),
+    "within": ("box", "point", "radius", "min_confidence", "structure"),
+    "find": ("text", "k"),
+    "similar": ("id", "image", "box", "k", "min_confidence", "structure", "everywhere"),
+    "relations": ("subject", "predicate", "object", "min_confidence"),
+}
+"""By question, the words that a catalogue can answer."""
+_MOST_RELATIONS = 1000
+Words = dict[str, Any]
+
+
+def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the same command with `--catalog URL`, which asks a catalogue about the memory of that name instead."""
+    name = command.__name__
+    signature = inspect.signature(command, eval_str=True)
+    option = Annotated[
+        str | None,
+        typer.Option("--catalog", metavar="URL", help=f"Ask a catalogue; MEMORY is a name in it, or {ALL}."),
+    ]
+    everywhere = Annotated[
+        bool, typer.Option("--everywhere", help="With --catalog: compare with the things of all memories.")
+    ]
+    kinds: dict[str, Any] = {"catalog": option, **({"everywhere": everywhere} if name == "similar" else {})}
+    defaults = {"catalog": None, "everywhere": False}
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    added = [inspect.Parameter(n, keyword, default=defaults[n], annotation=kind) for n, kind in kinds.items()]
+
+    @functools.wraps(command)
+    def asked(**words: Any) -> Any:
+        url, everywhere = words.pop("catalog", None), words.pop("everywhere", False)
+        if url is None:
+            if everywhere:
+                raise _option_error("--everywhere goes with --catalog URL")
+            return command(**words)
+        json, memory = words.pop("json"), str(words.pop("memory"))
+        _check(name, words, signature)
+        _ask(url, name, None if memory == ALL else memory, {**words, "everywhere": everywhere}, json)
+
+    asked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
+    asked.__annotations__ = {**get_type_hints(command, include_extras=True), **kinds}
+    return asked
+
+
+def _option_error(text: str) -> Exception:
+    from list3r.memory.errors import OptionError
+
+    return OptionError(text)
+
+
+def _check(name: str, words: Words, signature: inspect.Signature) -> None:
+    """Raise `OptionError` for what is asked that only a file can tell."""
+    if asked_at() is not None:
+        raise _option_error("--at is a question to one file; leave it out, or ask the file")
+    for word, value in words.items():
+        if word not in _TOLD[name] and value != signature.parameters[word].default:
+            told = word.replace("_", "-")
+            raise _option_error(f"--{told} is a question to one file; leave it out, or ask the file")
+
+
+def _ask(url: str, name: str, memory: str | None, words: Words, json: bool) -> None:
+    from list3r.catalog import Catalog
+    from list3r.catalog.records import CatalogFilters
+
+    filters = CatalogFilters(
+        bool(words.get("structure")), float(words.get("min_confidence") or 0.0), words.get("state")
+    )
+    with Catalog.open(url) as catalog:
+        if name == "relations":
+            found = catalog.relations(memory, **{w: words[w] for w in _TOLD[name][:3]}, k=_MOST_RELATIONS)
+            rows = [r for r in found if r.confidence >= filters.min_confidence]
+            _print(rows, found, json, _relation_row, _RELATIONS)
+            return
+        ask = {"nearest": _nearest, "within": _within, "find": _find, "similar": _similar}[name]
+        found = ask(catalog, memory, words, filters)
+    _print(list(found), found, json, _match_row, _MATCHES)
+
+
+def _one(memory: str | None) -> str:
+    if memory is None:
+        raise _option_error(f"a place is one of one memory; name that instead of {ALL}")
+    return memory
+
+
+def _nearest(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
+    point, near, told = words["point"], words["id"], words["words"]
+    if told is not None and (point is not None or near is not None):
+        raise _option_error("words and a place together are a question to one file; leave one of them out")
+    if told is not None:
+        return catalog.find(told, memory, k=words["k"], filters=filters)
+    at = None if point is None else parse_point(point, "--point")
+    return catalog.nearest(_one(memory), point=at, instance_id=near, k=words["k"], filters=filters)
+
+
+def _within(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
+    from list3r.cli.ask.words import CameraWords, RegionWords
+
+    region = RegionWords(words["box"], words["point"], words["radius"]).lengths(CameraWords())
+    return catalog.within(_one(memory), **region, filters=filters)  # type: ignore[arg-type]
+
+
+def _find(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
+    return catalog.find(words["text"], memory, k=words["k"], filters=filters)
+
+
+def _similar(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
+    anywhere = memory is None or words["everywhere"]
+    asked: Words = {"anywhere": anywhere, "k": words["k"], "filters": filters}
+    if words["image"] is None:
+        return catalog.similar(memory, instance_id=words["id"], **asked)
+    vector, space = _picture(catalog, memory, words)
+    return catalog.similar(memory, vector=vector, space=space, **asked)
+
+
+def _picture(catalog: Catalog, memory: str | None, words: Words) -> tuple[Any, str]:
+    """Return the vector of a picture, by the model of the first memory that can be opened here, and its space."""
+    from list3r.api import open as open_scene
+    from list3r.cli.ask.words import LikeWords
+    from list3r.semantics.picture_query import picture_query
+
+    entries = catalog.memories() if memory is None else [catalog.memory(memory)]
+    path = next((e.path for e in entries if Path(e.path).is_file()), None)
+    if path is None:
+        raise _option_error("no file of the catalogue lies on this machine, which names the model of the picture")
+    like = LikeWords(words["id"], words["image"], words["box"])
+    with open_scene(path) as scene:
+        asked = picture_query(scene.store, words["image"], like.corners())
+    if asked.part is not None:
+        raise _option_error("pictures are compared by vectors of a model; `list3r embed` makes those of the memories")
+    return asked.vector, asked.space
+
+
+_MATCHES = ("memory", "id", "what", "score", "distance", "file", "why")
+_RELATIONS = ("memory", "id", "subject", "predicate", "id", "object", "conf", "file")
+
+
+def _match_row(m: Any) -> list[object]:
+    what = m.label or m.description
+    return [m.memory, m.id, what, m.score, "" if m.distance is None else f"{m.distance:.3f}", m.path, m.reason]
+
+
+def _relation_row(r: Any) -> list[object]:
+    return [r.memory, r.subject, r.subject_name, r.predicate, r.object, r.object_name, r.confidence, r.path]
+
+
+def _print(
+    rows: list[Any], found: CatalogAnswers, json: bool, row: Callable[[Any], list[object]], header: tuple[str, ...]
+) -> None:
+    if json:
+        print_answer(map(asdict, rows), None, found.notes)
+        return
+    note(*(f"note: {line}" for line in found.notes))
+    print_table(map(row, rows), header)

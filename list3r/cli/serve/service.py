@@ -1,0 +1,58 @@
+"""serve: a catalogue over HTTP."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from typing import Annotated
+
+import typer
+
+from list3r.cli.catalog.commands import CatalogOption
+from list3r.cli.common import note
+from list3r.cli.terminal import say
+
+SECRET_VARIABLE = "LIST3R_SERVE_SECRET"
+_FIRST_TOKEN_HOURS = 24.0
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command("serve")(serve)
+
+
+def serve(
+    catalog: CatalogOption = "catalog.sqlite",
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", help="0: any free one.")] = 8750,
+    workers: Annotated[int, typer.Option("--workers", metavar="N", help="Processes.")] = 1,
+    timeout: Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="For one request.")] = 10.0,
+    hours: Annotated[
+        float | None, typer.Option("--token-for", metavar="HOURS", help="Print a token that holds so long, and stop.")
+    ] = None,
+) -> None:
+    """Serve a catalogue over HTTP. Clients send a token made with --token-for and the secret in LIST3R_SERVE_SECRET;
+    without a secret a new one is made, and a token for a day is printed.
+
+    Example: list3r serve --catalog postgresql://db.example/list3r --workers 4
+    """
+    from list3r.memory.errors import OptionError
+    from list3r.service.tokens import make_token
+
+    secret = os.environ.get(SECRET_VARIABLE)
+    if hours is not None:
+        if secret is None:
+            raise OptionError(f"--token-for signs with the secret of the service; set {SECRET_VARIABLE}")
+        say(make_token(secret, hours))
+        return
+    known, secret = secret is not None, secret or secrets.token_urlsafe(32)
+    token = make_token(secret, _FIRST_TOKEN_HOURS)
+    from list3r.service.limits import ServiceLimits
+    from list3r.service.running import ServiceAddress
+    from list3r.service.running import serve as run
+
+    def started(address: str) -> None:
+        note(address)
+        note("Authorization: Bearer " + (f"TOKEN of --token-for and {SECRET_VARIABLE}" if known else token))
+
+    run(catalog, secret, ServiceAddress(host, port, workers), ServiceLimits(request_s=timeout), started)

@@ -1,0 +1,115 @@
+"""Whether given poses fit the depth of the frames: depth of one frame, seen from another, must meet its depth.
+
+Recorders differ in the axes of a camera and in which way a pose leads; a wrong guess still runs, and makes a world of
+nonsense. What fits far better in another convention is told apart here from poses that merely drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera, Frame, FrameSource
+from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """When poses are taken for those of another convention."""
+
+    pairs: int = 6
+    """Pairs of frames that are looked at, spread over the source."""
+    gaps: tuple[int, ...] = (1, 4, 12, 30)
+    """Frames between the two of a pair; the first gap over which the camera has moved enough."""
+    least_turn_deg: float = 4.0
+    """Motion that tells conventions apart, or"""
+    least_shift_m: float = 0.08
+    stride: int = 6
+    """Every so many-th pixel is compared."""
+    tolerance: float = 0.05
+    """Depth that differs by less than this share agrees."""
+    least_points: int = 100
+    good: float = 0.75
+    """Another convention is meant where at least this share agrees in it,"""
+    gain: float = 0.2
+    """and so much more than as the poses are read: neighbours agree by half in any convention."""
+
+
+CONVENTIONS = {
+    "as they are read": lambda T: T,
+    "with the camera's y and z turned round (OpenGL against OpenCV)": lambda T: T @ OPENGL_TO_OPENCV,
+    "led the other way (world to camera)": np.linalg.inv,
+    "led the other way and turned round": lambda T: np.linalg.inv(T) @ OPENGL_TO_OPENCV,
+}
+"""What a pose may have been meant as; the first is what the reader makes of it."""
+
+
+def wrong_convention(source: FrameSource, settings: AgreementSettings | None = None) -> str | None:
+    """Return in which convention the poses of a source fit its depth, where that is not the one they are read in.
+
+    None where they fit, or where it cannot be told: without depth, without motion, or when nothing fits.
+    """
+    s, info = settings or AgreementSettings(), source.info
+    if not (info.has_depth and info.has_poses and info.camera is not None and info.poses_metric):
+        return None
+    shares: dict[str, list[float]] = {name: [] for name in CONVENTIONS}
+    for start in np.linspace(0, max(0, info.frame_count - 2), s.pairs).astype(int).tolist():
+        pair = _pair(source, start, s)
+        if pair is None:
+            continue
+        for name, change in CONVENTIONS.items():
+            share = _share(*pair, [change(f.T_source_cam) for f in pair], info.camera, s)
+            shares[name].append(share)
+    if len(shares["as they are read"]) < min(2, s.pairs):
+        return None
+    middle = {name: float(np.median(found)) for name, found in shares.items()}
+    stated, best = next(iter(middle.values())), max(middle, key=lambda name: middle[name])
+    return best if middle[best] >= max(s.good, stated + s.gain) else None
+
+
+def _pair(source: FrameSource, start: int, s: AgreementSettings) -> tuple[Frame, Frame] | None:
+    """Two frames with depth and pose between which the camera moved enough."""
+    first = _whole(source, start)
+    for gap in s.gaps if first is not None else ():
+        if start + gap >= source.info.frame_count:
+            break
+        other = _whole(source, start + gap)
+        if first is None or other is None:
+            continue
+        assert first.T_source_cam is not None and other.T_source_cam is not None
+        step = np.linalg.inv(first.T_source_cam) @ other.T_source_cam
+        turn = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
+        if turn >= s.least_turn_deg or np.linalg.norm(step[:3, 3]) >= s.least_shift_m:
+            return first, other
+    return None
+
+
+def _whole(source: FrameSource, position: int) -> Frame | None:
+    frame = next(iter(source.read(position, position + 1)), None)
+    if not isinstance(frame, Frame) or frame.depth is None or frame.T_source_cam is None:
+        return None
+    return frame
+
+
+def _share(a: Frame, b: Frame, poses: list[Pose], camera: Camera, s: AgreementSettings) -> float:
+    """Return the share of a's depth that meets b's, of what falls on b's known depth; 0 where hardly anything does."""
+    assert a.depth is not None and b.depth is not None
+    row, column = np.nonzero(a.depth[:: s.stride, :: s.stride] > 0)
+    row, column = row * s.stride, column * s.stride
+    z = a.depth[row, column].astype(np.float64)
+    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(z))], axis=1)
+    T_b_a = np.linalg.inv(poses[1]) @ poses[0]
+    points = (z[:, None] * rays) @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    front = points[:, 2] > 1e-3
+    uv = np.rint(points[front, :2] / points[front, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+    inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1)
+    u, v = uv[inside].astype(np.int64).T
+    seen, expected = b.depth[v, u], points[front, 2][inside]
+    known = seen > 0
+    if known.sum() < min(s.least_points, 0.2 * len(z)):
+        return 0.0
+    return float((np.abs(seen[known] - expected[known]) < s.tolerance * expected[known]).mean())

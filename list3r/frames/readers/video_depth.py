@@ -1,0 +1,119 @@
+"""A recording whose pictures are a video and whose depth and poses lie beside it, by the number of the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.decoding.decode import read_raw_depth
+from list3r.frames.layout import Optics
+from list3r.frames.options import Intrinsics, SourceOptions
+from list3r.frames.readers.video import VideoSource
+from list3r.frames.recordings.stored import CodedArray, Stored
+from list3r.frames.registration.rig import WORKING_SIDES, build_rig
+from list3r.memory.errors import FrameError
+
+
+@dataclass(frozen=True)
+class RecordingParts:
+    """What lies beside the video."""
+
+    kind: str
+    video: Path
+    intrinsics: Intrinsics
+    """Of the pictures as stored; depth shares the view."""
+    depth: Mapping[int, Stored | CodedArray]
+    poses: Mapping[int, NDArray[np.float64]]
+    """T_source_cam (4, 4), OpenCV's axes."""
+    units_per_m: float
+    note: str
+    z_up: bool = False
+    poses_drift: bool = False
+    confidence: Callable[[int], Path] | None = None
+    """The file of a frame's confidence, which need not exist."""
+    least_confidence: int = 0
+
+
+class VideoWithDepth:
+    """A `FrameSource`: the pictures of the video, each with depth and pose of its number."""
+
+    def __init__(self, root: Path, parts: RecordingParts, options: SourceOptions) -> None:
+        """Raises `SourceError` and `OptionError` where the files do not fit together."""
+        side = WORKING_SIDES[True] if options.max_side is None else options.max_side
+        words = replace(options, kind="auto", intrinsics=parts.intrinsics, max_side=side, depth_scale=None)
+        self._video, self._parts = VideoSource(parts.video, words), parts
+        stored = self._video.stored_size
+        scale = options.depth_scale or parts.units_per_m
+        lens = options.distortion or ()
+        optics = Optics(parts.intrinsics, lens, parts.intrinsics, np.eye(4), scale, stored, stored)
+        size = read_raw_depth(next(iter(parts.depth.values()))).shape if parts.depth else None
+        self._rig = build_rig(optics, stored, (size[0], size[1]) if size else None, options.max_depth_m, side)
+        self._info = self._describe(root)
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was recognised."""
+        return self._info
+
+    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
+        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
+        return self.read_every(start, stop, 1)
+
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but only each `step`-th frame from `start` on."""
+        for frame in self._video.read_every(start, stop, step):
+            try:
+                yield frame if isinstance(frame, BadFrame) else self._with_depth(frame)
+            except FrameError as error:
+                yield BadFrame(frame.index, str(error))
+
+    def position(self, index: int) -> int:
+        """Where a frame (Frame.index) is among those handed out."""
+        return self._video.position(index)
+
+    def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
+        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
+        numbers = (self._video.number(k) for k in range(self._info.frame_count))
+        found = ((k, self._video.time_s(k), self._parts.poses.get(k)) for k in numbers)
+        return [(k, time_s, T) for k, time_s, T in found if T is not None]
+
+    def _with_depth(self, frame: Frame) -> Frame:
+        depth = None
+        if self._parts.depth:
+            if frame.index not in self._parts.depth:
+                raise FrameError(f"frame {frame.index} has no depth image")
+            depth = self._rig.depth(self._sure(frame.index))
+        return replace(frame, depth=depth, T_source_cam=self._parts.poses.get(frame.index))
+
+    def _sure(self, number: int) -> NDArray[np.generic]:
+        raw = read_raw_depth(self._parts.depth[number])
+        path = None if self._parts.confidence is None else self._parts.confidence(number)
+        if path is None or not path.is_file():
+            return raw
+        confidence = read_raw_depth(path)
+        if confidence.shape != raw.shape:
+            raise FrameError(f"{path.name}: confidence and depth are of different sizes")
+        return np.where(confidence >= self._parts.least_confidence, raw, np.zeros((), raw.dtype))
+
+    def _describe(self, root: Path) -> SourceInfo:
+        info, parts, registration = self._video.info, self._parts, self._rig.registration
+        return replace(
+            info,
+            kind=parts.kind,
+            path=str(root),
+            has_depth=bool(parts.depth),
+            has_poses=bool(parts.poses),
+            scale_kind="metric" if parts.depth else "relative",
+            depth_camera=registration.depth_camera if registration else None,
+            T_color_depth=registration.T_color_depth if registration else None,
+            depth_scale=self._rig.depth_scale if parts.depth else None,
+            notes=(*info.notes, parts.note),
+            missing=tuple(m for m in info.missing if "depth" not in m) if parts.depth else info.missing,
+            z_up=parts.z_up,
+            poses_drift=parts.poses_drift,
+        )

@@ -1,0 +1,1 @@
+"""A catalogue over HTTP: stateless, bounded, for many processes side by side."""

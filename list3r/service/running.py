@@ -1,0 +1,73 @@
+"""Processes that serve a catalogue."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import uvicorn
+from uvicorn.supervisors import Multiprocess
+
+from list3r.catalog import Catalog
+from list3r.memory.errors import OptionError
+from list3r.service.app import CATALOG_VARIABLE, SECRET_VARIABLE, TIMEOUT_VARIABLE
+from list3r.service.limits import BoundedProtocol, ServiceLimits
+
+
+@dataclass(frozen=True)
+class ServiceAddress:
+    """Where a service listens, with how many processes."""
+
+    host: str = "127.0.0.1"
+    port: int = 8750
+    """0: any free one."""
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise OptionError(f"--workers {self.workers}: at least 1 process is needed")
+
+
+def serve(
+    catalog: str, secret: str, address: ServiceAddress, limits: ServiceLimits, started: Callable[[str], None]
+) -> None:
+    """Serve a catalogue until interrupted. `started` is told the address once the port is taken.
+
+    Raises `OptionError` where the port is taken, `CatalogError` where the catalogue cannot be opened.
+    """
+    Catalog.open(catalog).close()  # what is wrong with it is said here, and once
+    os.environ |= {CATALOG_VARIABLE: catalog, SECRET_VARIABLE: secret, TIMEOUT_VARIABLE: str(limits.request_s)}
+    listener = _listen(address.host, address.port)
+    config = uvicorn.Config(
+        "list3r.service.app:from_environment",
+        factory=True,
+        http=BoundedProtocol,
+        ws="none",
+        workers=address.workers,
+        log_level="warning",
+        limit_concurrency=limits.at_once,
+        timeout_keep_alive=math.ceil(limits.request_s),
+        timeout_graceful_shutdown=math.ceil(limits.request_s),
+        server_header=False,
+    )
+    started(f"http://{address.host}:{listener.getsockname()[1]}/v1")
+    if address.workers == 1:
+        uvicorn.Server(config).run(sockets=[listener])
+    else:
+        Multiprocess(config, sockets=[listener]).run()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except (OSError, OverflowError) as error:
+        listener.close()
+        raise OptionError(f"--host {host} --port {port} cannot be served: {error}; name another") from error
+    listener.listen(128)
+    listener.set_inheritable(True)
+    return listener

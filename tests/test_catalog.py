@@ -1,0 +1,348 @@
+"""A catalogue of many memories, in SQLite and in a real PostgreSQL: the same answers, and nothing wrong by force."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from list3r.catalog import Catalog
+from list3r.catalog.base import open_backend
+from list3r.catalog.catalog import aabb_distance, box_distance
+from list3r.catalog.reading import read_content
+from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
+from list3r.cli.app import run as list3r
+from list3r.memory.errors import List3rError, OptionError, UnknownIdError
+from list3r.memory.geometry import OrientedBox, rotation_exp
+from list3r.memory.store.store import Store
+from tests.conftest import write_small_room
+from tests.postgres_server import PostgresServer, running_postgres
+
+SPACE = "test@1/16"
+STRANGE = ("x'; DROP TABLE memory; --", '"%s ? $1 {}', "\\", "a\x00b", "mug' OR 1=1")
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PostgresServer]:
+    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'list3r[catalog]'")
+    with running_postgres() as found:
+        yield found
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgres"])
+def url(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A catalogue with a random memory, which the tests only add to."""
+    if request.param == "sqlite":
+        found = str(tmp_path_factory.mktemp("catalog") / "catalog.sqlite")
+    else:
+        found = request.getfixturevalue("server").url
+    backend = open_backend(found)
+    backend.put(content("random"))
+    backend.put(content("other", seed=2))
+    backend.close()
+    return found
+
+
+@pytest.fixture
+def catalog(url: str) -> Iterator[Catalog]:
+    with Catalog.open(url) as opened:
+        yield opened
+
+
+def content(name: str, count: int = 120, seed: int = 1) -> MemoryContent:
+    """A memory of boxes that stand askew, with names, relations and vectors."""
+    chance = np.random.default_rng(seed)
+    things = []
+    for n in range(count):
+        box = OrientedBox(chance.uniform(0, 4, 3), chance.uniform(0.1, 1.0, 3), rotation_exp(chance.normal(size=3)))
+        label, structure = ("mug", "box", "lamp")[n % 3], "floor" if n % 10 == 9 else None
+        state = "removed" if n % 7 == 6 else "present"
+        told = (label, f"red {label}", state, structure, float(n % 5) / 5 + 0.1, 0.01, 1, box)
+        things.append(CatalogThing(name, n, *told, {label: 100, "red": 90}))
+    relations = [(n, "on", n + 1, 0.9, 0.1) for n in range(0, count - 1, 2)]
+    vectors = chance.normal(size=(count, 16)).astype(np.float32)
+    entry = MemoryEntry(name, f"/none/{name}.l3r", 0, f"{name}{seed}", 9, 0, "relative", "known", count, 1)
+    return MemoryContent(entry, things, relations, [SpaceVectors(SPACE, np.arange(count), vectors)])
+
+
+def passing(filters: CatalogFilters) -> list[CatalogThing]:
+    wanted = content("random").things
+    wanted = [t for t in wanted if t.confidence >= filters.min_confidence and (filters.structure or not t.structure)]
+    return [t for t in wanted if filters.state == "any" or t.state == (filters.state or "present")]
+
+
+FILTERS = [
+    CatalogFilters(),
+    CatalogFilters(structure=True, state="any"),
+    CatalogFilters(min_confidence=0.6, state="removed"),
+]
+
+
+@pytest.mark.parametrize("filters", FILTERS)
+@pytest.mark.parametrize("point", [(1.0, 2.0, 3.0), (50.0, -9.0, 0.5)])
+def test_nearest_are_those_of_all_boxes(catalog: Catalog, filters: CatalogFilters, point: tuple[float, ...]) -> None:
+    found = catalog.nearest("random", point=point, k=7, filters=filters)
+    truth = sorted((box_distance(t, np.array(point)), t.id) for t in passing(filters))[:7]
+    assert [m.distance for m in found] == pytest.approx([d for d, _ in truth], abs=2e-4)
+    assert {(m.memory, m.revision, m.units) for m in found} == {("random", 1, "unit")}
+    assert not [m for m in catalog.nearest("random", instance_id=4, k=7) if m.id == 4]
+
+
+def test_within_are_the_boxes_that_meet_a_region(catalog: Catalog) -> None:
+    middle = np.array((2.0, 2.0, 2.0))
+    inside = {m.id for m in catalog.within("random", center=middle, radius=0.8)}
+    assert inside == {t.id for t in passing(CatalogFilters()) if box_distance(t, middle) <= 0.8}
+    met = {m.id for m in catalog.within("random", lower=middle - 1, upper=middle + 1)}
+    assert inside <= met
+    assert all(aabb_distance(t, middle) > 1 for t in passing(CatalogFilters()) if t.id not in met)
+
+
+def test_phrases_find_things_in_one_memory_and_over_all(catalog: Catalog) -> None:
+    mugs = {t.id for t in passing(CatalogFilters()) if t.label == "mug"}
+    assert {m.id for m in catalog.find("red mugs", "random", k=100)} == mugs
+    everywhere = catalog.find("mug", k=1000)
+    assert {m.id for m in everywhere if m.memory == "random"} == mugs
+    assert "other" in {m.memory for m in everywhere}
+    confident = [m.confidence for m in everywhere if m.memory == "random"]
+    assert confident == sorted(confident, reverse=True)
+    on = {m.id for m in catalog.find("mug on a box", "random", k=100)}
+    assert on == {n for n in mugs if n % 2 == 0 and (n + 1) % 3 == 1}
+    assert catalog.find("purple mug") == []
+    for text in ("small mug", "mug left of box", "#3", "mug between box and lamp"):
+        with pytest.raises(OptionError, match="ask the memory's file"):
+            catalog.find(text)
+
+
+def test_stored_relations_answer_by_words_and_ids(catalog: Catalog) -> None:
+    found = catalog.relations("random", subject=2)
+    assert [(r.subject, r.predicate, r.object) for r in found] == [(2, "on", 3)]
+    found = catalog.relations(subject="mug", predicate="on", object="box", k=1000)
+    assert {r.memory for r in found} == {"random", "other"}
+    assert {(r.subject % 3, r.object % 3) for r in found} == {(0, 1)}
+    with pytest.raises(OptionError, match="not one that is stored"):
+        catalog.relations("random", predicate="left_of")
+    with pytest.raises(OptionError, match="number in one memory"):
+        catalog.relations(subject=3)
+
+
+def test_vectors_find_what_is_alike(catalog: Catalog) -> None:
+    held = {
+        (n, i): v for n, s in (("random", 1), ("other", 2)) for i, v in enumerate(content(n, seed=s).spaces[0].vectors)
+    }
+    query = held["random", 3]
+    try:
+        found = catalog.similar("random", instance_id=3, k=5)
+    except CatalogError as error:
+        pytest.skip(str(error))
+    shown = {("random", t.id) for t in passing(CatalogFilters())}
+    cosine = {p: float(v @ query / np.linalg.norm(v) / np.linalg.norm(query)) for p, v in held.items()}
+    own = sorted((p for p in shown if p != ("random", 3)), key=lambda p: -cosine[p])[:5]
+    assert [(m.memory, m.id) for m in catalog.similar("random", instance_id=3, anywhere=False)] == own
+    assert [m.score for m in found] == pytest.approx([cosine[m.memory, m.id] for m in found], abs=2e-3)
+    assert found[0].score >= cosine[own[0]] - 2e-3
+    assert catalog.similar(vector=query, space=SPACE, k=1)[0].id == 3
+    with pytest.raises(List3rError, match=r"no vectors of|16"):
+        catalog.similar(vector=np.ones(3), space=SPACE)
+    with pytest.raises(OptionError, match="not all zero"):
+        catalog.similar(vector=np.zeros(16), space=SPACE)
+
+
+@pytest.mark.parametrize("text", STRANGE)
+def test_what_is_asked_is_never_part_of_a_statement(catalog: Catalog, text: str) -> None:
+    before = catalog.memories()
+    asked: list[Callable[[], Any]] = [
+        lambda: catalog.nearest(text, point=(0, 0, 0)),
+        lambda: catalog.find(text),
+        lambda: catalog.find("mug", text),
+        lambda: catalog.relations(subject=text, predicate="on"),
+        lambda: catalog.similar(text, instance_id=1),
+        lambda: catalog.similar(vector=np.ones(16), space=text),
+        lambda: catalog.remove(text),
+        lambda: catalog.nearest("random", instance_id=2**63),
+    ]
+    for ask in asked:
+        try:
+            assert list(ask()) == []
+        except List3rError as error:
+            assert "\n" not in str(error)
+    assert catalog.memories() == before
+
+
+def test_names_of_things_are_kept_as_they_are(url: str, catalog: Catalog) -> None:
+    """Labels, descriptions and names of memories of all kinds go in and come out."""
+    held, labels = content("strange", count=len(STRANGE)), [text.replace("\x00", "\ufffd") for text in STRANGE]
+    things = [replace(t, label=label, structure=None) for t, label in zip(held.things, labels, strict=True)]
+    backend = open_backend(url)
+    name = "m'); DELETE FROM memory; --"
+    backend.put(replace(held, entry=replace(held.entry, name=name), things=things))
+    found = catalog.nearest(name, point=(0, 0, 0), k=9, filters=CatalogFilters(state="any"))
+    assert {m.label for m in found} == {t.label for t in things}
+    assert {e.name for e in catalog.memories()} >= {name, "random", "other"}
+    assert backend.drop(name)
+    backend.close()
+
+
+def test_a_memory_that_cannot_be_written_whole_is_not_written(url: str, catalog: Catalog) -> None:
+    broken = content("random", seed=5)
+    broken = replace(broken, relations=[*broken.relations, broken.relations[0]])
+    before, answers = catalog.memory("random"), catalog.find("mug", "random", k=50)
+    backend = open_backend(url)
+    with pytest.raises(CatalogError, match="nothing was changed"):
+        backend.put(broken)
+    backend.close()
+    assert catalog.memory("random") == before
+    assert catalog.find("mug", "random", k=50) == answers
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    path = tmp_path / "room.l3r"
+    with Store.create(path) as store, store.transaction():
+        write_small_room(store)
+    return path
+
+
+def test_files_are_read_and_changes_of_them_noticed(catalog: Catalog, room: Path, tmp_path: Path) -> None:
+    first = catalog.add(room)
+    assert (first.revision, first.instances, first.sessions) == (1, 4, 1)
+    assert catalog.add(room) == first
+    mugs = catalog.find("mug on table", "room")
+    assert ([m.id for m in mugs], {m.stale for m in mugs}, {m.path for m in mugs}) == ([3, 4], {False}, {str(room)})
+    with Store.open(room, writable=True) as store, store.transaction():
+        store.instances.set_labels({3: "vase"})
+    mugs = catalog.find("mug", "room")
+    assert {m.stale for m in mugs} == {True}
+    assert "catalog add" in mugs.notes[0]
+    assert catalog.add(room).revision == 2
+    assert [m.id for m in catalog.find("vase", "room")] == [3]
+    kept = catalog.add(room, store=str(tmp_path / "kept"))
+    assert (kept.revision, Path(kept.path).parent) == (2, tmp_path / "kept")
+    room.write_bytes(b"")
+    assert {m.stale for m in catalog.find("vase", "room")} == {False}
+    Path(kept.path).unlink()
+    assert {m.stale for m in catalog.find("vase", "room")} == {True}
+    catalog.remove("room")
+    with pytest.raises(CatalogError, match="no memory 'room'"):
+        catalog.find("vase", "room")
+    with pytest.raises(UnknownIdError):
+        catalog.nearest("random", instance_id=4000)
+
+
+def test_a_memory_that_is_being_written_is_not_catalogued(room: Path) -> None:
+    with Store.open(room, writable=True) as store:
+        with store.transaction():
+            store.instances.set_labels({3: "vase"})
+        with pytest.raises(CatalogError, match="being written"):
+            read_content(str(room))
+
+
+def test_a_catalogue_written_anew_answers_the_same(room: Path, tmp_path: Path) -> None:
+    shutil.copy(room, tmp_path / "second.l3r")
+    with Catalog.open(str(tmp_path / "a.sqlite")) as one, Catalog.open(f"sqlite:///{tmp_path}/b.sqlite") as other:
+        for path in (room, tmp_path / "second.l3r"):
+            one.add(path)
+            other.again(str(path))
+            one.again(str(path))
+        assert one.memories() == other.memories()
+        assert list(one.find("mug", k=9)) == list(other.find("mug", k=9))
+
+
+def test_files_that_are_no_catalogue_are_refused(tmp_path: Path, room: Path) -> None:
+    with pytest.raises(CatalogError, match="is no catalogue"):
+        Catalog.open(str(room))
+    (tmp_path / "text").write_text("no database at all, but long enough to be taken for the head of one" * 20)
+    with pytest.raises(CatalogError, match="cannot be opened"):
+        Catalog.open(str(tmp_path / "text"))
+    with pytest.raises(CatalogError, match="mysql:// is no catalogue"):
+        Catalog.open("mysql://here/a")
+
+
+def test_the_commands_keep_and_ask_a_catalogue(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LIST3R_CATALOG", str(tmp_path / "c.sqlite"))
+    url = str(tmp_path / "c.sqlite")
+
+    def answer(*words: str, status: int = 0) -> dict[str, Any]:
+        assert list3r([*words, "--json"]) == status
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        assert found["schema"] == "list3r/answer/1"
+        return found
+
+    assert [e["name"] for e in answer("catalog", "add", str(tmp_path))["matches"]] == ["room"]
+    ask = ("--catalog", url)
+    assert [m["id"] for m in answer("query", "find", "@all", "mug on table", *ask)["matches"]] == [3, 4]
+    assert answer("query", "nearest", "room", "--id", "3", "-k", "1", *ask)["matches"][0]["path"] == str(room)
+    assert [
+        m["id"] for m in answer("query", "within", "room", "--point", "2,1,0.4", "--radius", "0.3", *ask)["matches"]
+    ] == [5]
+    assert answer("query", "similar", "room", "--id", "3", "--everywhere", *ask)["matches"][0]["memory"] == "room"
+    assert len(answer("query", "relations", "room", "--predicate", "on", *ask)["matches"]) == 3
+    assert answer("query", "nearest", "room", "--id", "3", "--color", "red", *ask, status=2)["error"]
+    assert answer("query", "within", "@all", "--point", "0,0,0", "--radius", "1", *ask, status=2)["error"]
+    assert answer("catalog", "check")["total"] == 0
+    os.utime(room, (1, 1))
+    assert answer("catalog", "check", status=1)["matches"][0]["name"] == "room"
+    assert answer("catalog", "rebuild")["matches"][0]["revision"] == 1
+    assert answer("catalog", "list")["total"] == 1
+    assert answer("catalog", "remove", "room")["matches"] == [{"name": "room"}]
+
+
+def test_passwords_and_wrong_servers_are_told_in_one_line(server: PostgresServer, tmp_path: Path) -> None:
+    with pytest.raises(CatalogError, match="PGPASSWORD") as refused:
+        Catalog.open("postgresql://me:secret@db.example/list3r")
+    assert "secret" not in str(refused.value)
+    with pytest.raises(CatalogError, match="cannot be opened") as absent:
+        Catalog.open(f"postgresql:///none?host={tmp_path}")
+    assert "\n" not in str(absent.value)
+
+
+def test_a_role_that_may_only_read_asks_and_writes_nothing(server: PostgresServer) -> None:
+    psycopg = pytest.importorskip("psycopg")
+    backend = open_backend(server.url)
+    backend.put(content("shown"))
+    backend.close()
+    with psycopg.connect(server.url) as owner:
+        owner.execute("CREATE ROLE reader LOGIN; GRANT USAGE ON SCHEMA list3r TO reader")
+        owner.execute("GRANT SELECT ON ALL TABLES IN SCHEMA list3r TO reader")
+    with Catalog.open(server.url.replace("//postgres@", "//reader@")) as reader:
+        assert reader.find("mug", "shown")
+        with pytest.raises(CatalogError, match="permission denied"):
+            reader.remove("shown")
+
+
+def test_a_server_that_dies_is_told_and_asked_again_when_it_is_back(server: PostgresServer) -> None:
+    with Catalog.open(server.url) as catalog:
+        backend = open_backend(server.url)
+        backend.put(content("kept"))
+        backend.close()
+        before = catalog.find("mug", "kept", k=50)
+        assert before
+        server.kill()
+        with pytest.raises(CatalogError, match="cannot be asked") as told:
+            catalog.find("mug", "kept")
+        assert "\n" not in str(told.value)
+        assert not catalog.alive()
+        server.start()
+        assert catalog.find("mug", "kept", k=50) == before
+
+
+def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "full.sqlite"
+    backend = open_backend(str(path))
+    backend.put(content("kept"))
+    backend._database.execute("PRAGMA max_page_count = 60")  # type: ignore[attr-defined]
+    with pytest.raises(CatalogError, match="full; nothing was changed"):
+        backend.put(content("more", count=2000))
+    assert [e.name for e in backend.memories()] == ["kept"]
+    backend.close()
+    with sqlite3.connect(path) as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)

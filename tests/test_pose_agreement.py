@@ -1,0 +1,92 @@
+"""Poses of another convention than a format states are told apart by the depth that they carry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from list3r.frames.base import Frame, SourceInfo
+from list3r.frames.options import SourceOptions
+from list3r.frames.pose_agreement import CONVENTIONS, wrong_convention
+from list3r.frames.source import open_source
+from list3r.memory.errors import SourceError
+from list3r.pipeline.session import check_convention
+from tests import recordings
+from tests.recordings import WITH_DEPTH, shots
+from tests.rgbd_scenes import CAMERA, frames_along, walk
+
+
+@pytest.mark.parametrize("kind", WITH_DEPTH)
+def test_poses_as_the_format_states_them_fit(kind: str, tmp_path: Path) -> None:
+    assert wrong_convention(open_source(WITH_DEPTH[kind](tmp_path / "walk"))) is None
+
+
+class Walk:
+    """A source of frames that are there."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+        self.info = SourceInfo("tum", "walk", len(frames), 30.0, CAMERA, True, True, "metric", "")
+
+    def read(self, start: int, stop: int) -> list[Frame]:
+        return self._frames[start:stop]
+
+
+def meant(T: np.ndarray, name: str) -> np.ndarray:
+    """The pose that a reader gets of someone who writes in a convention."""
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    return {"as": T, "with": T @ flip, "led": np.linalg.inv(T)}.get(name.split()[0], T)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return frames_along(walk(45)[::3])
+
+
+@pytest.mark.parametrize("name", list(CONVENTIONS)[:3])
+def test_the_convention_that_was_meant_is_named(name: str, frames: list[Frame]) -> None:
+    told = [replace(f, T_source_cam=meant(f.T_source_cam, name)) for f in frames if f.T_source_cam is not None]
+    found = wrong_convention(Walk(told))  # type: ignore[arg-type]
+    assert found == (None if name.startswith("as") else name)
+
+
+def test_drift_is_no_other_convention(frames: list[Frame]) -> None:
+    drifting = []
+    for k, f in enumerate(frames):
+        T = np.array(f.T_source_cam)
+        T[:3, 3] += 0.01 * k
+        drifting.append(replace(f, T_source_cam=T))
+    assert wrong_convention(Walk(drifting)) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["record3d", "polycam"])
+def test_a_recording_whose_cameras_are_turned_twice_is_refused(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    right = recordings.arkit
+    monkeypatch.setattr(recordings, "arkit", lambda T: right(T) @ flip)
+    path = WITH_DEPTH[kind](tmp_path / "walk")
+    with pytest.raises(SourceError, match="turned round"):
+        check_convention(path, SourceOptions())
+
+
+def test_a_world_with_y_up_is_not_taken_for_one_with_z_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    right = recordings.arkit
+    standing = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    level = np.linalg.inv(shots()[0].T_world_cam)  # filmed level, with z up as OpenCV's -y
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    monkeypatch.setattr(recordings, "arkit", lambda T: right(upright @ level @ T))
+    assert open_source(recordings.write_record3d(tmp_path / "a")).info.z_up
+    monkeypatch.setattr(recordings, "arkit", lambda T: standing @ right(upright @ level @ T))
+    assert not open_source(recordings.write_record3d(tmp_path / "b")).info.z_up
+
+
+def test_a_camera_of_another_size_is_doubted(tmp_path: Path) -> None:
+    whole = open_source(recordings.write_nerfstudio(tmp_path / "a"))
+    assert not any("another size" in note for note in whole.info.notes)
+    wrong = open_source(recordings.write_nerfstudio(tmp_path / "b", cx=39.5, cy=29.5))
+    assert any("another size" in note for note in wrong.info.notes)
