@@ -43,7 +43,8 @@ def pale_picture(frame: PlanFrame, things: list[Support], floors: list[Support],
 
 def hatched(pixels: Image) -> Image:
     """Return the picture with strokes where nothing was seen. Shape (H, W, 3)."""
-    unseen = binary_opening((pixels > PAPER - 2).all(axis=2), iterations=3)
+    blank: NDArray[np.bool_] = np.asarray((pixels > PAPER - 2).all(axis=2))
+    unseen = binary_opening(blank, iterations=3)
     y, x = np.indices(unseen.shape)
     return np.where((unseen & ((x + y) % _HATCH_PX == 0))[..., None], _HATCH, pixels)
 
