@@ -9,6 +9,7 @@ tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` s
 nothing. `things_scale` is the scale of the world by the middles of the things that are matched at IoU 0.5, over that
 by the cameras: 1 where things lie where the cameras saw them. Relations are those among things matched by masks.
 Walks and reconstructions that are in `--keep` are used again, and then the time is that of what is left.
+With `--step METRES` the walks are those of `wide_walks.py`, which says what is measured of them.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 from kept import read_kept
 from machine import machine, run_list3r, write_json
 from numpy.typing import NDArray
+from wide_walks import compare_walks
 
 from list3r.api import open as open_memory
 from list3r.evaluation.instances import match_boxes
@@ -73,8 +75,14 @@ def main() -> None:
     parser.add_argument("--seeds", default="31,32,33")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
+    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
+    parser.add_argument("--frames", type=int, default=150, help="of each such walk")
+    parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
+    if words.step is not None:
+        compare_walks(words)
+        return
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         root = words.keep or Path(scratch)

@@ -152,7 +152,7 @@ def _pace(command: list[str], memory: Path) -> list[float]:
         now = chunks_in(memory)
         at += [spent] * (now - held)
         held = now
-        time.sleep(0.01)
+        time.sleep(0.05)
     if process.returncode != 0:
         raise SystemExit(f"{' '.join(command)}: {process.communicate()[1].strip()}")
     return [b - a for a, b in zip(at, [*at[1:], spent], strict=True)]
@@ -171,7 +171,7 @@ def _reaches(process: subprocess.Popen[str], memory: Path, chunks: int, cpu_s: f
     while process.poll() is None:
         if chunks_in(memory) >= chunks:
             return _runs_for(process, _spent_s(process) + cpu_s)
-        time.sleep(0.01)
+        time.sleep(0.05)
     return False
 
 
@@ -183,7 +183,7 @@ def _runs_for(process: subprocess.Popen[str], cpu_s: float) -> bool:
     while process.poll() is None:
         if _spent_s(process) >= cpu_s:
             return True
-        time.sleep(0.01)
+        time.sleep(0.05)
     return False
 
 

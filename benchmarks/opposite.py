@@ -76,7 +76,9 @@ def measure(store: Store, truth: Trajectory, cut: int) -> dict[str, Any]:
     parts = [rows < cut, rows >= cut]
     if len(component) > 1 or not all(p.any() for p in parts):
         return told
-    S_truth_world = align(truth, Trajectory(truth.time_s[rows[parts[0]]], path[parts[0]]), with_scale=False)
+    first = rows[parts[0]]
+    known = Trajectory(truth.time_s[first], truth.T_world_cam[first])
+    S_truth_world = align(known, Trajectory(truth.time_s[first], path[parts[0]]), with_scale=False)
     error = np.linalg.inv(truth.T_world_cam[rows[parts[1]]]) @ _moved(S_truth_world, path[parts[1]])
     turn = np.degrees(np.arccos(np.clip((np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
     off = np.linalg.norm(error[:, :3, 3], axis=1)

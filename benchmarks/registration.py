@@ -1,7 +1,7 @@
 """Registration of chunks by their things alone, in simulated homes that are seen again from elsewhere or changed.
 
 python benchmarks/registration.py --preset opposite --seeds 66-80 --json FILE
-python benchmarks/registration.py --judge FILE     # the scores of FILE by the thresholds as they are now
+python benchmarks/registration.py --judge FILE FILE --json BOTH     # stored scores by the thresholds as they are now
 
 A home is filmed twice (`benchmarks.simulation.returns`): rooms and at last one of them, then that room again. Every
 chunk of the second run is registered to the last five of the first, and to as many of another home, with
@@ -34,10 +34,10 @@ def main() -> None:
     parser.add_argument("--preset", default="opposite")
     parser.add_argument("--seeds", default="61-80", help="first-last")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--judge", type=Path)
+    parser.add_argument("--judge", type=Path, nargs="+")
     words = parser.parse_args()
     if words.judge:
-        return _judged_again(words.judge, words.seeds)
+        return _judged_again(words.judge, words.json)
     first, last = (int(n) for n in words.seeds.split("-"))
     pairs: list[dict[str, Any]] = []
     before: Any = None
@@ -52,18 +52,18 @@ def main() -> None:
     print(machine())
 
 
-def _judged_again(path: Path, seeds: str) -> None:
-    """Judge stored scores of some seeds by the thresholds as they are now."""
+def _judged_again(paths: list[Path], out: Path | None) -> None:
+    """Judge stored scores by the thresholds as they are now."""
     from list3r.association.revisits.constellations.registration import RegistrationSettings, doubt
 
-    held = json.loads(path.read_text(encoding="utf-8"))
-    first, last = (int(n) for n in seeds.split("-"))
-    pairs = [p for p in held["pairs"] if first <= p["seed"] <= last]
+    held = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    pairs = [p for h in held for p in h["pairs"]]
     for pair in pairs:
         pair["believed"] = "agreeing" in pair and doubt(pair, RegistrationSettings()) is None
     found = summary(pairs)
     print(json.dumps(found))
-    write_json(path, {"preset": held["preset"], "scored_at": held["commit"], "total": found, "pairs": pairs})
+    scored_at = [h["commit"] for h in held]
+    write_json(out, {"preset": held[0]["preset"], "scored_at": scored_at, "total": found, "pairs": pairs})
 
 
 def summary(pairs: list[dict[str, Any]]) -> dict[str, Any]:

@@ -44,23 +44,26 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="where to keep the memory")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
-    truth, names = _truth(words.source, words.frames)
+    truth, names = read_truth(words.source, words.frames)
     with tempfile.TemporaryDirectory() as scratch:
-        folder = _colour_only(Path(scratch) / "colour", names)
+        folder = colour_only(Path(scratch) / "colour", names)
         given = folder if words.given_as == "folder" else _video(folder, Path(scratch), words.given_as)
-        ours = {"given_as": words.given_as, **_ours(given, Path(scratch), words, truth)}
+        ours = {
+            "given_as": words.given_as,
+            **built(given, words.keep or Path(scratch) / "memory.l3r", _options(words), truth),
+        }
         print(ours)
         if words.no_plain:
             write_json(words.json, {"source": words.source.name, "list3r": ours})
             return
-        plain = _plain(folder, Path(scratch), words, truth)
+        plain = plain_pycolmap(folder, Path(scratch), words.intrinsics, truth, words.plain_every)
         print(plain)
     ratio = ours["ate_sim3_m"] / plain["ate_sim3_m"] if plain["posed"] else float("nan")
     print(f"ATE ours by plain {ratio:.3f}", machine())
     write_json(words.json, {"source": words.source.name, "list3r": ours, "pycolmap": plain, "ratio": round(ratio, 4)})
 
 
-def _truth(source: Path, count: int | None) -> tuple[Trajectory, list[Path]]:
+def read_truth(source: Path, count: int | None) -> tuple[Trajectory, list[Path]]:
     """Given poses of the colour camera, at index / 30 s, and the colour pictures in order."""
     opened = open_source(source, SourceOptions(stop=count))
     poses = {index: T for index, _, T in opened.read_poses()}  # type: ignore[attr-defined]
@@ -69,7 +72,7 @@ def _truth(source: Path, count: int | None) -> tuple[Trajectory, list[Path]]:
     return Trajectory(np.array(rows) / 30.0, np.stack([poses[k] for k in rows])), names
 
 
-def _colour_only(folder: Path, names: list[Path]) -> Path:
+def colour_only(folder: Path, names: list[Path]) -> Path:
     """A folder of links to the colour pictures, with names that say nothing of their camera."""
     folder.mkdir()
     for number, name in enumerate(names):
@@ -108,11 +111,15 @@ def _video(folder: Path, scratch: Path, kind: str) -> Path:
     return path
 
 
-def _ours(folder: Path, scratch: Path, words: argparse.Namespace, truth: Trajectory) -> dict[str, Any]:
-    memory = words.keep or scratch / "memory.l3r"
-    options = ["--reconstruction", "sfm", "--workers", str(words.workers)]
+def _options(words: argparse.Namespace) -> list[str]:
+    options = ["--workers", str(words.workers)]
     options += ["--intrinsics", words.intrinsics] if words.intrinsics else []
-    options += ["--every", str(words.every)] if words.every else []
+    return options + (["--every", str(words.every)] if words.every else [])
+
+
+def built(folder: Path, memory: Path, options: list[str], truth: Trajectory) -> dict[str, Any]:
+    """What `list3r build FOLDER --reconstruction sfm` makes of pictures; `truth` at index / 30 s."""
+    options = ["--reconstruction", "sfm", *options]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     report, usage = run_list3r("build", str(folder), "-m", str(memory), *options)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -129,17 +136,19 @@ def _ours(folder: Path, scratch: Path, words: argparse.Namespace, truth: Traject
         **usage,
         "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
         "frames_per_s": round(report["frames"] / usage["wall_s"], 2),
-        "ate_sim3_m": _ate(truth, {k: (R, t) for k, R, t in rows}),
+        "ate_sim3_m": sim3_error(truth, {k: (R, t) for k, R, t in rows}),
         "stage_cpu_seconds": report["stage_seconds"],
     }
 
 
-def _plain(folder: Path, scratch: Path, words: argparse.Namespace, truth: Trajectory) -> dict[str, Any]:
-    """Whole-sequence incremental mapping by pycolmap on every n-th frame."""
+def plain_pycolmap(
+    folder: Path, scratch: Path, intrinsics: str | None, truth: Trajectory, every: int = 1
+) -> dict[str, Any]:
+    """Whole-sequence incremental mapping by pycolmap on every n-th frame; `truth` at index / 30 s."""
     import pycolmap
 
     pictures, database = scratch / "pictures", scratch / "plain.db"
-    camera = _write_frames(folder, pictures, words)
+    camera = _write_frames(folder, pictures, intrinsics, every)
     wall, cpu = time.monotonic(), time.process_time()
     pycolmap.set_random_seed(1)
     reader = pycolmap.ImageReaderOptions()
@@ -163,27 +172,29 @@ def _plain(folder: Path, scratch: Path, words: argparse.Namespace, truth: Trajec
             T = image.cam_from_world().matrix()
             poses[int(Path(image.name).stem)] = T[:, :3].T, -T[:, :3].T @ T[:, 3]
     return {
-        "every": words.plain_every,
+        "every": every,
         "frames": len(list(pictures.iterdir())),
         "posed": len(poses),
+        "models": len(made),
         "wall_s": round(wall, 1),
         "cpu_s": round(cpu, 1),
-        "ate_sim3_m": _ate(truth, poses),
+        "ate_sim3_m": sim3_error(truth, poses),
     }
 
 
-def _write_frames(folder: Path, pictures: Path, words: argparse.Namespace) -> Camera | None:
+def _write_frames(folder: Path, pictures: Path, intrinsics: str | None, every: int) -> Camera | None:
     """Every n-th frame as it is handed out."""
     pictures.mkdir()
-    intrinsics = parse_intrinsics(words.intrinsics) if words.intrinsics else None
-    source = open_source(folder, SourceOptions(intrinsics=intrinsics, every=words.plain_every))
+    known = parse_intrinsics(intrinsics) if intrinsics else None
+    source = open_source(folder, SourceOptions(intrinsics=known, every=every))
     for frame in source.read(0, source.info.frame_count):
         if isinstance(frame, Frame):
             cv2.imwrite(str(pictures / f"{frame.index:06d}.png"), frame.color[..., ::-1])
     return source.info.camera
 
 
-def _ate(truth: Trajectory, poses: dict[int, tuple[Any, Any]]) -> float:
+def sim3_error(truth: Trajectory, poses: dict[int, tuple[Any, Any]]) -> float:
+    """RMS distance of cameras (rotation, place) by index from the truth at index / 30 s, after Sim(3), metres."""
     rows = sorted(poses)
     if len(rows) < 3:
         return float("nan")

@@ -115,6 +115,19 @@ def test_other_processes_and_tries_make_the_same_bytes(
         assert database.execute("SELECT outcome, built FROM attempts").fetchall() == [("lost", 0)] * 2 + [("done", 1)]
 
 
+def test_what_was_under_way_when_a_batch_is_interrupted_is_pending(folder: Path, tmp_path: Path) -> None:
+    class Interrupted(Here):
+        def as_completed(self) -> Iterator[Outcome]:
+            raise KeyboardInterrupt
+
+    settings, group = BatchSettings(str(tmp_path / "out")), read_tasks(str(folder / "videos.jsonl"), ASKED)[0]
+    with pytest.raises(KeyboardInterrupt):
+        run_batch([group], engine := Interrupted(), settings)
+    assert engine.cancelled
+    with Ledger(settings.ledger()) as ledger:
+        assert [(r.state, r.attempts) for r in ledger.rows()] == [("pending", 1)]
+
+
 def test_a_task_that_is_lost_too_often_fails(folder: Path, tmp_path: Path) -> None:
     group = read_tasks(str(folder / "videos.jsonl"), ASKED)[0]
     report = run_batch([group], Here(lost=9), BatchSettings(str(tmp_path / "out"), retries=1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from list3r.exporters.components import read_components
-from list3r.exporters.palette import instance_color
+from list3r.exporters.plan.colors import PALETTE, plan_colors
 from list3r.exporters.plan.frame import PlanFrame, choose_rotation
-from list3r.exporters.plan.labels import TagTarget, place_tags
+from list3r.exporters.plan.labels import TagTarget, crossings, place_tags
 from list3r.exporters.plan.layout import PlanSettings, choose_layout
 from list3r.exporters.plan.margins import round_length
 from list3r.exporters.plan.picture import plan_image, write_plan
@@ -32,7 +33,7 @@ def test_the_picture_has_its_size_and_its_colours(make_memory: Callable[..., Pat
     assert picture.mode == "RGB"
     pixels = np.asarray(picture).reshape(-1, 3).astype(int)
     for id in (2, 3, 4, 5):
-        assert (np.abs(pixels - instance_color(id)).max(axis=1) <= 2).sum() > 20, f"the box of {id} is not drawn"
+        assert (np.abs(pixels - PALETTE[id]).max(axis=1) <= 2).sum() > 20, f"the box of {id} is not drawn"
 
 
 def test_width_follows_the_settings(make_memory: Callable[..., Path]) -> None:
@@ -111,7 +112,35 @@ def test_things_without_a_tag_are_faint(make_memory: Callable[..., Path]) -> Non
     with Store.open(make_memory()) as store:
         picture = plan_image(store, read_components(store)[0], PlanSettings(max_tags=2))
     pixels = np.asarray(picture).reshape(-1, 3).astype(int)
-    drawn = [int((np.abs(pixels - instance_color(id)).max(axis=1) <= 2).sum()) for id in (2, 3)]
-    legend_only = (np.abs(pixels - instance_color(5)).max(axis=1) <= 2).sum()
+    drawn = [int((np.abs(pixels - PALETTE[id]).max(axis=1) <= 2).sum()) for id in (2, 3)]
+    legend_only = (np.abs(pixels - PALETTE[5]).max(axis=1) <= 2).sum()
     assert min(drawn) > 2 * 20
     assert 0 < legend_only < drawn[0]
+
+
+def test_neighbours_have_different_colours() -> None:
+    places = {n: np.array(xy) for n, xy in enumerate(np.random.default_rng(0).uniform(0, 100, (60, 2)))}
+    colors = plan_colors(places)
+    for n in places:
+        earlier = sorted(range(n), key=lambda k: float(np.linalg.norm(places[k] - places[n])))[:6]
+        assert colors[n] not in {colors[k] for k in earlier}
+    assert plan_colors({}) == {} and set(colors.values()) <= set(PALETTE)
+
+
+def test_lines_that_cross_are_counted() -> None:
+    leaders = np.array([[0.0, 1.0, 2.0, 1.0], [5.0, 5.0, 6.0, 6.0]])
+    ends = np.array([[1.0, 2.0], [1.0, 0.5], [9.0, 0.0]])
+    assert crossings(np.array([1.0, 0.0]), ends, leaders).tolist() == [1, 0, 0]
+
+
+def test_a_vector_plan_says_what_the_picture_says(make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    path = make_memory()
+    with Store.open(path, writable=True) as store, store.transaction():
+        store.instances.set_labels({3: "Übel <b> & \x07"})
+    with Store.open(path) as store:
+        write_plan(store, tmp_path / "plan.svg")
+    page = xml.etree.ElementTree.parse(tmp_path / "plan.svg").getroot()
+    texts = [e.text for e in page.iter("{http://www.w3.org/2000/svg}text")]
+    assert "room.l3r" in texts and "Übel <b> & \\x07" in texts and {"2", "3", "4", "5"} <= set(texts)
+    images = list(page.iter("{http://www.w3.org/2000/svg}image"))
+    assert [i.get("href", "")[:22] for i in images] == ["data:image/png;base64,"]

@@ -56,7 +56,11 @@ def visit(walks: ModuleType, index: int, place: int, name: str = "rooms") -> Chu
         return dataclasses.replace(found, support=support, track=dataclasses.replace(found.track, frames=frames))
 
     library = dataclasses.replace(made.library, instances=tuple(map(seen, made.library.instances)))
-    return dataclasses.replace(made, index=index, frame_indices=frames, times_s=frames / 30.0, library=library)
+    later = int(frames[0] - made.frame_indices[0])
+    keyframes = tuple(dataclasses.replace(k, frame_index=k.frame_index + later) for k in made.keyframes)
+    return dataclasses.replace(
+        made, index=index, frame_indices=frames, times_s=frames / 30.0, library=library, keyframes=keyframes
+    )
 
 
 @pytest.fixture
@@ -174,7 +178,8 @@ def test_what_neighbours_of_computed_depth_miss_grows_alike(walks: ModuleType, s
             camera_frames=frames,
             T_chunk_cam=made.T_chunk_cam,
         )
-        made = dataclasses.replace(made, frame_indices=frames, library=library, samples=samples)
+        keyframes = tuple(dataclasses.replace(k, frame_index=int(k.frame_index + move)) for k in made.keyframes)
+        made = dataclasses.replace(made, frame_indices=frames, library=library, samples=samples, keyframes=keyframes)
         add(store, dataclasses.replace(made, scale_kind="relative"))
         check(store, "instances", "members", "observations")
         hidden = max(hidden, store.library.members.hidden_groups())

@@ -16,6 +16,7 @@ from list3r.importers.registry import read_map
 from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.importing import IMPORTED, import_map, upright
+from list3r.viewer.world import read_world
 from tests.recordings import put
 
 TABLE, CUP = ((1.0, 2.0, 0.36), (1.2, 0.8, 0.72)), ((1.1, 2.1, 0.77), (0.08, 0.08, 0.1))
@@ -98,6 +99,7 @@ def test_an_imported_map_answers(kind: str, up: str, tmp_path: Path) -> None:
         assert [m.instance.id for m in scene.find("cup on table")] == [cup]
         assert np.allclose(scene.instance(table).center, TABLE[0], atol=0.03)
         scene.export("json", tmp_path / "m.json")
+        assert {i.id for i in scene} == {table, cup} <= set(read_world(scene, []).cloud.owner.tolist())
     with Store.open(tmp_path / "m.l3r") as store:
         told = store.facts[IMPORTED]
         assert told is not None and told["format"] == kind and told["names"] == list(NAMES[kind])

@@ -43,7 +43,7 @@ def meant(T: np.ndarray, name: str) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    return frames_along(walk(45)[::3])
+    return frames_along(walk(45)[::5])
 
 
 @pytest.mark.parametrize("name", list(CONVENTIONS)[:3])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from list3r.viewer.app import Viewer, ViewerSettings
+from list3r.viewer.beside import SideBySide
 from list3r.viewer.layers import LayerSettings
 from list3r.viewer.link import ViewState
 from list3r.viewer.world import (
@@ -182,6 +184,20 @@ def test_search_select_and_measure_without_a_page(viewer: Viewer) -> None:
     viewer.show(selected=12345)
     assert viewer.state.selected is None
     assert ViewState.decode(viewer.link(None).split("view=")[1]) == viewer.state
+
+
+def test_several_memories_stand_side_by_side(viewer: Viewer, room: Path) -> None:
+    with list3r.open(room) as memory:
+        other = Viewer(memory, ViewerSettings(0))
+        beside = SideBySide([("a <b>", viewer.address), ("other", other.address)])
+        try:
+            with urllib.request.urlopen(beside.address) as answer:
+                text = answer.read().decode()
+        finally:
+            beside.stop()
+            other.stop()
+    assert viewer.address != other.address
+    assert [f'src="{v.address}"' in text for v in (viewer, other)] == [True, True] and "a &lt;b&gt;" in text
 
 
 def test_the_program_says_what_is_wrong(room: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -84,6 +84,8 @@ class Ledger:
         return self
 
     def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(sqlite3.Error), self._transaction():
+            self._release()
         self._database.close()
         self._lock.release()
 
@@ -93,11 +95,7 @@ class Ledger:
         What ran when a batch was killed is pending again.
         """
         with self._transaction():
-            self._database.execute("UPDATE tasks SET state = 'pending' WHERE state = 'running'")
-            self._database.execute(
-                "UPDATE attempts SET outcome = 'lost', reason = 'the batch was ended' "
-                "WHERE ended_at IS NULL AND outcome = ''"
-            )
+            self._release()
             for t in tasks:
                 same = (t.memory, t.source, t.source_hash, t.settings_hash)
                 query = "SELECT attempts FROM tasks WHERE (memory, source, source_hash, settings_hash) = (?, ?, ?, ?)"
@@ -106,6 +104,14 @@ class Ledger:
                     self._database.execute(f"INSERT OR REPLACE INTO tasks ({_COLUMNS}) VALUES ({_MARKS})", row)
         rows = {(r.memory, r.source): r for r in self.rows()}
         return {t: rows[t.memory, t.source] for t in tasks}
+
+    def _release(self) -> None:
+        """Make pending what nobody works on any more."""
+        self._database.execute("UPDATE tasks SET state = 'pending' WHERE state = 'running'")
+        self._database.execute(
+            "UPDATE attempts SET outcome = 'lost', reason = 'the batch was ended' "
+            "WHERE ended_at IS NULL AND outcome = ''"
+        )
 
     def rows(self) -> list[TaskRow]:
         """Return all rows, by memory and in the order in which they came."""

@@ -128,7 +128,7 @@ class Catalog:
         if (point is None) == (instance_id is None):
             raise OptionError("give a point or an instance to be near to, one of the two")
         at = checked_point(point, "point") if point is not None else self._known(memory, instance_id).box.center
-        count, own = 4 * k + 8, instance_id
+        count, own = k + 8, instance_id
         while True:
             near = self._backend.near(memory, at.tolist(), count, filters)
             found = sorted(((box_distance(t, at), t.id, t) for t in near if t.id != own), key=lambda f: f[:2])[:k]

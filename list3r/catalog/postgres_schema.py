@@ -5,6 +5,10 @@ from __future__ import annotations
 PARTITIONS = 16
 """Of the tables of instances and relations, by memory."""
 
+_LINKS, _LOOKED_AT = 12, 32
+"""Of the index of vectors: links of each and candidates looked at for them. Half of what pgvector takes: a third of the
+time to add a vector."""
+
 
 def _partitioned(table: str) -> str:
     return "".join(
@@ -47,5 +51,6 @@ def vector_table(space_id: int, dimension: int) -> str:
     return (
         f"CREATE TABLE {table} (memory_id integer NOT NULL, id bigint NOT NULL, v halfvec({int(dimension)}) NOT NULL, "
         f"PRIMARY KEY (memory_id, id)); "
-        f"CREATE INDEX {table}_alike ON {table} USING hnsw (v halfvec_cosine_ops)"
+        f"CREATE INDEX {table}_alike ON {table} USING hnsw (v halfvec_cosine_ops) "
+        f"WITH (m = {_LINKS}, ef_construction = {_LOOKED_AT})"
     )

@@ -47,7 +47,7 @@ _THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confiden
 _FROM = "FROM instance i JOIN memory m ON m.memory_id = i.memory_id"
 _OF_MEMORY = "i.memory_id = (SELECT memory_id FROM memory WHERE name = ?)"
 _BATCH = 20_000
-_GROW = 4.0
+_GROW = 2.0
 """How much further is looked where too little lies within a distance."""
 
 
@@ -148,23 +148,27 @@ class SqliteBackend:
 
     def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
         """Return the k nearest by axis-aligned boxes: of those within a distance that grows until they are enough."""
-        at, reach = np.asarray(point, np.float64), 1.0
-        whole = self._rows(
-            f"SELECT min(b.min_x), min(b.min_y), min(b.min_z), max(b.max_x), max(b.max_y), max(b.max_z) "
-            f"FROM bounds b JOIN instance i ON i.number = b.number WHERE {_OF_MEMORY}",
-            (memory,),
-        )[0]
-        if whole[0] is None:
-            return []
-        corners = np.array(whole, np.float64).reshape(2, 3)
-        farthest = float(np.linalg.norm(np.maximum(np.abs(corners - at), 0.0).max(axis=0))) + 1.0
+        at, reach, farthest = np.asarray(point, np.float64), 1.0, np.inf
         while True:
             found = self.inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
             gaps = [_gap(t, at) for t in found]
             if sum(g <= reach for g in gaps) >= k or reach >= farthest:
                 order = sorted(range(len(found)), key=lambda n: (gaps[n], found[n].id))
                 return [found[n] for n in order[:k]]
+            farthest = self._farthest(memory, at) if np.isinf(farthest) else farthest
             reach *= _GROW
+
+    def _farthest(self, memory: str, point: NDArray[np.float64]) -> float:
+        """Return a distance from a point beyond which a memory holds nothing."""
+        whole = self._rows(
+            "SELECT min(b.min_x), min(b.min_y), min(b.min_z), max(b.max_x), max(b.max_y), max(b.max_z) "
+            f"FROM bounds b JOIN instance i ON i.number = b.number WHERE {_OF_MEMORY}",
+            (memory,),
+        )[0]
+        if whole[0] is None:
+            return 0.0
+        corners = np.array(whole, np.float64).reshape(2, 3)
+        return float(np.linalg.norm(np.abs(corners - point).max(axis=0))) + 1.0
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
@@ -204,10 +208,11 @@ class SqliteBackend:
         self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
     ) -> list[tuple[str, int, str, str, int, str, float, float]]:
         """Return relations, the surest first."""
-        (a, values), (b, more) = wanted_sql(subject, "s", _bearing), wanted_sql(object, "o", _bearing)
+        bearing = _bearing if memory is None else _bearing_here
+        (a, values), (b, more) = wanted_sql(subject, "s", bearing), wanted_sql(object, "o", bearing)
         parts, given = [a, b], [*values, *more]
         if memory is not None:
-            parts.append("m.name = ?")
+            parts.append(_OF_MEMORY.replace("i.", "r."))
             given.append(memory)
         if predicate is not None:
             parts.append("r.predicate = ?")
@@ -302,12 +307,20 @@ def _told(t: CatalogThing) -> tuple[object, ...]:
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
+    """Over all memories: what bears a word is looked up."""
     one = f"{alias}.number IN (SELECT number FROM word WHERE word = ?)"
     return " AND ".join([one] * len(words)), list(words)
 
 
+def _bearing_here(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
+    """In one memory: each of its instances is looked at."""
+    one = f"EXISTS (SELECT 1 FROM word WHERE word = ? AND number = {alias}.number)"
+    return " AND ".join([one] * len(words)), list(words)
+
+
 def _where(memory: str | None, wanted: Wanted, filters: CatalogFilters) -> tuple[str, list[Any]]:
-    (a, values), (b, more) = wanted_sql(wanted, "i", _bearing), filters_sql(filters, "i")
+    bearing = _bearing if memory is None else _bearing_here
+    (a, values), (b, more) = wanted_sql(wanted, "i", bearing), filters_sql(filters, "i")
     if memory is None:
         return f"{a} AND {b}", [*values, *more]
     return f"{a} AND {b} AND {_OF_MEMORY}", [*values, *more, memory]

@@ -254,12 +254,13 @@ def _enlarged(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(image.resize((image.width * zoom, image.height * zoom), Image.Resampling.BICUBIC))
 
 
-def serve(viewer: Viewer) -> None:
-    """Keep a viewer running until it is interrupted."""
+def serve(*viewers: Viewer) -> None:
+    """Keep viewers running until they are interrupted."""
     try:
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
         pass
     finally:
-        viewer.stop()
+        for viewer in viewers:
+            viewer.stop()

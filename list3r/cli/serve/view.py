@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from list3r.cli.common import MemoryArgument, note
+from list3r.cli.common import note
 
 
 def register(app: typer.Typer) -> None:
@@ -15,7 +17,9 @@ def register(app: typer.Typer) -> None:
 
 
 def view(
-    memory: MemoryArgument,
+    memories: Annotated[
+        list[Path], typer.Argument(metavar="MEMORY...", help="The memory file; several stand side by side.")
+    ],
     port: Annotated[int, typer.Option("--port", help="Port on this machine; the next free one if taken.")] = 8741,
     write: Annotated[bool, typer.Option("--write", help="Also edits; keeps other writers out.")] = False,
     browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
@@ -31,11 +35,19 @@ def view(
         raise OptionError(f"--port {port} must lie between 1 and 65535")
     from list3r.viewer.app import Viewer, ViewerSettings, serve
 
-    with open_scene(memory, writable=write) as scene:
-        viewer = Viewer(scene, ViewerSettings(port))
-        note(f"{viewer.address}  (Ctrl-C ends it)")
+    with contextlib.ExitStack() as stack:
+        scenes = [stack.enter_context(open_scene(memory, writable=write)) for memory in memories]
+        viewers = [Viewer(scene, ViewerSettings(min(port + k, 65535))) for k, scene in enumerate(scenes)]
+        address = viewers[0].address
+        if len(viewers) > 1:
+            from list3r.viewer.beside import SideBySide
+
+            beside = SideBySide([(v.memory.path.name, v.address) for v in viewers])
+            stack.callback(beside.stop)
+            address = beside.address
+        note(f"{address}  (Ctrl-C ends it)")
         if browser:
             import webbrowser
 
-            webbrowser.open(viewer.address)
-        serve(viewer)
+            webbrowser.open(address)
+        serve(*viewers)

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from list3r.exporters.components import Component
-from list3r.exporters.palette import Color, instance_color
+from list3r.exporters.palette import Color
 from list3r.exporters.plan.frame import is_wall
 from list3r.exporters.plan.labels import TagTarget, place_tags
-from list3r.exporters.plan.map import pale_picture
+from list3r.exporters.plan.map import hatched, pale_picture
 from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet, plain_text
 from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance, Support
@@ -28,8 +28,7 @@ def draw_picture(sheet: Sheet, component: Component, supports: dict[int, Support
     floors = [supports[i.id] for i in seen if i.structure and not is_wall(i, up)]
     things = [supports[i.id] for i in seen if not i.structure]
     pixels = pale_picture(sheet.frame.reduced(OVERSAMPLING), things, floors, walls)
-    picture = Image.fromarray(np.round(pixels).astype(np.uint8)).resize(sheet.map_size, Image.Resampling.BICUBIC)
-    sheet.image.paste(picture, (sheet.left, sheet.top))
+    sheet.paste(Image.fromarray(np.round(hatched(pixels)).astype(np.uint8)))
     bare = [i for i in component.instances if is_wall(i, up) and not len(supports[i.id].points)]
     for instance in bare:
         sheet.draw.polygon(sheet.footprint(instance), fill=(62, 68, 82, 200))
@@ -40,7 +39,7 @@ def draw_picture(sheet: Sheet, component: Component, supports: dict[int, Support
 def draw_boxes(sheet: Sheet, things: list[Instance], tagged: set[int]) -> None:
     """Draw oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
     for instance in sorted(things, key=lambda i: (-_area(sheet.footprint(i)), i.id)):
-        color, outline = instance_color(instance.id), sheet.footprint(instance)
+        color, outline = sheet.color(instance.id), sheet.footprint(instance)
         if instance.id not in tagged:
             sheet.draw.line([*outline, outline[0], outline[1]], fill=(*color, 110), width=OVERSAMPLING)
             continue
@@ -53,7 +52,7 @@ def draw_tracks(sheet: Sheet, tracks: dict[int, NDArray[np.float64]]) -> None:
     """Draw where moving things went, in their colours: a dot where each was seen first, an arrow where last."""
     k = OVERSAMPLING
     for instance_id, places in sorted(tracks.items()):
-        xy, color = sheet.px(places), instance_color(instance_id)
+        xy, color = sheet.px(places), sheet.color(instance_id)
         points = [(float(x), float(y)) for x, y in xy]
         if len(points) < 2:
             continue

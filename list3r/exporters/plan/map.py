@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import binary_opening, uniform_filter
 
 from list3r.exporters.components import point_spacing
 from list3r.exporters.plan.frame import PlanFrame
@@ -12,6 +12,8 @@ from list3r.memory.records import Support
 
 PAPER = 255.0
 _WALL = np.array([62.0, 68.0, 82.0])
+_HATCH, _HATCH_PX = np.array([196.0, 200.0, 208.0]), 12
+"""Colour of the strokes where nothing was seen, and how far they are apart."""
 _FADE_THINGS = 0.6
 """How much of the seen colour of things stays in the pale picture."""
 _FADE_FLOOR = 0.3
@@ -37,6 +39,14 @@ def pale_picture(frame: PlanFrame, things: list[Support], floors: list[Support],
     image[seen] = _rgb(codes[seen])
     alpha = 0.9 * _wall_density(frame, walls)
     return image * (1 - alpha) + _WALL * alpha
+
+
+def hatched(pixels: Image) -> Image:
+    """Return the picture with strokes where nothing was seen. Shape (H, W, 3)."""
+    blank: NDArray[np.bool_] = np.asarray((pixels > PAPER - 2).all(axis=2))
+    unseen = binary_opening(blank, iterations=3)
+    y, x = np.indices(unseen.shape)
+    return np.where((unseen & ((x + y) % _HATCH_PX == 0))[..., None], _HATCH, pixels)
 
 
 def _smooth_floor(frame: PlanFrame, support: Support) -> tuple[Image, Image]:

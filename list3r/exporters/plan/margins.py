@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from PIL import ImageDraw
 
-from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Font, Sheet, font_of, plain_text
+from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet, font_of, plain_text
 from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance
 
@@ -19,6 +18,31 @@ def draw_scale_bar(sheet: Sheet, unit: str) -> None:
     sheet.draw.line([(x0, y - 6 * k), (x0, y), (x1, y), (x1, y - 6 * k)], fill=INK, width=2 * k)
     words = f"{length:g} m" if unit == "m" else f"{length:g} units of the memory (relative scale)"
     sheet.text((x1, y - 11 * k), words, sheet.text_font, INK, anchor="rs")
+
+
+def draw_grid(sheet: Sheet, unit: str) -> None:
+    """Draw a grid of round lengths from the world's origin, with ticks and numbers, and a cross at the origin."""
+    k, frame = OVERSAMPLING, sheet.frame
+    step = round_length(130 * k / frame.pixels_per_unit)
+    width, height = sheet.map_size
+    left, top, right, bottom = sheet.left, sheet.top, sheet.left + width, sheet.top + height
+    reach = np.array([width, height]) / (2 * frame.pixels_per_unit)
+    low, high = np.ceil((frame.center - reach) / step), np.floor((frame.center + reach) / step)
+    for n in np.arange(low[0], high[0] + 1):
+        x = left + width / 2 + (n * step - frame.center[0]) * frame.pixels_per_unit
+        sheet.draw.line([(x, top), (x, bottom)], fill=(*INK, 22), width=k)
+        sheet.draw.line([(x, bottom), (x, bottom + 5 * k)], fill=GREY, width=k)
+        sheet.text((x, bottom + 6 * k), f"{n * step + 0.0:g}", font_of(11), GREY, anchor="ma")
+    for n in np.arange(low[1], high[1] + 1):
+        y = top + height / 2 - (n * step - frame.center[1]) * frame.pixels_per_unit
+        sheet.draw.line([(left, y), (right, y)], fill=(*INK, 22), width=k)
+        sheet.draw.line([(left - 5 * k, y), (left, y)], fill=GREY, width=k)
+        sheet.text((left - 6 * k, y), f"{n * step + 0.0:g}", font_of(11), GREY, anchor="rm")
+    x, y = (float(v) for v in sheet.px(np.zeros((1, 3)))[0])
+    if left < x < right and top < y < bottom:
+        for dx, dy in ((9 * k, 0), (0, 9 * k)):
+            sheet.draw.line([(x - dx, y - dy), (x + dx, y + dy)], fill=INK, width=2 * k)
+        sheet.text((x + 5 * k, y - 4 * k), f"0 {unit}", font_of(11), INK, anchor="ls", halo=True)
 
 
 def draw_axes(sheet: Sheet, remark: str) -> None:
@@ -80,7 +104,7 @@ def _legend_column(sheet: Sheet, rows: list[Instance], unit: str, x: float, y: f
         middle = y + 28 * k + (row + 0.5) * sheet.settings.row_px * k
         sheet.chip((x + 18 * k, middle), (max(30.0 * k, sheet.chip_width(instance.id)), 18.0 * k), instance.id)
         room = right - reserved - x - 46 * k
-        words = _shorten(sheet.draw, shown(instance.label or instance.description), sheet.text_font, room)
+        words = _shorten(sheet, shown(instance.label or instance.description), room)
         sheet.text((x + 46 * k, middle), words, sheet.text_font, INK, anchor="lm")
         sheet.text((right, middle), size, sheet.text_font, GREY, anchor="rm")
 
@@ -90,11 +114,11 @@ def seen_most(things: list[Instance], limit: int) -> list[Instance]:
     return sorted(sorted(things, key=lambda i: (-i.observations, i.id))[:limit], key=lambda i: i.id)
 
 
-def _shorten(draw: ImageDraw.ImageDraw, text: str, font: Font, width: float) -> str:
-    text = plain_text(text)
-    if draw.textlength(text, font=font) <= width:
+def _shorten(sheet: Sheet, text: str, width: float) -> str:
+    text = text if sheet.vector is not None else plain_text(text)
+    if sheet.draw.textlength(text, font=sheet.text_font) <= width:
         return text
-    while text and draw.textlength(text + "…", font=font) > width:
+    while text and sheet.draw.textlength(text + "…", font=sheet.text_font) > width:
         text = text[:-1]
     return text.rstrip() + "…"
 

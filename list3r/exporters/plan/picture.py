@@ -11,6 +11,7 @@ from PIL import Image
 
 from list3r.exporters.components import Component, has_box, read_components, thinned_support
 from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.plan.colors import plan_colors
 from list3r.exporters.plan.drawing import (
     draw_boxes,
     draw_camera_path,
@@ -22,35 +23,46 @@ from list3r.exporters.plan.drawing import (
 from list3r.exporters.plan.frame import PlanFrame, choose_rotation, quarter_turn
 from list3r.exporters.plan.layout import Layout, PlanSettings, choose_layout
 from list3r.exporters.plan.loops import loop_ends
-from list3r.exporters.plan.margins import draw_axes, draw_header, draw_legend, draw_scale_bar, seen_most
+from list3r.exporters.plan.margins import draw_axes, draw_grid, draw_header, draw_legend, draw_scale_bar, seen_most
 from list3r.exporters.plan.sheet import OVERSAMPLING, Sheet
 from list3r.memory.records import Support
 from list3r.memory.store.store import Store
 
 
 def write_plan(store: Store, path: str | Path, settings: PlanSettings | None = None) -> tuple[Path, ...]:
-    """Write the plan view of every component as PNG, the main one to `path`. Returns the files written."""
+    """Write the plan view of every component as PNG or SVG, the main one to `path`. Returns the files written."""
     path, settings = Path(path), settings or PlanSettings()
     written = []
     with contextlib.ExitStack() as stack:
         for component in read_components(store):
             target = part_path(path, component.name)
             temporary = stack.enter_context(replacing(target))
-            plan_image(store, component, settings).save(temporary, format="PNG")
+            if path.suffix.lower() == ".svg":
+                sheet = _drawn(store, component, settings, vector=True)
+                assert sheet.vector is not None
+                temporary.write_text(sheet.vector.svg(settings.width_px), encoding="utf-8")
+            else:
+                plan_image(store, component, settings).save(temporary, format="PNG")
             written.append(target)
     return tuple(written)
 
 
 def plan_image(store: Store, component: Component, settings: PlanSettings | None = None) -> Image.Image:
     """Draw the plan view of one component."""
-    settings = settings or PlanSettings()
+    return _drawn(store, component, settings or PlanSettings(), vector=False).finish()
+
+
+def _drawn(store: Store, component: Component, settings: PlanSettings, *, vector: bool) -> Sheet:
     limits = (settings.points_per_instance, settings.points_per_structure)
     supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
     things = [i for i in component.instances if not i.structure and has_box(i)]
     tagged = seen_most(things, settings.max_tags)
     frame, layout = _frame(store, component, supports, settings, len(things))
-    sheet = Sheet(frame, layout, settings)
+    middles = frame.to_px(np.array([i.box.center for i in things]).reshape(-1, 3))
+    colors = plan_colors(dict(zip((i.id for i in things), middles, strict=True)))
+    sheet = Sheet(frame, layout, settings, colors, vector=vector)
     draw_picture(sheet, component, supports)
+    draw_grid(sheet, units(store))
     draw_boxes(sheet, things, {i.id for i in tagged})
     moved = {i.id: store.tracks.of(i.id)[1] for i in component.instances if i.dynamic}
     draw_tracks(sheet, {n: places[np.isfinite(places).all(axis=1)] for n, places in moved.items()})
@@ -58,10 +70,11 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
     draw_camera_path(sheet, component)
     draw_tags(sheet, tagged)
     draw_scale_bar(sheet, units(store))
-    draw_axes(sheet, "" if len(tagged) == len(things) else f"; the {len(tagged)} things seen most have tags")
+    remark = "" if len(tagged) == len(things) else f"; the {len(tagged)} things seen most have tags"
+    draw_axes(sheet, f"; hatched: not seen{remark}")
     draw_header(sheet, _title(store, component), _subtitle(store, component))
     draw_legend(sheet, things, units(store))
-    return sheet.finish()
+    return sheet
 
 
 def _title(store: Store, component: Component) -> str:

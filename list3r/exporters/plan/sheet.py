@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from list3r.exporters.palette import Color, instance_color
 from list3r.exporters.plan.frame import PlanFrame
 from list3r.exporters.plan.layout import Layout, PlanSettings
+from list3r.exporters.plan.vector import VectorDraw
 from list3r.memory.records import Instance
 
 INK: Color = (38, 42, 52)
@@ -24,18 +27,41 @@ Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 class Sheet:
     """The page while it is drawn, at `OVERSAMPLING` times its size."""
 
-    def __init__(self, frame: PlanFrame, layout: Layout, settings: PlanSettings) -> None:
+    def __init__(
+        self,
+        frame: PlanFrame,
+        layout: Layout,
+        settings: PlanSettings,
+        colors: Mapping[int, Color],
+        *,
+        vector: bool = False,
+    ) -> None:
         self.frame, self.layout, self.settings = frame, layout, settings
+        self._colors = colors
         k = OVERSAMPLING
         self.left, self.top = settings.margin_px * k, settings.header_px * k
         self.map_size = frame.size_px
-        self.image = Image.new("RGB", (settings.width_px * k, layout.height_px * k), (255, 255, 255))
-        self.draw = ImageDraw.Draw(self.image, "RGBA")
+        size = settings.width_px * k, layout.height_px * k
+        self.image = Image.new("RGB", (1, 1) if vector else size, (255, 255, 255))
+        self.vector = VectorDraw(size) if vector else None
+        """The page as SVG in place of `image`, where it was asked for."""
+        self.draw: Any = self.vector or ImageDraw.Draw(self.image, "RGBA")
         self.tag_font, self.text_font = font_of(13), font_of(14)
 
     def finish(self) -> Image.Image:
         """Return the page at its size."""
         return self.image.reduce(OVERSAMPLING)
+
+    def color(self, instance_id: int) -> Color:
+        """Return the colour of an instance on this page."""
+        return self._colors.get(instance_id) or instance_color(instance_id)
+
+    def paste(self, pixels: Image.Image) -> None:
+        """Put the picture of what was seen into the frame of the map."""
+        if self.vector is not None:
+            self.vector.picture(pixels, (self.left, self.top), self.map_size)
+        else:
+            self.image.paste(pixels.resize(self.map_size, Image.Resampling.BICUBIC), (self.left, self.top))
 
     def px(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where world points are on the page, px. Shape (N, 3) -> (N, 2)."""
@@ -75,8 +101,9 @@ class Sheet:
     ) -> None:
         """Write a text in the letters of the font."""
         stroke = 2 * OVERSAMPLING if halo else 0
+        words = text if self.vector is not None else plain_text(text)
         self.draw.text(
-            xy, plain_text(text), fill=color, font=font, anchor=anchor, stroke_width=stroke, stroke_fill=(255, 255, 255)
+            xy, words, fill=color, font=font, anchor=anchor, stroke_width=stroke, stroke_fill=(255, 255, 255)
         )
 
     def chip_width(self, instance_id: int) -> float:
@@ -86,7 +113,7 @@ class Sheet:
     def chip(self, xy: tuple[float, float], size: tuple[float, float], instance_id: int) -> None:
         """Draw the tag of an id, its middle at `xy`."""
         (x, y), (w, h) = xy, (size[0] / 2, size[1] / 2)
-        color = instance_color(instance_id)
+        color = self.color(instance_id)
         edge = OVERSAMPLING
         self.draw.rounded_rectangle(
             (x - w, y - h, x + w, y + h), radius=h * 0.5, fill=color, outline=(255, 255, 255), width=edge

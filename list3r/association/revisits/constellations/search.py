@@ -49,6 +49,8 @@ class ThingSearchSettings:
     near: float = 1.5
     """Chunks tied to the new one are asked where they lie this near, shares of both typical depths."""
     most_near: int = 4
+    most_looked: int = 16
+    """Chunks whose origins lie nearest, of which it is asked how near they lie; reading all takes long."""
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
 
 
@@ -81,6 +83,8 @@ class ThingSearch:
         s = self._settings
         pick = np.linspace(0, len(apart) - 1, min(len(apart), s.most_apart)).astype(np.int64)
         wanted = [apart[k] for k in pick.tolist()] + self._near(tied)
+        if not wanted:
+            return []
         here = self._constellation(self._id)
         likely = []
         for u in wanted:
@@ -111,8 +115,10 @@ class ThingSearch:
             return []
         S_world_v = self._rows[before[0].u].S_world_chunk @ before[0].S_v_u.inverse()
         middle, reach = self._middle(self._id, S_world_v)
+        origins = np.array([self._rows[u].S_world_chunk.translation for u in tied])
+        nearest = np.argsort(np.linalg.norm(origins - S_world_v.translation, axis=1), kind="stable")
         out = []
-        for u in tied:
+        for u in (tied[k] for k in nearest[: self._settings.most_looked].tolist()):
             other, also = self._middle(u, self._rows[u].S_world_chunk)
             off = float(np.linalg.norm(middle - other)) / (reach + also)
             if off <= self._settings.near / 2:

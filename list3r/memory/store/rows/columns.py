@@ -70,6 +70,11 @@ class Columns(Generic[R]):
         held = tuple(n for column in columns for n in column.fields)
         self._by_name = None if held == known[: len(held)] else held
 
+    @staticmethod
+    def of(record: type[R], *special: Column, **renamed: str) -> Columns[R]:
+        """Return the columns of a record, made once in a process: opening a memory asks for those of every table."""
+        return _columns(record, special, tuple(renamed.items()))  # type: ignore[arg-type]
+
     def rows(self, records: Sequence[R]) -> list[tuple[Value, ...]]:
         """Return what the columns hold of records, in the order of `names`."""
         held: list[Sequence[Value]] = []
@@ -125,6 +130,11 @@ class Columns(Generic[R]):
 
 
 @cache
+def _columns(record: type[Any], special: tuple[Column, ...], renamed: tuple[tuple[str, str], ...]) -> Columns[Any]:
+    return Columns(record, *special, **dict(renamed))
+
+
+@cache
 def _hints(record: type[Any]) -> dict[str, Any]:
     """Return the types of the fields of a record; reading them takes longer than opening a small memory."""
     return get_type_hints(record, include_extras=True)
@@ -158,6 +168,7 @@ def joined(
     )
 
 
+@cache
 def nested(field: str, columns: Columns[Any]) -> Column:
     """Return the columns of a field that is a record itself."""
     return Column(

@@ -73,10 +73,10 @@ class Chunks:
         self._keyframes = keyframes
         self._local_instances = local_instances
         self._library = library
-        measured = Columns(_Measured, _INTRINSICS, _IMAGE_SIZE, _SAMPLES, index="chunk_index")
+        measured = Columns.of(_Measured, _INTRINSICS, _IMAGE_SIZE, _SAMPLES, index="chunk_index")
         self._measured = Table(connection, "chunks", measured, "chunk_id")
-        self._placements = Table(connection, "placements", Columns(_Placement), "chunk_id")
-        placed = Columns(ChunkRow, _INTRINSICS, _IMAGE_SIZE, index="chunk_index")
+        self._placements = Table(connection, "placements", Columns.of(_Placement), "chunk_id")
+        placed = Columns.of(ChunkRow, _INTRINSICS, _IMAGE_SIZE, index="chunk_index")
         both = "chunks JOIN placements USING (chunk_id)"
         self._placed = Table(connection, "chunks", placed, "chunk_id", source=both, parts=("chunks",))
         self._version = -1

@@ -30,7 +30,7 @@ class Edges:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._rows = Table(connection, "edges", Columns(Edge, _FRAMES), "u, v, kind, frame_u, frame_v")
+        self._rows = Table(connection, "edges", Columns.of(Edge, _FRAMES), "u, v, kind, frame_u, frame_v")
         self._version = -1
         self._known: dict[_Key, Edge] | None = None
         connection.on_forget(self._forget)
@@ -80,7 +80,7 @@ class Bends:
     """The table of bends: one small row for each chunk that bends, written when a session is finished."""
 
     def __init__(self, connection: Connection) -> None:
-        self._rows = Table(connection, "bends", Columns(_BendRow, _BEND), "chunk_id")
+        self._rows = Table(connection, "bends", Columns.of(_BendRow, _BEND), "chunk_id")
 
     def replace(self, bends: Mapping[int, Bend]) -> None:
         """Replace what is known of how chunks bend, by chunk id; call inside `transaction()`."""

@@ -34,7 +34,7 @@ class MergeLog:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        columns = Columns(LogEntry, nested("decision", Columns(MergeDecision)))
+        columns = Columns.of(LogEntry, nested("decision", Columns.of(MergeDecision)))
         self._rows = Table(connection, "merges", columns, "entry")
 
     def add(self, chunk_id: int, decision: MergeDecision) -> int:
@@ -63,7 +63,7 @@ class Edits:
     """The table of edits. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
-        self._rows = Table(connection, "edits", Columns(Edit, _ARGUMENTS), "entry")
+        self._rows = Table(connection, "edits", Columns.of(Edit, _ARGUMENTS), "entry")
 
     def add(self, edit: Edit) -> None:
         """Append an edit."""

@@ -15,7 +15,7 @@ class Events:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        columns = Columns(ChangeEvent, instance_id="instance")
+        columns = Columns.of(ChangeEvent, instance_id="instance")
         self._rows = Table(connection, "events", columns, "session_id, instance")
 
     def replace(self, events: Iterable[ChangeEvent]) -> None:

@@ -51,7 +51,7 @@ class Frames:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._rows = Table(connection, "frames", Columns(FrameRow), "session_id, frame_index")
+        self._rows = Table(connection, "frames", Columns.of(FrameRow), "session_id, frame_index")
 
     def add(self, session_id: int, chunk_id: int, result: ChunkResult) -> None:
         """Store the frames of a chunk; of those that it shares with the chunk before it places the second half."""
@@ -103,7 +103,7 @@ class Keyframes:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        columns = Columns(_KeyframeRow, nested("keyframe", _KEYFRAME))
+        columns = Columns.of(_KeyframeRow, nested("keyframe", _KEYFRAME))
         self._rows = Table(connection, "keyframes", columns, "chunk_id, frame_index")
 
     def add(self, chunk_id: int, keyframes: Iterable[Keyframe]) -> None:

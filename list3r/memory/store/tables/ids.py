@@ -27,7 +27,7 @@ class Ids:
         self._connection = connection
         self._facts = facts
         self._edits = edits
-        self._aliases = Table(connection, "aliases", Columns(_Alias), "id")
+        self._aliases = Table(connection, "aliases", Columns.of(_Alias), "id")
 
     def resolve(self, instance_id: int) -> int:
         """Return the id that stands for an id today.

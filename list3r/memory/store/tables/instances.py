@@ -86,7 +86,8 @@ class Instances:
 
     def get(self, instance_id: int) -> Instance:
         """Return one instance; an alias gives the instance it was merged into. Raises `UnknownIdError`."""
-        return self._rows.all("id = ?", (self._ids.resolve(instance_id),))[0]
+        held = self._rows.first("id = ?", (int(instance_id),)) if 0 < instance_id < 2**63 else None
+        return held or self._rows.all("id = ?", (self._ids.resolve(instance_id),))[0]
 
     def of(self, ids: Sequence[int]) -> list[Instance]:
         """Return the instances of these ids that are there, in the order of `ids`; aliases are not resolved."""

@@ -29,7 +29,7 @@ class LabelVotes:
     """The table of votes. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
-        columns = Columns(_Vote, nested("votes", Columns(Votes)))
+        columns = Columns.of(_Vote, nested("votes", Columns.of(Votes)))
         self._rows = Table(connection, "votes", columns, "chunk_id, local_id, source")
 
     def put(self, chunk_id: int, source: str, votes: Mapping[int, Votes]) -> None:
@@ -49,7 +49,7 @@ class DetectedLabels:
     """The table of labels that instances have from detectors. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
-        columns = Columns(_Detected, nested("label", Columns(DetectedLabel)))
+        columns = Columns.of(_Detected, nested("label", Columns.of(DetectedLabel)))
         self._rows = Table(connection, "detected_labels", columns, "instance")
 
     def all(self) -> dict[int, DetectedLabel]:

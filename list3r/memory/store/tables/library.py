@@ -78,7 +78,7 @@ class Settled:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        columns = Columns(_OfChunk, nested("settled", Columns(SettledRow)))
+        columns = Columns.of(_OfChunk, nested("settled", Columns.of(SettledRow)))
         self._rows = Table(connection, "settled", columns, "chunk_id")
         self._known: dict[int, SettledRow] | None = None
         self._version = -1
@@ -126,7 +126,7 @@ class Overlaps:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._rows = Table(connection, "overlaps", Columns(Overlap), "u, v")
+        self._rows = Table(connection, "overlaps", Columns.of(Overlap), "u, v")
 
     def all(self, chunk_ids: Sequence[int] | None = None) -> dict[Key, bytes]:
         """Return how pairs of chunks (u <= v) overlap, those of which one is among these, or all, in order."""
@@ -163,7 +163,7 @@ class GroupMembers:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._rows = Table(connection, "members", Columns(GroupMember, _KEY, _FIRST), "chunk_id, local_id")
+        self._rows = Table(connection, "members", Columns.of(GroupMember, _KEY, _FIRST), "chunk_id, local_id")
 
     def of(self, chunk_ids: Sequence[int]) -> dict[Key, GroupMember]:
         """Return the local instances of some chunks, by key."""
@@ -197,7 +197,7 @@ class Anchors:
     """The table of which chunks instances hang on. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
-        self._rows = Table(connection, "anchors", Columns(_AnchorRow), "instance")
+        self._rows = Table(connection, "anchors", Columns.of(_AnchorRow), "instance")
 
     def put(self, anchors: Mapping[int, Anchor]) -> None:
         """Say which chunk instances hang on, by id."""

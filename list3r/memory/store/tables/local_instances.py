@@ -121,7 +121,7 @@ class Supports:
     """The table of surfaces of local instances. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
-        order, columns = "chunk_id, local_id", Columns(LocalSupport, _SUPPORT)
+        order, columns = "chunk_id, local_id", Columns.of(LocalSupport, _SUPPORT)
         self._rows = Table(connection, "supports", columns, order)
         of_instances = "observations JOIN supports USING (chunk_id, local_id)"
         self._observed = Table(
@@ -150,7 +150,7 @@ class LocalInstances:
         self._supports = supports
         self._library = library
         order = "chunk_id, local_id"
-        columns = Columns(_LocalRow, nested("instance", _INSTANCE))
+        columns = Columns.of(_LocalRow, nested("instance", _INSTANCE))
         self._rows = Table(connection, "local_instances", columns, order)
         self._measured = Table(connection, "local_instances", _INSTANCE, order)
         nodes = "local_instances JOIN chunks USING (chunk_id) JOIN supports USING (chunk_id, local_id)"

@@ -17,7 +17,7 @@ class Observations:
     def __init__(self, connection: Connection, ids: Ids) -> None:
         self._connection = connection
         self._ids = ids
-        columns = Columns(Observation, instance_id="instance")
+        columns = Columns.of(Observation, instance_id="instance")
         self._rows = Table(connection, "observations", columns, "chunk_id, local_id")
 
     def set(self, observations: Iterable[Observation]) -> None:

@@ -17,7 +17,7 @@ class RelationTable:
     def __init__(self, connection: Connection, ids: Ids) -> None:
         self._connection = connection
         self._ids = ids
-        order, columns = "subject, predicate, object", Columns(Relation)
+        order, columns = "subject, predicate, object", Columns.of(Relation)
         self._rows = Table(connection, "relations", columns, order, checked=True)
         self._unchecked = Table(connection, "relations", columns, order)
 

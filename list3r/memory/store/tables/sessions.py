@@ -24,7 +24,7 @@ class Sessions:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._rows = Table(connection, "sessions", Columns(Session), "session_id")
+        self._rows = Table(connection, "sessions", Columns.of(Session), "session_id")
 
     def add(self, source: str, fingerprint: str, settings: Mapping[str, object], frame_count: int) -> int:
         """Add a session in the state `building`; its id."""

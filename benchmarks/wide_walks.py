@@ -1,0 +1,88 @@
+"""Colour walks in wide steps, as phones' exports of 2 to 4 frames a second are: ours beside plain pycolmap.
+
+    python benchmarks/colour.py --step 0.08 --seeds 31,32,33,34,35 --real ../shared/data/redkitchen --json FILE
+
+Each simulated walk goes to and fro between two rooms and films them from a new place each time; a frame is kept after
+each step. The real one is every eighth frame of a folder with poses. Both programs get the same pictures and focal
+length (plain pycolmap: `benchmarks/sfm.py`). `cpu_s_a_frame` is that of all processes of the program; with two idle
+cores a frame takes half of it or little more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, write_json
+from sfm import built, colour_only, plain_pycolmap, read_truth
+
+from benchmarks.simulation.wide_steps import WideStepWalk
+from list3r.evaluation.trajectory import Trajectory, read_tum
+from list3r.simulation.dataset import write_walk
+
+SIZE = (540, 360)
+REAL_EVERY = 8
+REAL_INTRINSICS = "525,525,320,240"
+"""Of the colour camera of 7-Scenes."""
+
+
+def compare_walks(words: argparse.Namespace) -> None:
+    """Film, build and compare the walks of some seeds, and a real one."""
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        root = words.keep or Path(scratch)
+        for seed in [int(word) for word in words.seeds.split(",") if word]:
+            walk = WideStepWalk(seed=seed, frames=words.frames, size=SIZE, step_m=words.step)
+            rows.append({"walk": f"seed {seed}", **_simulated(root / f"wide-{seed}", walk, words)})
+            _tell(rows, words)
+        if words.real is not None:
+            rows.append({"walk": f"{words.real.name}, every {REAL_EVERY}th", **_real(root / "wide-real", words)})
+            _tell(rows, words)
+    print(machine())
+
+
+def _tell(rows: list[dict[str, Any]], words: argparse.Namespace) -> None:
+    print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    write_json(words.json, {"step_m": words.step, "frames": words.frames, "size": SIZE, "walks": rows})
+
+
+def _simulated(folder: Path, walk: WideStepWalk, words: argparse.Namespace) -> dict[str, Any]:
+    if not (folder / "walk" / "truth.json").exists():
+        write_walk(folder / "walk", walk, words.workers)
+    poses = read_tum(folder / "walk" / "groundtruth.txt").T_world_cam
+    camera = walk.camera()
+    intrinsics = ",".join(f"{v:g}" for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return _compared(folder, sorted((folder / "walk" / "rgb").iterdir()), poses, intrinsics, words)
+
+
+def _real(folder: Path, words: argparse.Namespace) -> dict[str, Any]:
+    truth, names = read_truth(words.real, None)
+    assert len(names) == len(truth.time_s), "every picture needs a pose"
+    kept = slice(None, None, REAL_EVERY)
+    return _compared(folder, names[kept], truth.T_world_cam[kept], REAL_INTRINSICS, words)
+
+
+def _compared(
+    folder: Path, names: list[Path], T_world_cam: Any, intrinsics: str, words: argparse.Namespace
+) -> dict[str, Any]:
+    """The figures of both programs on the same pictures, in order, with their true poses (F, 4, 4)."""
+    truth = Trajectory(np.arange(len(names)) / 30.0, T_world_cam)
+    path_m = float(np.linalg.norm(np.diff(truth.positions(), axis=0), axis=1).sum())
+    with tempfile.TemporaryDirectory() as scratch:
+        pictures = colour_only(Path(scratch) / "colour", names)
+        memory = folder / "memory.l3r"
+        folder.mkdir(parents=True, exist_ok=True)
+        options = ["--force", "--workers", str(words.workers), "--intrinsics", intrinsics]
+        ours = built(pictures, memory, options, truth)
+        plain = plain_pycolmap(pictures, Path(scratch), intrinsics, truth)
+    ours["cpu_s_a_frame"] = round(ours["cpu_s"] / len(names), 3)
+    return {
+        "path_m": round(path_m, 2),
+        "ate_of_path": round(ours["ate_sim3_m"] / path_m, 5),
+        "ate_by_plain": round(ours["ate_sim3_m"] / plain["ate_sim3_m"], 3) if plain["posed"] == len(names) else None,
+        "list3r": ours,
+        "pycolmap": plain,
+    }
