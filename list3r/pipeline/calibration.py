@@ -63,6 +63,16 @@ def estimated_camera(
     return SessionCamera((full.fx, full.fy, full.cx, full.cy), tuple(found.camera.distortion), tuple(found.notes))
 
 
+def with_short_windows(settings: BuildSettings) -> BuildSettings:
+    """Return settings by which the camera of a video of wide steps is estimated: from shorter windows, by maps that are
+    adjusted less often."""
+    s = settings.video_map
+    windows = replace(settings.models.sfm.calibration, windows=3, frames=s.window_frames, least_frames=s.window_frames)
+    mapping = replace(settings.models.sfm.mapping, growth=s.mapping.growth, whole_rounds=s.mapping.whole_rounds)
+    sfm = replace(settings.models.sfm, mapping=mapping, calibration=windows)
+    return replace(settings, models=replace(settings.models, sfm=sfm))
+
+
 def told_camera(options: SourceOptions, known: SessionCamera) -> SourceOptions:
     """The options with a camera that was estimated."""
     return replace(options, intrinsics=known.intrinsics, distortion=known.distortion)

@@ -6,7 +6,7 @@ A function of the chunk alone, so that chunks can be worked on side by side in a
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -49,6 +49,8 @@ class ChunkTask:
     """Positions [start, stop) of the shot that the chunk lies in, from which it may borrow frames; None for none."""
     depth_every: int = 1
     """Frames at multiples of this position in the source get depth."""
+    T_map_cam: Mapping[int, NDArray[np.float64]] | None = None
+    """By Frame.index, where the whole video was mapped before its chunks."""
 
 
 def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
@@ -101,6 +103,8 @@ def reconstruct(
     from around it are borrowed. Raises `TrackingError`.
     """
     model = _model(task.settings, source.info.camera is not None)
+    if task.T_map_cam is not None:
+        return frames, [model.placed(frames, camera, task.T_map_cam)], ()  # type: ignore[attr-defined]
     parts: Sequence[Reconstruction] = ()
     failed: BaselineError | None = None
     try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from list3r.association.overlap.camera_edge import better_edge, camera_edge
+from list3r.association.overlap.camera_edge import better_edge, camera_edge, in_one_frame, one_frame_edge
 from list3r.association.overlap.edges import EdgeEnd, measure_edge
 from list3r.association.overlap.prior_edge import prior_edge
 from list3r.association.revisits.joint_window import JointReconstructor
@@ -63,8 +63,10 @@ def add_chunk(
         if given:
             store.edges.add(_edge_of_given_poses(store, session_id))
         else:
-            store.edges.add(_adjacent_edge(store, session_id, chosen, debug_dir))
-            store.edges.add(_prior_edge(store, session_id, result, chosen))
+            adjacent = _adjacent_edge(store, session_id, chosen, debug_dir)
+            store.edges.add(adjacent)
+            given = any(in_one_frame(e) for e in adjacent)
+            store.edges.add([] if given else _prior_edge(store, session_id, result, chosen))
         if not given or len(store.sessions.all()) > 1:
             loops = find_loops(store, chunk_id, joint, chosen.revisits)
             store.edges.add(_refined(store, e, chosen.reprojection) if e.accepted else e for e in loops)
@@ -87,6 +89,9 @@ def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debu
     u, v = chunks[-2], chunks[-1]
     metric = u.scale_kind == v.scale_kind == "metric"
     samples_u, samples_v = store.chunks.samples(u.chunk_id), store.chunks.samples(v.chunk_id)
+    mapped = None if metric else one_frame_edge(samples_u, samples_v, u.chunk_id, v.chunk_id)
+    if mapped is not None:
+        return [mapped]
     by_cameras = None
     if not metric and knows_cameras(store, session_id):
         by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id, how.cameras)

@@ -14,6 +14,7 @@ from list3r.association.graph.growth import extend
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.graph.surface_graph import place_by_surfaces
+from list3r.association.overlap.camera_edge import in_one_frame
 from list3r.association.revisits.session_ties import hold_back
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
@@ -79,9 +80,11 @@ def _straightened(
     metric: bool,
     how: AssociationSettings,
 ) -> GraphResult:
-    """The graph with the bending of chunks undone; chunks whose poses were given do not bend."""
+    """The graph with the bending of chunks undone; chunks whose poses were given do not bend, nor do those that were
+    mapped together."""
     given = {s.session_id for s in store.sessions.all() if poses_given(store, s.session_id)}
     rigid = {c.chunk_id for c in chunks if c.session_id in given}
+    rigid |= {chunk for e in graph.edges if in_one_frame(e) for chunk in (e.u, e.v)}
     bends: dict[int, Bend] = {}
     if len(rigid) < len(chunks):
         graph, bends = bend_chunks(store.chunks.samples, graph, rigid, metric, how.nodes, how.graph)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
@@ -24,7 +25,7 @@ from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
-from list3r.pipeline.calibration import camera_notes, estimated_camera, with_camera
+from list3r.pipeline.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
 from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
 from list3r.pipeline.chunk import ChunkTask, process_parts
 from list3r.pipeline.finishing import check_run
@@ -35,6 +36,9 @@ from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.pipeline.settings import AssociationSettings, BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
 from list3r.reconstruction.registry import entry, usual_model
+
+if TYPE_CHECKING:
+    from list3r.association.whole_map.video_map import VideoMap
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,8 @@ class Plan:
     """Numbers of the spans that an earlier run finished."""
     tasks: list[ChunkTask]
     """What is left to do, in order."""
+    whole: VideoMap | None = None
+    """The map of the whole video, where one was made before its chunks."""
 
     def fresh_frames(self) -> int:
         """Frames that this run works on, each counted once."""
@@ -115,20 +121,23 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     step = settled_step(store, session, job, watch)
     spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
     done = {c.index for c in store.chunks.all(session)}
+    wide = step == 1 and not cuts and any(s.index not in done for s in spans) and _takes_wide_steps(job)
+    how = with_short_windows(job.settings) if wide else job.settings
     options = with_camera(
         store,
         session,
         job.options,
-        lambda: estimated_camera(job.source, job.options, job.settings, job.info, watch.look),
+        lambda: estimated_camera(job.source, job.options, how, job.info, watch.look),
     )
+    whole = _whole_map(job, options) if wide else None
     tasks = []
     for span in spans:
         if span.index not in done:
             where = None if watch.debug_dir is None else str(watch.debug_dir)
-            tasks.append(
-                ChunkTask(str(job.source), options, span, job.settings, where, shot_of(span, cuts, count), step)
-            )
-    return Plan(session, spans, done, tasks)
+            shot = shot_of(span, cuts, count)
+            known = None if whole is None else whole.T_map_cam
+            tasks.append(ChunkTask(str(job.source), options, span, job.settings, where, shot, step, known))
+    return Plan(session, spans, done, tasks, whole)
 
 
 def add_chunks(
@@ -165,6 +174,10 @@ def add_chunks(
                 note_lost(store, session, part)
                 added(part)
             watch.show(task.span.stop, count)
+    if plan.whole is not None:
+        from list3r.association.whole_map.loops import write_revisits
+
+        write_revisits(store, session, plan.whole, how.revisits.search.suppress_frames)
 
 
 MOST_DEPTH_EVERY = 8
@@ -226,6 +239,24 @@ def note_lost(store: Store, session: int, result: ChunkResult) -> None:
         with store.transaction():
             row = store.sessions.get(session)
             store.sessions.put(replace(row, lost_reasons=(*row.lost_reasons, result.lost_reason)))
+
+
+def _takes_wide_steps(job: Job) -> bool:
+    """Whether a video is one to be mapped as a whole, by a model that can."""
+    s = job.settings
+    if not entry(s.reconstruction).maps_videos or (s.poses, s.local_features) != ("estimate", "sift"):
+        return False
+    from list3r.association.whole_map.source import takes_wide_steps
+
+    return takes_wide_steps(open_source(job.source, job.options), s.video_map, s.pace)
+
+
+def _whole_map(job: Job, options: SourceOptions) -> VideoMap | None:
+    """The map of a whole video, by Frame.index; None where it gives none."""
+    from list3r.association.whole_map.source import map_source
+
+    with threadpool_limits(1):
+        return map_source(open_source(job.source, options), job.settings.models.sfm, job.settings.video_map)
 
 
 def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]:

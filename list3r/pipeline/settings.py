@@ -15,6 +15,7 @@ from list3r.association.overlap.prior_edge import PriorEdgeSettings
 from list3r.association.revisits.reprojection_edge import ReprojectionSettings
 from list3r.association.revisits.search import RevisitSettings
 from list3r.association.revisits.session_ties import TieSettings
+from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.frames.chunking.borrowing import BorrowSettings
 from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.chunking.cuts import ShotCutSettings
@@ -95,6 +96,8 @@ class BuildSettings:
     cuts: ShotCutSettings = field(default_factory=ShotCutSettings)
     """Where the video jumps."""
     pace: PaceSettings = field(default_factory=PaceSettings)
+    video_map: VideoMapSettings = field(default_factory=VideoMapSettings)
+    """One map of the whole video before its chunks, where its steps are wide."""
     borrowing: BorrowSettings = field(default_factory=BorrowSettings)
     """Frames from around a chunk through which the camera hardly moves."""
     models: ReconstructionSettings = field(default_factory=ReconstructionSettings)

@@ -46,6 +46,8 @@ class ModelEntry:
     """Module that estimates an unknown camera before the chunks, by `calibrate(source, settings)`."""
     thins: bool = False
     """Computes depth, so that frames which show the same from nearly the same place need not all have it."""
+    maps_videos: bool = False
+    """Has `placed(frames, camera, T_map_cam)` for chunks of a video that was mapped as a whole before."""
     by_cameras: bool = False
     """Knows its cameras better than its surfaces: chunks are joined by both, loops refined by features."""
     follows_prior: bool = False
@@ -56,7 +58,9 @@ class ModelEntry:
 
 MODELS: dict[str, ModelEntry] = {
     "rgbd": ModelEntry("rgbd.reconstructor", needs_depth=True, needs_camera=True, follows_prior=True),
-    "sfm": ModelEntry("sfm.reconstructor", calibration="sfm.calibration", thins=True, by_cameras=True),
+    "sfm": ModelEntry(
+        "sfm.reconstructor", calibration="sfm.calibration", thins=True, maps_videos=True, by_cameras=True
+    ),
     "pi3": ModelEntry("networks.pi3"),
     "pi3x": ModelEntry("networks.pi3x"),
     "vggt": ModelEntry("networks.vggt"),

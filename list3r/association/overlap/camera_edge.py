@@ -77,6 +77,25 @@ def camera_edge(
     )
 
 
+ONE_FRAME = {"one_frame": 1.0}
+"""Scores of an edge between chunks that lie in one frame of reference and scale from the start."""
+
+
+def one_frame_edge(u: FrameSamples, v: FrameSamples, u_id: int, v_id: int) -> Edge | None:
+    """Return the edge of two chunks whose shared frames have the same poses in both, as in a video that was mapped as a
+    whole; else None."""
+    frames, at_u, at_v = np.intersect1d(u.camera_frames, v.camera_frames, return_indices=True)
+    if not len(frames) or not np.allclose(u.T_chunk_cam[at_u], v.T_chunk_cam[at_v], rtol=0.0, atol=1e-9):
+        return None
+    reason = f"the cameras of {len(frames)} shared frames are the same in both"
+    return Edge(u_id, v_id, "adjacent", Sim3.identity(), 1.0, 1.0, len(frames), 0.0, True, reason, dict(ONE_FRAME))
+
+
+def in_one_frame(edge: Edge) -> bool:
+    """Tell whether the chunks of an edge lie in one frame of reference and scale from the start."""
+    return "one_frame" in edge.scores
+
+
 def better_edge(by_points: Edge | None, by_cameras: Edge | None) -> Edge | None:
     """Return the edge by cameras where there is one, with what the points told; else that by points."""
     if by_cameras is None or by_points is None:

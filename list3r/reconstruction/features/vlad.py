@@ -42,10 +42,15 @@ def describe_frame(local_descriptors: NDArray[np.uint8]) -> Floats:
 
     Shape (words * d,).
     """
+    return describe_rooted(root_sift(local_descriptors))
+
+
+def describe_rooted(rooted: Floats) -> Floats:
+    """Return the same of descriptors that are RootSIFT already, (N, 128)."""
     v = Vocabulary.built_in()
-    if not len(local_descriptors):
+    if not len(rooted):
         return np.zeros(v.words.size, np.float32)
-    x = (root_sift(local_descriptors) - v.mean) @ v.axes
+    x = (rooted - v.mean) @ v.axes
     word = np.argmin((v.words**2).sum(axis=1) - 2.0 * x @ v.words.T, axis=1)
     sums = np.zeros(v.words.shape, np.float64)
     np.add.at(sums, word, x - v.words[word])

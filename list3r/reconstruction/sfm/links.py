@@ -20,6 +20,7 @@ _FEATURE_IDS = 1_000_000
 """Numbers of features start here for the first keyframe, so that they never meet those of tracks."""
 _AHEAD_IDS = 500_000
 """... and here those of features by which a keyframe is matched with the ones ahead."""
+_NO_ROWS = np.zeros((0, 2), np.int64)
 
 
 def keyframe_problem(
@@ -30,16 +31,22 @@ def keyframe_problem(
     `finder` finds features where tracks do not reach; None takes SIFT.
     """
     chosen = settings or LinkSettings()
+    problem = corner_problem(tracks, chosen)
+    if len(np.unique(tracks.run[list(tracks.keyframes)])) < 2:
+        return problem
+    return with_features(problem, finder or make_finder(grays, None, None, chosen.features), chosen)
+
+
+def corner_problem(tracks: CornerTracks, settings: LinkSettings) -> MapProblem:
+    """Return the keyframes of a chunk with the corners that were followed alone."""
     views = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     pairs = {}
     for n, a in enumerate(tracks.keyframes):
         for b in tracks.keyframes[n + 1 :]:
-            if tracks.run[a] == tracks.run[b] and len(rows := shared_rows(views[a], views[b])) >= chosen.least_matches:
+            rows = shared_rows(views[a], views[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
+            if len(rows) >= settings.least_matches:
                 pairs[a, b] = rows
-    problem = MapProblem(views, pairs)
-    if len(np.unique(tracks.run[list(tracks.keyframes)])) < 2:
-        return problem
-    return with_features(problem, finder or make_finder(grays, None, None, chosen.features), chosen)
+    return MapProblem(views, pairs)
 
 
 def step_beside(tracks: CornerTracks, settings: LinkSettings) -> int:

@@ -92,11 +92,11 @@ def build_maps(
     length and the distortion.
     """
     chosen = settings or MappingSettings()
-    cache = _cache(problem, camera, free_camera, chosen)
+    cache = correspondences(problem, camera, free_camera, chosen)
     if cache is None:
         return []
     grown: list[list[SparseMap]] = []
-    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen))):
+    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.told])):
         maps = _grown(cache, problem, camera, free_camera, pair, chosen)
         grown.append(_without_beside(maps, problem))
         if agreed(grown, chosen) or (not maps and pair is None and _turns(problem, problem.views, camera, chosen)):
@@ -129,7 +129,7 @@ def _grown(
     settings: MappingSettings,
 ) -> list[SparseMap]:
     """Maps that grow from two keyframes, one from a pair that is told; none of a camera that only turns."""
-    options = _options(camera, free_camera, settings)
+    options = mapper_options(camera, free_camera, settings)
     told = pair is not None or free_camera == "focal"
     options.mapper.init_min_tri_angle = settings.told_angle_deg if told else settings.first_angle_deg
     if pair is not None:
@@ -137,7 +137,7 @@ def _grown(
         options.max_num_models = 1
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, cache, manager).run()
-    maps = [_sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
+    maps = [sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
     if problem.matched:
         maps = [_borne_out(m, problem, cache, camera, settings) for m in maps]
     maps = [m for m in maps if len(m.points) >= settings.least_points and len(m.T_map_cam) >= 2]
@@ -204,7 +204,7 @@ def triangulate(
     chosen = settings or MappingSettings()
     known = {key: view for key, view in problem.views.items() if key in T_map_cam}
     pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
-    cache = _cache(MapProblem(known, pairs, problem.matched), camera, "", chosen)
+    cache = correspondences(MapProblem(known, pairs, problem.matched), camera, "", chosen)
     if cache is None:
         return None
     mapper = pycolmap.IncrementalMapper(cache)
@@ -213,17 +213,26 @@ def triangulate(
     for image_id, image in sorted(made.images.items()):
         image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
         made.register_frame(image.frame_id)
-    options = _options(camera, "", chosen)
+    options = mapper_options(camera, "", chosen)
     for image_id in sorted(made.images):
         mapper.triangulate_image(options.triangulation, image_id)
     mapper.complete_and_merge_tracks(options.triangulation)
     mapper.filter_points(options.mapper)
-    found = _sparse_map(made, problem, camera)
+    found = sparse_map(made, problem, camera)
     return found if len(found.points) >= chosen.least_points else None
 
 
-def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
-    """pycolmap's correspondence graph; None when no two views have anything in common."""
+def correspondences(
+    problem: MapProblem,
+    camera: Camera,
+    free_camera: str,
+    settings: MappingSettings,
+    verified: Mapping[tuple[int, int], Ints] | None = None,
+) -> Any:
+    """pycolmap's correspondence graph; None when no two views have anything in common.
+
+    `verified` are the rows of pairs that agree on a geometry, where that is known already.
+    """
     database = pycolmap.Database.open(":memory:")
     lens = make_lens(camera, free_camera)
     lens.camera_id = 1
@@ -243,7 +252,12 @@ def _cache(problem: MapProblem, camera: Camera, free_camera: str, settings: Mapp
     count = 0
     for (a, b), rows in sorted(problem.pairs.items()):
         matched = (a, b) in problem.matched
-        found = _two_view(problem, (a, b), lens, camera, free_camera, settings)
+        if verified is not None:
+            found = pycolmap.TwoViewGeometry()
+            found.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            found.inlier_matches = verified.get((a, b), rows[:0]).astype(np.uint32)
+        else:
+            found = _two_view(problem, (a, b), lens, camera, free_camera, settings)
         wanted = max(settings.least_matches, settings.matched_share * len(rows) if matched else 0.0)
         if found is not None and len(found.inlier_matches) >= wanted:
             database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
@@ -274,7 +288,8 @@ def _two_view(
     return estimate(lens, one, lens, two, rows.astype(np.uint32), options)
 
 
-def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
+def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
+    """Return how pycolmap grows and filters a map."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.extract_colors = 1, settings.seed, False
     options.min_num_matches, options.min_model_size = settings.least_matches, 2
@@ -282,8 +297,10 @@ def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any
     options.ba_refine_focal_length = free_camera == "focal"
     options.ba_refine_extra_params = bool(free_camera)
     options.ba_refine_principal_point = False
-    options.ba_local_max_num_iterations, options.ba_global_max_num_iterations = 10, 25
-    options.ba_global_max_refinements = 3
+    options.ba_local_max_num_iterations = settings.part_iterations
+    options.ba_global_max_num_iterations = settings.whole_iterations
+    options.ba_global_max_refinements = settings.whole_rounds
+    options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.settled
     options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
     mapper, unit = options.mapper, pixel_unit(camera)
     mapper.num_threads, mapper.random_seed = 1, settings.seed
@@ -302,7 +319,8 @@ def _options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any
     return options
 
 
-def _sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
+def sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
+    """Return what pycolmap made of a problem."""
     poses: dict[int, Poses] = {}
     for image_id in sorted(made.reg_image_ids()):
         poses[image_id - 1] = inverse(matrix_of(made.images[image_id].cam_from_world()))

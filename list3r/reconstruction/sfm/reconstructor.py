@@ -8,7 +8,7 @@ poses the structure is triangulated in the source's world. Decision 0066 has the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,17 +26,12 @@ from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
 from list3r.reconstruction.sfm.keyframe_features import make_finder
-from list3r.reconstruction.sfm.links import keyframe_problem, step_beside, with_neighbours
+from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, step_beside, with_neighbours
 from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap, build_maps, triangulate
-from list3r.reconstruction.sfm.settings import (
-    SfmSettings,
-)
+from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
 
 Poses = NDArray[np.float64]
-
-MIDDLE_DEPTH = 2.0
-"""Where the middle of what a chunk sees is put."""
 
 
 def make(options: ModelOptions) -> SfmReconstructor:
@@ -97,6 +92,18 @@ class SfmReconstructor:
         groups.sort(key=lambda group: max(group[0].T_map_cam))
         return [self._finish([frames[k] for k in kept], _renumbered(s, kept), deep) for s, kept in groups]
 
+    def placed(self, frames: Sequence[Frame], camera: Camera, T_map_cam: Mapping[int, Poses]) -> Reconstruction:
+        """Reconstruct a chunk of a video that was mapped as a whole, in the map's frame of reference and scale.
+
+        `T_map_cam` is by Frame.index. Raises `TrackingError` where none of the frames is in the map.
+        """
+        known = {k: T_map_cam[f.index] for k, f in enumerate(frames) if f.index in T_map_cam}
+        if not known:
+            raise TrackingError(f"{_span(frames)}: the map of the whole video does not hold them")
+        tracks = follow_corners([_gray(f) for f in frames], self.settings.tracks)
+        problem = corner_problem(tracks, self.settings.links)
+        return self._finish(frames, self._triangulated(tracks, problem, camera, known), in_place=True)
+
     def _segments(
         self, frames: Sequence[Frame], grays: Sequence[Gray], camera: Camera, around: Around | None = None
     ) -> list[PosedSegment]:
@@ -138,20 +145,28 @@ class SfmReconstructor:
         self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera
     ) -> PosedSegment:
         T, posed = given_poses(frames)
-        poses = {k: T[k] for k in np.flatnonzero(posed).tolist()}
+        return self._triangulated(tracks, problem, camera, {k: T[k] for k in np.flatnonzero(posed).tolist()})
+
+    def _triangulated(
+        self, tracks: CornerTracks, problem: MapProblem, camera: Camera, poses: dict[int, Poses]
+    ) -> PosedSegment:
         found = triangulate(problem, camera, poses, self.settings.mapping)
         return _with_given_poses(found or SparseMap({}, {}, camera), poses, tracks)
 
     def _finish(
-        self, frames: Sequence[Frame], segment: PosedSegment, deep: Collection[int] | None = None
+        self,
+        frames: Sequence[Frame],
+        segment: PosedSegment,
+        deep: Collection[int] | None = None,
+        in_place: bool = False,
     ) -> Reconstruction:
-        """Dense depth, units, keyframes."""
+        """Dense depth, units, keyframes; `in_place` leaves frame of reference and scale as they are."""
         T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
         for position, pose in segment.T_map_cam.items():
             T[position], posed[position] = pose, True
         sparse = [segment.depths(k) if k in segment.seen and len(segment.seen[k][0]) else None for k in range(len(T))]
         depths = np.concatenate([np.ones(0), *(s[1] for s in sparse if s is not None)])
-        if self.poses == "estimate":
+        if self.poses == "estimate" and not in_place:
             scale = MIDDLE_DEPTH / float(np.median(depths)) if len(depths) else 1.0
             T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
             T[:, :3, 3] *= scale

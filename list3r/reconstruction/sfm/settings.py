@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from list3r.reconstruction.base import KeyframeSpacing
 from list3r.reconstruction.mvs.settings import MvsSettings
 
+MIDDLE_DEPTH = 2.0
+"""Where the middle of what a chunk sees is put."""
+
 
 @dataclass(frozen=True)
 class CornerSettings:
@@ -130,11 +133,21 @@ class MappingSettings:
     """... where they are told, or the camera is to be found as well."""
     told_steps: tuple[int, int] = (4, 7)
     """Keyframes from the first to the second that are told, at least and at most."""
+    told: int = 2
+    """Pairs that are told at most, besides that of the mapper's own choice."""
     same_error: float = 1.005
     """Two maps whose errors are that near are the same, and no third is grown: right ones of one chunk differ by 0.1 to
     0.7 %, bent ones are 9 to 12 % off (simulated walks 101 to 104)."""
     growth: float = 1.4
     """The whole map is adjusted each time it has grown by this factor."""
+    whole_iterations: int = 25
+    """Most iterations of that,"""
+    whole_rounds: int = 3
+    """and so many times at most, each without what the one before contradicts."""
+    part_iterations: int = 10
+    """Most iterations of the adjustment of a new keyframe with those around it."""
+    settled: float = 0.0
+    """Adjustments end when a step gains less than this share of the error."""
     alike: float = 0.95
     """Maps with at least this share of the keyframes of the largest are compared by their error."""
     point_angle_deg: float = 1.0
@@ -144,6 +157,21 @@ class MappingSettings:
     seed: int = 1
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     turning: TurningSettings = field(default_factory=TurningSettings)
+
+
+@dataclass(frozen=True)
+class AdjustmentSettings:
+    """How keyframes are adjusted. Errors in px of a picture 640 wide."""
+
+    gates_px: tuple[float, ...] = (8.0, 2.0, 1.5)
+    """Observations farther from their point's image than this are left out, round by round."""
+    loss_px: float = 0.5
+    """Errors larger than this count less (soft L1)."""
+    iterations: int = 30
+    """Most of a round."""
+    least_points: int = 12
+    """Fewest points of a keyframe whose pose is believed."""
+    mapping: MappingSettings = field(default_factory=MappingSettings)
 
 
 @dataclass(frozen=True)

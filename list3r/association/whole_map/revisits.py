@@ -1,0 +1,103 @@
+"""Frames of a map, not neighbours in time, that see the same: proposed by their poses and looks, told by geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.whole_map.settings import RevisitPairSettings
+from list3r.association.whole_map.views import MapView, shared_views
+from list3r.frames.base import Camera
+from list3r.memory.geometry import Sim3
+from list3r.reconstruction.sfm.fill import pose_of
+from list3r.reconstruction.sfm.keyframe_features import match_features
+
+Array = NDArray[np.float64]
+Pair = tuple[int, int]
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Revisit:
+    """Two views, by their rows, that see the same."""
+
+    a: int
+    b: int
+    S_b_a: Sim3
+    """From a's camera to b's; the scale is how far the map's has drifted between."""
+    inliers: int
+
+
+def candidate_pairs(views: Sequence[MapView], camera: Camera, settings: RevisitPairSettings) -> list[Pair]:
+    """Return pairs of views that may show the same, by their rows, the smaller first."""
+    count = len(views)
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) >= settings.apart
+    forward = np.stack([v.T_map_cam[:3, 2] for v in views])
+    turned = forward @ forward.T > np.cos(np.deg2rad(settings.most_turn_deg))
+    share = np.where(apart & turned, shared_views(views, camera), 0.0)
+    looks = np.stack([v.look for v in views]).astype(np.float64)
+    cosine = np.where(apart, looks @ looks.T, -1.0)
+    found: set[Pair] = set()
+    for k in range(count):
+        best = np.argsort(-share[k], kind="stable")[: settings.partners]
+        chosen = best[share[k, best] >= settings.least_shared].tolist()
+        chosen += np.argsort(-cosine[k], kind="stable")[: settings.alike].tolist()
+        found |= {(min(k, n), max(k, n)) for n in chosen if apart[k, n]}
+    return sorted(found)
+
+
+def find_revisits(
+    views: Sequence[MapView], camera: Camera, settings: RevisitPairSettings
+) -> tuple[list[Revisit], dict[Pair, Rows]]:
+    """Revisits that the way between does not contradict, and the rows of the features (M, 2) of each."""
+    places = np.stack([v.T_map_cam[:3, 3] for v in views])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+    out, common = [], {}
+    for a, b in candidate_pairs(views, camera, settings):
+        rows = match_features(views[a].features, views[b].features)
+        found = relation(views[a], views[b], rows, camera, settings)
+        if found is not None and _fits(found.S_b_a, views[a], views[b], (b - a, float(way[b] - way[a])), settings):
+            out.append(Revisit(a, b, found.S_b_a, found.inliers))
+            common[a, b] = rows
+    return out, common
+
+
+@dataclass(frozen=True)
+class ViewRelation:
+    """How two views lie to each other."""
+
+    S_b_a: Sim3
+    """From a's camera to b's, the scale from what both maps hold; 1 where that is too little."""
+    inliers: int
+    """Features that agree."""
+    tells_scale: bool
+
+
+def relation(a: MapView, b: MapView, rows: Rows, camera: Camera, settings: RevisitPairSettings) -> ViewRelation | None:
+    """Return the relation of two views from points of a and where b sees them, `rows` (M, 2) of features."""
+    rows = rows[np.isfinite(a.points_cam[rows[:, 0], 0])] if len(rows) >= settings.least_matches else rows[:0]
+    points = a.points_cam[rows[:, 0]]
+    found = pose_of(b.features.xy[rows[:, 1]], points, camera, None, settings.pose)
+    if found is None:
+        return None
+    T_b_a, agree = np.asarray(np.linalg.inv(found[0]), np.float64), found[1]
+    there = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    own = b.points_cam[rows[:, 1], 2]
+    both = agree & np.isfinite(own) & (own > 0) & (there[:, 2] > 0)
+    tells = bool(both.sum() >= settings.tells_scale)
+    scale = float(np.exp(np.median(np.log(own[both] / there[both, 2])))) if tells else 1.0
+    return ViewRelation(Sim3(np.asarray(scale), T_b_a[:3, :3], scale * T_b_a[:3, 3]), int(agree.sum()), tells)
+
+
+def _fits(S_b_a: Sim3, a: MapView, b: MapView, between: tuple[int, float], s: RevisitPairSettings) -> bool:
+    """Tell whether the map may have drifted by so much along `between`: frames, and map units."""
+    count, way = between
+    off = (S_b_a.inverse() @ Sim3.from_matrix(np.linalg.inv(b.T_map_cam) @ a.T_map_cam)).log()
+    return bool(
+        np.linalg.norm(off[:3]) < s.shift[0] * a.depth + s.shift[1] * way
+        and np.linalg.norm(off[3:6]) < s.turn_rad[0] + s.turn_rad[1] * count
+        and abs(off[6]) < s.log_scale[0] + s.log_scale[1] * count
+    )

@@ -1,0 +1,135 @@
+"""One map of a whole video of wide steps, before its chunks (decision 0074).
+
+Frames are followed and matched with those ahead, and mapped in one go; then frames that see the same again are sought,
+drift is spread over the way between them, and all is adjusted together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.whole_map.drift import spread_drift
+from list3r.association.whole_map.joining import join_maps
+from list3r.association.whole_map.revisits import Revisit, find_revisits
+from list3r.association.whole_map.settings import VideoMapSettings
+from list3r.association.whole_map.views import view_of
+from list3r.frames.base import Camera
+from list3r.reconstruction.sfm.adjustment import adjust
+from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, make_finder, match_features
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps, shared_rows
+from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
+from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
+
+Array = NDArray[np.float64]
+
+_IDS = 1_000_000
+"""Features of the first frame are numbered from here on; those of every frame have so many numbers."""
+
+
+@dataclass(frozen=True)
+class VideoMap:
+    """Where the camera was in a whole video, in one frame of reference and scale."""
+
+    T_map_cam: dict[int, Array]
+    """By position of the frame. Shape (4, 4) each."""
+    revisits: list[tuple[int, int, int]]
+    """Positions of frames that see the same again, the earlier first, and by how many features."""
+
+
+def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings: VideoMapSettings) -> VideoMap | None:
+    """Return the map of all frames of a video; None where it falls into pieces or poses too few."""
+    tracks = follow_corners(grays, sfm.tracks)
+    finder = make_finder(grays, None, None, settings.features)
+    features = {key: finder(key) for key in tracks.keyframes}
+    problem = video_problem(tracks, features, settings)
+    maps = build_maps(problem, camera, settings=settings.mapping)
+    if not maps:
+        return None
+    first_ids = {key: _first_id(key) for key in features}
+    joined = join_maps(maps, features, first_ids, camera, (settings.joining, settings.revisits))
+    if len(joined.T_map_cam) < settings.least_posed * len(tracks.keyframes):
+        return None
+    found, revisits = _closed(joined, problem, features, camera, settings)
+    segments = fill_segments([found], tracks, grays, sfm.fill)
+    if not segments or len(segments[0].T_map_cam) < settings.least_posed * len(grays):
+        return None
+    return VideoMap(_scaled(segments[0], found.T_map_cam), revisits)
+
+
+def _scaled(segment: PosedSegment, adjusted: dict[int, Array]) -> dict[int, Array]:
+    """Poses by position, those that were `adjusted` as they are, in a scale in which the middle of all depths is where
+    chunks have it."""
+    depths = np.concatenate([segment.depths(k)[1] for k in sorted(segment.seen)])
+    scale = MIDDLE_DEPTH / float(np.median(depths)) if len(depths) else 1.0
+    lengths = np.ones((4, 4))
+    lengths[:3, 3] = scale
+    return {k: T * lengths for k, T in sorted((segment.T_map_cam | adjusted).items())}
+
+
+def video_problem(tracks: CornerTracks, features: dict[int, LocalFeatures], settings: VideoMapSettings) -> MapProblem:
+    """Return keyframes with corners and features, each paired with those ahead."""
+    views, first, pairs, matched = {}, {}, {}, set()
+    for key in tracks.keyframes:
+        first[key] = len(tracks.ids[key])
+        ids = np.concatenate([tracks.ids[key], _first_id(key) + np.arange(len(features[key].xy))])
+        views[key] = KeyframeView(ids, np.concatenate([tracks.xy[key], features[key].xy]).astype(np.float32))
+    corners = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
+    for n, a in enumerate(tracks.keyframes):
+        for step, b in enumerate(tracks.keyframes[n + 1 : n + 1 + settings.followed], start=1):
+            rows = shared_rows(corners[a], corners[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
+            alike = match_features(features[a], features[b]) if step <= settings.ahead else _NO_ROWS
+            if len(rows) < settings.least_matches and len(alike) >= settings.least_matches:
+                matched.add((a, b))
+            alike = alike if len(alike) >= settings.least_matches else _NO_ROWS
+            rows = np.concatenate([rows, alike + np.array([first[a], first[b]])])
+            if len(rows) >= settings.least_matches:
+                pairs[a, b] = rows
+    return MapProblem(views, pairs, frozenset(matched))
+
+
+_NO_ROWS = np.zeros((0, 2), np.int64)
+
+
+def _first_id(key: int) -> int:
+    return _IDS * (key + 1)
+
+
+def _closed(
+    found: SparseMap,
+    problem: MapProblem,
+    features: dict[int, LocalFeatures],
+    camera: Camera,
+    settings: VideoMapSettings,
+) -> tuple[SparseMap, list[tuple[int, int, int]]]:
+    """Return the map with what is seen again closed, and the revisits; as it is where nothing comes back."""
+    views = [view_of(k, found, features[k], _first_id(k)) for k in sorted(found.T_map_cam)]
+    revisits, common = find_revisits(views, camera, settings.revisits)
+    if not revisits:
+        return found, []
+    T_map_cam, believed = spread_drift(views, revisits, settings.drift)
+    kept = {k: problem.views[k] for k in T_map_cam}
+    pairs = {p: rows for p, rows in problem.pairs.items() if p[0] in kept and p[1] in kept}
+    told = {}
+    for r in believed:
+        a, b = views[r.a].key, views[r.b].key
+        first = [len(problem.views[k].ids) - len(features[k].xy) for k in (a, b)]
+        told[a, b] = common[r.a, r.b] + np.array(first)
+    wider = MapProblem(kept, pairs | told, problem.matched | set(told))
+    closed = adjust(wider, camera, T_map_cam, settings.adjustment)
+    if closed is None:
+        return found, []
+    return _complete(closed, found), [_told(views[r.a].key, views[r.b].key, r) for r in believed]
+
+
+def _told(a: int, b: int, revisit: Revisit) -> tuple[int, int, int]:
+    return a, b, revisit.inliers
+
+
+def _complete(closed: SparseMap, before: SparseMap) -> SparseMap:
+    """Return the adjusted map; what it left out is for the frames between to find again."""
+    return replace(closed, camera=before.camera)

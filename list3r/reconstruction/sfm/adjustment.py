@@ -1,0 +1,80 @@
+"""Bundle adjustment of keyframes whose poses are known roughly: points are triangulated, all is adjusted, and both
+again with narrower gates (IncrementalMapper of pycolmap; Schoenberger, Frahm, "Structure-from-motion revisited", 2016).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.sfm.colmap import inverse, pixel_unit, pycolmap, rigid_of
+from list3r.reconstruction.sfm.consistency import epipolar_errors
+from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap, correspondences, mapper_options, sparse_map
+from list3r.reconstruction.sfm.settings import AdjustmentSettings
+
+Poses = NDArray[np.float64]
+
+
+def adjust(
+    problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], settings: AdjustmentSettings
+) -> SparseMap | None:
+    """Views with their poses adjusted, in the frame of reference and scale of those given; None where too little ties
+    them.
+
+    All views of the problem must have a pose. Views that see too few points are left out. What is left of the lens's
+    distortion is free, so that it does not bend the map.
+    """
+    gate = settings.gates_px[0] * pixel_unit(camera)
+    cache = correspondences(problem, camera, "k1", settings.mapping, _agreeing(problem, camera, T_map_cam, gate))
+    if cache is None:
+        return None
+    mapper = pycolmap.IncrementalMapper(cache)
+    made = pycolmap.Reconstruction()
+    mapper.begin_reconstruction(made)
+    for image_id, image in sorted(made.images.items()):
+        image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
+        made.register_frame(image.frame_id)
+    options = mapper_options(camera, "k1", settings.mapping)
+    for gate in settings.gates_px:
+        _round(mapper, made, options, gate * pixel_unit(camera), settings, pixel_unit(camera))
+    found = sparse_map(made, problem, camera)
+    kept = {k: T for k, T in found.T_map_cam.items() if len(found.seen[k].ids) >= settings.least_points}
+    seen = {k: found.seen[k] for k in kept}
+    return SparseMap(kept, found.points, camera, found.k1, found.error_px, seen) if len(kept) > 2 else None
+
+
+def _agreeing(
+    problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], gate_px: float
+) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Rows of each pair that lie near the epipolar lines of the poses."""
+    out = {}
+    for (a, b), rows in problem.pairs.items():
+        one, two = problem.views[a].xy[rows[:, 0]], problem.views[b].xy[rows[:, 1]]
+        out[a, b] = rows[epipolar_errors(one, two, T_map_cam[a], T_map_cam[b], camera) < gate_px]
+    return out
+
+
+def _round(mapper: Any, made: Any, options: Any, gate_px: float, settings: AdjustmentSettings, unit: float) -> None:
+    """Triangulate what is within a gate, adjust, and leave out what is not any more."""
+    focal = float(next(iter(made.cameras.values())).params[0])
+    triangulation = options.triangulation
+    angle = float(np.degrees(np.arctan(gate_px / focal)))
+    triangulation.create_max_angle_error = triangulation.continue_max_angle_error = angle
+    triangulation.complete_max_reproj_error = triangulation.merge_max_reproj_error = gate_px
+    options.mapper.filter_max_reproj_error = gate_px
+    for image_id in sorted(made.images):
+        mapper.triangulate_image(triangulation, image_id)
+    mapper.complete_and_merge_tracks(triangulation)
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.refine_focal_length = adjustment.print_summary = False
+    ceres = adjustment.ceres
+    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.SOFT_L1, settings.loss_px * unit
+    ceres.solver_options.num_threads = 1
+    ceres.solver_options.max_num_iterations = settings.iterations
+    ceres.solver_options.function_tolerance = 1e-6
+    mapper.adjust_global_bundle(options.mapper, adjustment)
+    mapper.filter_points(options.mapper)

@@ -1,0 +1,134 @@
+"""One map of a whole video: drift is spread by what is seen again, and all is adjusted together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.overlap.camera_edge import camera_edge, in_one_frame, one_frame_edge
+from list3r.association.whole_map.drift import spread_drift
+from list3r.association.whole_map.revisits import Revisit, find_revisits
+from list3r.association.whole_map.settings import DriftSettings, RevisitPairSettings
+from list3r.association.whole_map.views import MapView, shared_views
+from list3r.frames.base import Camera
+from list3r.memory.geometry import Sim3, umeyama
+from list3r.memory.records import FrameSamples
+from list3r.reconstruction.sfm.adjustment import adjust
+from list3r.reconstruction.sfm.keyframe_features import LocalFeatures
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, shared_rows
+from list3r.reconstruction.sfm.settings import AdjustmentSettings
+
+Array = NDArray[np.float64]
+
+CAMERA = Camera(540, 360, 443.0, 443.0, 269.5, 179.5)
+COUNT = 24
+_RNG = np.random.default_rng(5)
+POINTS = _RNG.uniform([-5, -5, -1.2], [5, 5, 1.2], (1500, 3))
+LOOKS = _RNG.normal(size=(len(POINTS), 128)).astype(np.float32)
+LOOKS /= np.linalg.norm(LOOKS, axis=1, keepdims=True)
+
+
+def ring() -> Array:
+    """Cameras on a circle of 1 m that look outward and come back to where they began. Shape (COUNT, 4, 4)."""
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi, COUNT)):
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        right, down = np.array([np.sin(angle), -np.cos(angle), 0.0]), np.array([0.0, 0.0, -1.0])
+        poses[k, :3, :3], poses[k, :3, 3] = np.stack([right, down, forward], axis=1), forward
+    return poses
+
+
+def drifted(poses: Array, turn_rad: float = 0.004, growth: float = 0.002) -> Array:
+    """The same with every step turned and longer than it was."""
+    out = [poses[0]]
+    for k in range(1, len(poses)):
+        step = np.linalg.inv(poses[k - 1]) @ poses[k]
+        step[:3, 3] *= 1.0 + growth * k
+        c, s = np.cos(turn_rad), np.sin(turn_rad)
+        out.append(out[-1] @ step @ np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]]))
+    return np.stack(out)
+
+
+def seen(T: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Numbers, px (N, 2) and camera coordinates (N, 3) of the points that a camera sees up to 4 m away."""
+    cam = (POINTS - T[:3, 3]) @ T[:3, :3]
+    xy = cam[:, :2] / np.maximum(cam[:, 2:], 1e-9) * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
+    inside = (
+        (cam[:, 2] > 0.3) & (cam[:, 2] < 4.0) & (xy > 0).all(axis=1) & (xy < (CAMERA.width, CAMERA.height)).all(axis=1)
+    )
+    return np.flatnonzero(inside), xy[inside], cam[inside]
+
+
+def views(poses: Array) -> list[MapView]:
+    """What the ring sees, at other poses than it has."""
+    out = []
+    for k, T in enumerate(ring()):
+        ids, xy, cam = seen(T)
+        features = LocalFeatures(xy.astype(np.float32), LOOKS[ids], 0.85)
+        out.append(MapView(k, poses[k], features, np.zeros(4, np.float32), cam, cam))
+    return out
+
+
+def error(poses: Array, true: Array) -> float:
+    S = umeyama(poses[:, :3, 3], true[:, :3, 3], with_scale=True)
+    return float(np.linalg.norm(S.apply(poses[:, :3, 3]) - true[:, :3, 3], axis=1).max())
+
+
+def test_views_of_one_place_share_what_they_see_and_opposite_ones_nothing() -> None:
+    share = shared_views(views(ring()), CAMERA)
+    assert share[0, COUNT - 1] > 0.4 and share[0, COUNT // 2] == 0 and np.allclose(share, share.T)
+
+
+def test_what_is_seen_again_is_found_and_drift_is_spread_by_it() -> None:
+    settings = RevisitPairSettings(apart=15)
+    off = drifted(ring())
+    revisits, common = find_revisits(views(off), CAMERA, settings)
+    assert any((r.a, r.b) == (0, COUNT - 1) for r in revisits) and all(len(common[r.a, r.b]) >= 20 for r in revisits)
+    placed, believed = spread_drift(views(off), revisits, DriftSettings())
+    assert len(believed) == len(revisits)
+    assert error(np.stack([placed[k] for k in range(COUNT)]), ring()) < 0.4 * error(off, ring())
+
+
+def test_a_false_revisit_is_distrusted_where_others_contradict_it() -> None:
+    true, _ = find_revisits(views(ring()), CAMERA, RevisitPairSettings(apart=15))
+    false = Revisit(0, 14, Sim3.identity(), 40)
+    placed, believed = spread_drift(views(ring()), [*true, false], DriftSettings())
+    assert [(r.a, r.b) for r in believed] == [(r.a, r.b) for r in true]
+    assert error(np.stack([placed[k] for k in range(COUNT)]), ring()) < 0.02
+
+
+def test_a_revisit_that_the_way_between_contradicts_is_none() -> None:
+    elsewhere = ring()
+    elsewhere[12:, :3, 3] += (3.0, 0.0, 0.0)
+    looks = [replace(v, look=np.ones(4, np.float32)) for v in views(elsewhere)]
+    assert not find_revisits(looks, CAMERA, RevisitPairSettings(apart=20))[0]
+
+
+def test_adjusting_recovers_poses_that_are_roughly_known() -> None:
+    rng, true = np.random.default_rng(3), ring()
+    noisy = {}
+    for k, T in enumerate(true):
+        noisy[k] = T @ Sim3.exp(np.concatenate([rng.normal(0, 0.006, 3), rng.normal(0, 0.003, 3), [0.0]])).as_matrix()
+    told = [(k, *seen(T)[:2]) for k, T in enumerate(true)]
+    keyframes = {k: KeyframeView(ids, xy + rng.normal(0, 0.2, xy.shape)) for k, ids, xy in told}
+    pairs = {(a, b): shared_rows(keyframes[a], keyframes[b]) for a in range(COUNT) for b in range(a + 1, COUNT)}
+    pairs = {pair: rows for pair, rows in pairs.items() if len(rows) >= 20}
+    found = adjust(MapProblem(keyframes, pairs), CAMERA, noisy, AdjustmentSettings())
+    assert found is not None and sorted(found.T_map_cam) == list(range(COUNT))
+    before = error(np.stack([noisy[k] for k in range(COUNT)]), true)
+    assert error(np.stack([found.T_map_cam[k] for k in range(COUNT)]), true) < 0.4 * before
+
+
+def test_chunks_with_equal_poses_of_shared_frames_lie_in_one_frame() -> None:
+    def samples(first: int, poses: Array) -> FrameSamples:
+        return replace(FrameSamples.empty(), camera_frames=np.arange(first, first + len(poses)), T_chunk_cam=poses)
+
+    u, v = samples(0, ring()[:16]), samples(8, ring()[8:])
+    edge = one_frame_edge(u, v, 1, 2)
+    assert edge is not None and in_one_frame(edge) and np.allclose(edge.S_v_u.as_matrix(), np.eye(4))
+    moved = replace(v, T_chunk_cam=np.linalg.inv(ring()[3]) @ v.T_chunk_cam)
+    assert one_frame_edge(u, moved, 1, 2) is None
+    measured = camera_edge(u, moved, 1, 2)
+    assert measured is None or not in_one_frame(measured)
