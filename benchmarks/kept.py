@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,11 @@ class Kept:
             return [self(frames, camera)]
         kind = "parts" if deep is None else f"parts-{len(deep)}"
         return self._kept(kind, frames, lambda: parts(frames, camera, around, deep))
+
+    def placed(self, frames: Sequence[Frame], camera: Camera, T_map_cam: Mapping[int, Any]) -> Reconstruction:
+        """As the model does with a chunk of a video that was mapped as a whole; the map is not kept."""
+        placed = self._model.placed  # type: ignore[attr-defined]
+        return self._kept("placed", frames, lambda: [placed(frames, camera, T_map_cam)])[0]
 
     def _kept(self, kind: str, frames: Sequence[Frame], make: Any) -> Sequence[Reconstruction]:
         path = self._folder / f"{kind}-{frames[0].index:06d}-{frames[-1].index:06d}-{len(frames)}.npz"

@@ -89,11 +89,11 @@ def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debu
     u, v = chunks[-2], chunks[-1]
     metric = u.scale_kind == v.scale_kind == "metric"
     samples_u, samples_v = store.chunks.samples(u.chunk_id), store.chunks.samples(v.chunk_id)
-    mapped = None if metric else one_frame_edge(samples_u, samples_v, u.chunk_id, v.chunk_id)
-    if mapped is not None:
-        return [mapped]
     by_cameras = None
     if not metric and knows_cameras(store, session_id):
+        mapped = one_frame_edge(samples_u, samples_v, u.chunk_id, v.chunk_id)
+        if mapped is not None:
+            return [mapped]
         by_cameras = camera_edge(samples_u, samples_v, u.chunk_id, v.chunk_id, how.cameras)
     try:
         ends = (
