@@ -53,7 +53,7 @@ def bound_rosbags() -> None:
         known["lz4"] = bounded(LZ4FrameDecompressor)
     if zstd is not None:
         known["zstd"] = bounded(zstd.ZstdDecompressor)
-        second.zstd = _Zstd(zstd, known["zstd"])  # type: ignore[misc, assignment, attr-defined]
+        second.zstd = _Zstd(zstd, known["zstd"])  # type: ignore[assignment, attr-defined]
     for table in (first.decompressors, storage_mcap.DECOMPRESSORS):
         table.update({name: unpack for name, unpack in known.items() if name in table})
 

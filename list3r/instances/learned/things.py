@@ -63,7 +63,7 @@ def thing_features(
     total = np.maximum(np.bincount(own, size, minlength=count), 1.0)
 
     def mean(values: NDArray[np.generic]) -> NDArray[np.float64]:
-        table = values if values.ndim == 2 else values[:, None]
+        table = (values if values.ndim == 2 else values[:, None]).astype(np.float64)
         sums = [np.bincount(own, table[:, k] * size, minlength=count) for k in range(table.shape[1])]
         return np.stack(sums, axis=1) / total[:, None]
 
