@@ -89,7 +89,8 @@ class _TooLongError(BaseException):
 
 def ask(words: Sequence[str], longest_s: float | None = None, *, serves: bool = False) -> Outcome:
     """Run one command; one that serves is interrupted as by Ctrl-C."""
-    out, err, started = io.StringIO(), io.StringIO(), time.process_time()
+    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace", write_through=True) for _ in range(2))
+    started = time.process_time()
     told = ""
     _forget_peak()
     try:
@@ -104,7 +105,8 @@ def ask(words: Sequence[str], longest_s: float | None = None, *, serves: bool = 
     peak = peak_mb()
     if peak > MOST_MB and ended not in ("hang", "traceback"):
         ended, told = "memory", f"{peak} MB"
-    return Outcome(ended, time.process_time() - started, out.getvalue(), told or err.getvalue()[:300], peak)
+    printed, errors = (stream.detach().getvalue().decode() for stream in (out, err))  # type: ignore[attr-defined]
+    return Outcome(ended, time.process_time() - started, printed, told or errors[:300], peak)
 
 
 def command_on(memory: Path, command: str, folder: Path) -> list[str]:

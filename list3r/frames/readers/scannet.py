@@ -62,6 +62,8 @@ def find_file(path: Path, options: SourceOptions) -> FolderLayout:
         if not (units > 0 and 0 < depth_width * depth_height <= 2**26):
             raise SourceError(f"{path} states depth of {depth_width}x{depth_height} with {units:g} units a metre")
         files, whole = _frames(file, path, count, (depth_height, depth_width))
+    if not files:
+        raise SourceError(f"{path} holds no frame; is the copy complete?")
     notes = [] if whole else [f"the file ends after {len(files)} of {count} frames; is the copy complete?"]
     optics = Optics(options.intrinsics or _intrinsics(color_k), (), _intrinsics(depth_k), None, units)
     T_color_depth = np.linalg.inv(color_e) @ depth_e

@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable
 from typing import Any, BinaryIO, Protocol, Self, cast
 
-MOST_BYTES = 2**28
-"""Of one chunk or message; recorders begin a new chunk after a megabyte, and a picture of 80 megapixels is as large."""
+MOST_BYTES = 96 * 2**20
+"""Of one chunk or message; recorders begin a new chunk after a megabyte, and a picture of 32 megapixels is as large."""
 _MOST_RATIO = 100
 """How many times its own length a file unpacks to."""
 

@@ -20,6 +20,8 @@ from list3r.memory.unpacking import parse_json
 _MOST_TEXT = 4000
 """Characters of a label, description or reason."""
 _MOST_JSON = 64 * 2**20
+_MOST_CELL = 16 * 2**20
+"""Bytes of a value that is looked into as a whole."""
 _MOST_LENGTH = 1e7
 """World units that anything may be away or long."""
 _ID = 2**53
@@ -58,7 +60,7 @@ def _one_of(*words: str) -> Rule:
 
 
 def _checked(function: str, words: str, kind: str = "blob") -> Rule:
-    return Rule(f"typeof({{}}) = '{kind}' AND {function}({{}})", words)
+    return Rule(f"typeof({{}}) = '{kind}' AND length({{}}) <= {_MOST_CELL} AND {function}({{}})", words)
 
 
 def _maybe(rule: Rule) -> Rule:
