@@ -28,6 +28,8 @@ LONGEST_S = 10.0
 """Processor time of a command; the clock may show `WAITING_S` on a busy machine, in which a wait is seen."""
 WAITING_S = 120.0
 SERVING_S = 10.0
+SLOW, SLOW_S = ("simready",), 60.0
+"""Formats that take seconds of a processor for the smallest memory, and what they may take."""
 MOST_MB = 1024
 READS = (
     "list --structure",
@@ -55,9 +57,10 @@ READS = (
 EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "delete 5")
 
 
-def exports() -> list[str]:
-    """Return a command for each format whose package is there."""
-    there = {n: f for n, f in FORMATS.items() if not f.package or importlib.util.find_spec(f.package)}
+def exports(*, slow: bool = False) -> list[str]:
+    """Return a command for each format whose package is there, of the fast formats or of the slow ones."""
+    known = {n: f for n, f in FORMATS.items() if (n in SLOW) == slow}
+    there = {n: f for n, f in known.items() if not f.package or importlib.util.find_spec(f.package)}
     endings = {
         name: "" if form.folder else ".usda" if name == "usd" else form.suffixes[0] for name, form in there.items()
     }

@@ -8,12 +8,14 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, Verbosity, given, seed, settings
 
-from hostile.asking import EDITS, READS, ask, command_on, exports, warm_up
+from hostile.asking import EDITS, READS, SLOW_S, ask, command_on, exports, warm_up
 from hostile.lies import Lie, lies, write_lie
 from hostile.subject import write_subject
 from hostile.work import Batch, Tally, total
 
 EACH = 50
+SLOWLY = 25
+"""One lie of so many goes through the slow formats."""
 
 
 @cache
@@ -51,6 +53,8 @@ def batch(folder: Path, first_seed: int, n: int) -> Batch:
         path = subject.with_name("lie.l3r")
         write_lie(subject, path, lie)
         told += 1
+        for command in exports(slow=True) if told % SLOWLY == 0 else ():
+            tally.add(repr(lie), command, ask(command_on(path, command, subject.parent), SLOW_S))
         edits = [EDITS[told // 5 % len(EDITS)]] if told % 5 == 0 else []
         for command in (*reads, *edits):
             if command in reads and not reads[command] & lie.tables:
