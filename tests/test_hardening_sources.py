@@ -6,11 +6,12 @@ import json
 import os
 import resource
 import shutil
+import signal
 import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from list3r.frames.files import too_many_pixels
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import FrameError, OptionError
 from list3r.reconstruction.precomputed_files import read_piece
+from tests import recordings
 from tests.frames_scenes import write_png, write_replica, write_seven_scenes, write_tum
 
 LIMIT_BYTES = 1500 * 2**20
@@ -76,6 +78,45 @@ def test_pipes_and_devices_of_a_source_are_not_waited_for(kind: str, name: str, 
     else:
         place.symlink_to("/dev/zero")
     assert run(["inspect", str(root)]) in (0, 2)
+
+
+@pytest.fixture
+def impatient() -> Iterator[None]:
+    """A wait of a minute is one without end."""
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+
+
+RECORDINGS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "record3d": (recordings.write_record3d, "lzfse"),
+    "rosbag": (recordings.write_bag, "rosbags.highlevel"),
+    "sens": (recordings.write_sens, ""),
+    "stray": (recordings.write_stray, ""),
+    "polycam": (recordings.write_polycam, ""),
+    "arkitscenes": (recordings.write_arkitscenes, ""),
+    "nerfstudio": (recordings.write_nerfstudio, ""),
+    "scannet": (recordings.write_scannet, ""),
+    "colmap": (recordings.write_colmap, ""),
+    "euroc": (recordings.write_euroc, ""),
+    "replica": (write_replica, ""),
+}
+
+
+@pytest.mark.parametrize("kind", RECORDINGS)
+def test_no_file_of_a_recording_is_waited_for(kind: str, tmp_path: Path, impatient: None) -> None:
+    write, package = RECORDINGS[kind]
+    if package:
+        pytest.importorskip(package)
+    root = write(tmp_path / "walk")
+    root = root if isinstance(root, Path) else tmp_path / "walk"
+    files = [root] if root.is_file() else [p for p in sorted(root.rglob("*")) if p.is_file()]
+    for path in {(p.parent, p.suffix): p for p in files}.values():
+        kept = path.rename(tmp_path / "kept")
+        os.mkfifo(path)
+        assert run(["inspect", str(root)]) in (0, 2), path
+        path.unlink()
+        kept.rename(path)
 
 
 def archive_bomb(path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import SourceOptions
@@ -35,6 +36,8 @@ _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TF = "tf2_msgs/msg/TFMessage"
 _INFO = "sensor_msgs/msg/CameraInfo"
+_MOST_BYTES = 2**50
+"""Of a recording: it is read message by message."""
 
 
 def is_recording(path: Path) -> bool:
@@ -203,6 +206,8 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     bound_rosbags()
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
+        for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):
+            check_ordinary(part.stat(), part, _MOST_BYTES)
         with AnyReader([path], default_typestore=known) as reader:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
