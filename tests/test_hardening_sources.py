@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import json
 import os
 import resource
@@ -10,6 +11,7 @@ import signal
 import struct
 import subprocess
 import sys
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,8 +22,10 @@ import pytest
 from list3r.cli.app import run
 from list3r.frames.decoding.decode import read_color, read_raw_depth
 from list3r.frames.files import too_many_pixels
+from list3r.frames.recordings import bag_chunks
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import FrameError, OptionError
+from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.unpacking import open_archive, parse_json
 from list3r.reconstruction.precomputed_files import read_piece
 from tests import recordings
 from tests.frames_scenes import write_png, write_replica, write_seven_scenes, write_tum
@@ -179,6 +183,42 @@ def test_depth_that_cannot_be_is_noted(value: int, tmp_path: Path) -> None:
     assert ("unknown everywhere" if value in (0, 65535) else "hardly indoors") in notes(root)
 
 
+def test_a_source_of_which_half_cannot_be_read_is_noted(tmp_path: Path) -> None:
+    root = write_tum(tmp_path / "tum", count=8)
+    assert "cannot be used" not in notes(root, intrinsics=(70.0, 70.0, 39.5, 29.5))
+    for path in sorted((root / "rgb").iterdir())[1::2]:
+        path.write_bytes(path.read_bytes()[:100])
+    assert "4 of 8 frames looked at cannot be used" in notes(root, intrinsics=(70.0, 70.0, 39.5, 29.5))
+
+
+def test_a_depth_scale_that_is_not_of_the_layout_is_noted(tmp_path: Path) -> None:
+    root = write_tum(tmp_path / "tum")
+    assert "depth-scale" not in notes(root, depth_scale=5000.0, intrinsics=(70.0, 70.0, 39.5, 29.5))
+    assert "makes all 5 times larger: the tum layout has 5000 units" in notes(
+        root, depth_scale=1000.0, intrinsics=(70.0, 70.0, 39.5, 29.5)
+    )
+
+
+@pytest.mark.parametrize(
+    "words", [["build", "walk", "-m", "m.l3r"], ["export", "m.l3r", "--to", "usd", "--out", "x.usda"]]
+)
+def test_too_little_address_space_is_one_line(
+    words: list[str], make_memory: Callable[..., Path], tmp_path: Path
+) -> None:
+    write_tum(tmp_path / "walk")
+    make_memory("m.l3r")
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (600 * 2**20, 600 * 2**20))
+
+    command = [sys.executable, "-m", "list3r", *words.split()]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    told = subprocess.run(
+        command, capture_output=True, text=True, check=False, preexec_fn=limit, cwd=tmp_path, env=environment
+    )
+    assert told.returncode == 2 and told.stderr.count("\n") == 1 and "limited to 600 MiB" in told.stderr
+
+
 def test_times_that_stand_still_are_noted(tmp_path: Path) -> None:
     root = write_tum(tmp_path / "tum")
     for name in ("rgb.txt", "depth.txt"):
@@ -193,6 +233,40 @@ def test_times_that_stand_still_are_noted(tmp_path: Path) -> None:
 def test_distortion_that_no_lens_has_is_refused(tmp_path: Path) -> None:
     root = write_seven_scenes(tmp_path / "seven")
     assert run(["inspect", str(root), "--distortion", "1e10,0,0,0"]) == 2
+
+
+@pytest.mark.parametrize("name", ["stsz", "trun"])
+def test_a_video_whose_index_claims_too_much_is_refused(name: str, tmp_path: Path) -> None:
+    table = struct.pack(">I4sIII", 20, name.encode(), 0, 2**31, 2**31)
+    outer = ("moov", "trak", "mdia", "minf", "stbl") if name == "stsz" else ("moof", "traf")
+    for box in reversed(outer):
+        table = struct.pack(">I4s", 8 + len(table), box.encode()) + table
+    (tmp_path / "walk.mp4").write_bytes(struct.pack(">I4sI4s", 16, b"ftyp", 0, b"isom") + table)
+    with pytest.raises(SourceError, match="claims over 8,000,000"):
+        open_source(tmp_path / "walk.mp4")
+
+
+@pytest.mark.parametrize("text", ["[" + "[]," * 4_000_000 + "[]]", "[" * 100_000], ids=["many", "deep"])
+def test_json_that_takes_much_memory_is_not_read(text: str) -> None:
+    with pytest.raises(ValueError, match=r"takes? about|nested"):
+        parse_json(text)
+
+
+def test_archives_that_unpack_in_leaps_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("metadata", bytes(1000))
+    with pytest.raises(zipfile.BadZipFile, match="deflate"):
+        open_archive(path)
+
+
+def test_chunks_of_recordings_unpack_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_chunks, "MOST_BYTES", 1000)
+    unpack = bag_chunks.bounded(bz2.BZ2Decompressor)
+    assert unpack(bz2.compress(bytes(999))) == bytes(999)
+    for data in (bz2.compress(bytes(2000)), bz2.compress(bytes(9))[:-4], b"no chunk at all"):
+        with pytest.raises(ValueError, match="chunk"):
+            unpack(data)
 
 
 def test_bombs_take_no_memory(tmp_path: Path) -> None:

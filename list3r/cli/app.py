@@ -39,6 +39,7 @@ from list3r.cli.serve import service as service_commands
 from list3r.cli.serve import view as view_commands
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
 from list3r.memory.errors import List3rError, naming_extras
+from list3r.memory.room import BUILD_MB, check_address_space
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
@@ -98,6 +99,7 @@ for module in (
 ):
     module.register(app)
 
+_BUILDING = ("build", "update", "demo", "precompute", "batch")
 _INTERRUPTED = 130
 """Status that typer gives when Ctrl-C reaches it."""
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
@@ -138,6 +140,8 @@ def run(arguments: list[str]) -> int:
     """Run one command; its exit status. What failed is said in one line, with `--json` in an answer as well."""
     told = _Failures(wants_json(arguments))
     try:
+        if arguments and arguments[0] in _BUILDING:
+            check_address_space(BUILD_MB, f"list3r {arguments[0]}")
         with naming_extras():
             status = commands().main(arguments, prog_name="list3r", standalone_mode=False)
         flush()
@@ -159,6 +163,8 @@ def run(arguments: list[str]) -> int:
         return _unheard()
     except (RuntimeError, OSError) as error:
         return told.fail_of_system(error)
+    except (MemoryError, ImportError) as error:
+        return told.fail_of_memory(error)
 
 
 @dataclass(frozen=True)
@@ -183,6 +189,14 @@ class _Failures:
             return self.fail("OSError", f"{error}; remove one of the links")
         where = f" {error.filename}:" if error.filename else ""
         return self.fail("OSError", f"{where} {error.strerror or error}".strip())
+
+    def fail_of_memory(self, error: MemoryError | ImportError) -> int:
+        """Memory that ran out, which libraries that are loaded tell in their own way; exit status 1."""
+        if isinstance(error, ImportError) and "failed to map" not in str(error):
+            raise error
+        message = "the memory that this process may use ran out; raise the limit (ulimit -v, or that of the container)"
+        self.fail("MemoryError", message)
+        return 1
 
     def usage(self, error: BaseException) -> int:
         """What is wrong with the command line, and where its help is."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from list3r.exporters.output import check_target
 from list3r.memory.errors import OptionError
+from list3r.memory.room import USD_MB, check_address_space
 
 if TYPE_CHECKING:  # the command line reads the names of the formats before anything heavy is needed
     from list3r.api import SceneMemory
@@ -47,6 +48,8 @@ class Format:
     """The package that it takes besides those of the extra `export`, as it is imported."""
     settings: str = ""
     """The dataclass of its options."""
+    address_space_mb: int = 0
+    """Address space that its libraries take, MiB; 0 where it is nothing to speak of."""
     options: tuple[str, ...] = ()
     """Fields of the settings that can be asked for, see `ExportOptions`."""
 
@@ -65,6 +68,7 @@ FORMATS: dict[str, Format] = {
         "OpenUSD: points, boxes, meshes, camera",
         settings="UsdSettings",
         options=("mesh", "colliders"),
+        address_space_mb=USD_MB,
     ),
     "ply": Format("ply", "write_ply", (".ply",), "coloured points", settings="PlySettings", options=("color",)),
     "glb": Format(
@@ -90,6 +94,7 @@ FORMATS: dict[str, Format] = {
         "a prop for each instance and a scene of them, for simulators",
         settings="SimreadySettings",
         options=("density",),
+        address_space_mb=USD_MB,
     ),
     "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),
     "nerfstudio": Format("cameras.nerfstudio", "write_nerfstudio", (), "transforms.json with pictures"),
@@ -119,6 +124,7 @@ def export(
         raise OptionError(f"the format {format_name} is written to a {' or '.join(form.suffixes)} file, not to {path}")
     if not form.folder:
         check_target(path)
+    check_address_space(form.address_space_mb, f"the format {format_name}")
     module = importlib.import_module(f"list3r.exporters.{form.module}")
     given = _given(format_name, form, dict(options))
     settings = [getattr(module, form.settings)(**given)] if given else []

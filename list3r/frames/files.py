@@ -24,7 +24,7 @@ def read_file(path: Path, most_bytes: int = MAX_FILE_BYTES) -> bytes:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with open(descriptor, "rb") as file:  # noqa: PTH123 - it closes the descriptor
         check_ordinary(os.fstat(descriptor), path, most_bytes)
-        return file.read(most_bytes + 1)
+        return file.read(os.fstat(descriptor).st_size + 1)
 
 
 def check_ordinary(found: os.stat_result, path: Path, most_bytes: int = MAX_FILE_BYTES) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
-from list3r.frames.decoding.decode import clean_depth, read_color, read_gray, read_raw_depth, used_bits
+from list3r.frames.decoding.decode import clean_depth, fault_of, read_color, read_gray, read_raw_depth, used_bits
 from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numbers
 from list3r.frames.options import SourceOptions
@@ -30,6 +30,7 @@ _LATER = ("start_s", "end_s", "sharpest", "max_side", "topics", "more")
 _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
 _POSES_TRIED = 50
+_FILES_TRIED = 12
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
 _LEAST_UPRIGHT = 0.4
@@ -190,7 +191,33 @@ class FolderSource:
 
     def _doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with depth, poses and times."""
-        return (*self._depth_doubts(), *self._pose_doubts(), *self._time_doubts(), *self._camera_doubts())
+        return (
+            *self._file_doubts(),
+            *self._scale_doubts(),
+            *self._depth_doubts(),
+            *self._pose_doubts(),
+            *self._time_doubts(),
+            *self._camera_doubts(),
+        )
+
+    def _file_doubts(self) -> tuple[str, ...]:
+        """Of files spread over the source, those that cannot be read; steps that are not even miss no pattern."""
+        files = self._layout.files
+        some = [files[int(k)] for k in np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round())]
+        faults = [found for f in some if (found := fault_of(f.color) or (fault_of(f.depth) if f.depth else None))]
+        if not faults:
+            return ()
+        return (f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]}); is the copy complete?",)
+
+    def _scale_doubts(self) -> tuple[str, ...]:
+        """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
+        said, usual = self._options.depth_scale, self._layout.optics.depth_scale
+        if not self._has_depth or said is None or usual is None or usual == said:
+            return ()
+        times = usual / said
+        how = f"{times:.3g} times larger" if times > 1 else f"{1 / times:.3g} times smaller"
+        kind = self._layout.kind
+        return (f"--depth-scale {said:g} makes all {how}: the {kind} layout has {usual:g} units a metre",)
 
     def _camera_doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with the camera: a centre far from the middle is that of another size."""

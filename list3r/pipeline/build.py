@@ -16,6 +16,7 @@ from list3r import __version__
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.memory.errors import TrackingError
+from list3r.memory.room import BUILD_MB, check_address_space
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
@@ -42,6 +43,7 @@ def build(
     memory in which cameras are placed, which `resume` goes on with. `FinishingError` where the memory is built and only
     its scale or its names are not.
     """
+    check_address_space(BUILD_MB, "a build")
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
     job = prepare(source, options, settings, run, memory)

@@ -15,6 +15,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.records import SessionCamera
+from list3r.memory.room import BUILD_MB, check_address_space
 from list3r.pipeline.calibration import estimated_camera, told_camera
 from list3r.pipeline.chunk import ChunkTask, reconstruct
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -63,6 +64,7 @@ def precompute(
     As in a build, jumps are looked for and an unknown camera is estimated. Raises `SourceError`, and `OptionError` when
     the folder holds files of other settings.
     """
+    check_address_space(BUILD_MB, "a reconstruction")
     run, watch = run or RunOptions(), watch or Watch()
     job = prepare(source, options, settings, run)
     watch.tell(job.notes)

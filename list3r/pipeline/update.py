@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
+from list3r.memory.room import BUILD_MB, check_address_space
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
@@ -41,6 +42,7 @@ def update(
     them, `force` gives up what an interrupted update left, of this video or another. `FinishingError` where the video
     is in the memory and only the scale or names are not.
     """
+    check_address_space(BUILD_MB, "a build")
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
     job = prepare(source, options, settings, run, memory, later=True)

@@ -108,6 +108,17 @@ def _decode(path: Stored, flags: int) -> NDArray[Any]:
     return image
 
 
+def fault_of(path: Stored | CodedArray) -> str | None:
+    """Return what is wrong with a file without decoding it: missing, empty or cut off; None where nothing is."""
+    try:
+        data = _bytes(path.data if isinstance(path, CodedArray) else path)
+    except OSError as error:
+        return f"{path.name} cannot be read ({error.strerror})"
+    if not data or _cut_off(data):
+        return f"{path.name} is {'cut off' if data else 'empty'}"
+    return None
+
+
 def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR, name: str = "the picture") -> NDArray[Any] | None:
     """Return what OpenCV makes of a picture, None where it is damaged. Raises `FrameError` for too large a one."""
     size = too_many_pixels(data)
