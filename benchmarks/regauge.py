@@ -27,7 +27,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalInstance
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunk import ChunkTask, process_chunk
+from list3r.pipeline.chunks.chunk import ChunkTask, process_chunk
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers

@@ -54,12 +54,12 @@ def main() -> None:
 
 def _judged_again(paths: list[Path], out: Path | None) -> None:
     """Judge stored scores by the thresholds as they are now."""
-    from list3r.association.revisits.constellations.registration import RegistrationSettings, doubt
+    from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, doubt
 
     held = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
     pairs = [p for h in held for p in h["pairs"]]
     for pair in pairs:
-        pair["believed"] = "agreeing" in pair and doubt(pair, RegistrationSettings()) is None
+        pair["believed"] = "agreeing" in pair and doubt(pair, ConstellationRegistrationSettings()) is None
     found = summary(pairs)
     print(json.dumps(found))
     scored_at = [h["commit"] for h in held]
@@ -90,14 +90,14 @@ def _home(preset: str, seed: int) -> dict[str, Any]:
     """Chunks of both runs of a home, and where they truly are."""
     from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
     from benchmarks.simulation.returns import make_return
-    from list3r.association.revisits.constellations.registration import RegistrationSettings
+    from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 
     video = make_return(preset, seed)
     model = FeedForwardModel(video, FeedForwardSettings.unseen_home(preset == "halls"), seed=seed)
     spans = plan_chunks(len(video.time_s), ChunkSettings(), video.cuts)
     runs = [s for s in spans if s.stop <= video.cuts[0]][-CHUNKS:], [s for s in spans if s.start >= video.cuts[0]]
-    settings = RegistrationSettings()
+    settings = ConstellationRegistrationSettings()
     return {
         "settings": settings,
         "runs": [[_place(video, model.chunk(span), settings) for span in run] for run in runs],
@@ -107,8 +107,8 @@ def _home(preset: str, seed: int) -> dict[str, Any]:
 def _place(video: Any, result: Any, settings: Any) -> tuple[Any, Any]:
     """A chunk as registration looks at it, and its S_truth_chunk."""
     from list3r.association.revisits.constellations.constellation import make_constellation
-    from list3r.association.revisits.constellations.registration import Place
-    from list3r.association.revisits.constellations.surface_fit import Surfaces
+    from list3r.association.revisits.constellations.registration import RegisteredChunk
+    from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
     from list3r.association.revisits.cross_check import Side
     from list3r.association.revisits.cues import CueSettings, instance_set
     from list3r.frames.base import Camera
@@ -126,8 +126,8 @@ def _place(video: Any, result: Any, settings: Any) -> tuple[Any, Any]:
     instances = instance_set(nodes, result.samples.T_chunk_cam, space, CueSettings())
     side = Side(result.samples, Camera(width, height, *result.intrinsics), instances)
     constellation = make_constellation(nodes, side, space, settings.constellation)
-    surfaces = Surfaces(side, constellation.unit, settings.surfaces)
-    return Place(constellation, surfaces, side), _to_truth(video, result.samples)
+    surfaces = ChunkSurfaces(side, constellation.unit, settings.surfaces)
+    return RegisteredChunk(constellation, surfaces, side), _to_truth(video, result.samples)
 
 
 def _to_truth(video: Any, samples: Any) -> Any:

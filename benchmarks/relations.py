@@ -39,7 +39,7 @@ from list3r.instances.neural.candidates import plane_of_mask, without_spill
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunk import ChunkTask, process_chunk
+from list3r.pipeline.chunks.chunk import ChunkTask, process_chunk
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.queries.relations import VERTICAL

@@ -9,11 +9,11 @@ import pytest
 
 from list3r.association.revisits.constellations.constellation import Constellation
 from list3r.association.revisits.constellations.matching import MatchingSettings, likeness, match_constellations
-from list3r.association.revisits.constellations.registration import RegistrationSettings, belief, doubt
+from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, belief, doubt
 from list3r.association.revisits.constellations.surface_fit import (
+    ChunkSurfaces,
     Held,
     SurfaceFitSettings,
-    Surfaces,
     fit_surfaces,
 )
 from list3r.association.revisits.cross_check import Side
@@ -92,7 +92,7 @@ def test_fewer_than_three_things_claim_nothing() -> None:
     assert match_constellations(u, u, metric=False, settings=MatchingSettings()) == []
 
 
-def room(S: Sim3, seed: int) -> Surfaces:
+def room(S: Sim3, seed: int) -> ChunkSurfaces:
     """Points of the floor and of three walls of a room of 4 x 3 x 2.5 m, in another gauge."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 1, (3000, 3)) * [4.0, 3.0, 2.5]
@@ -109,7 +109,9 @@ def room(S: Sim3, seed: int) -> Surfaces:
         instance=np.full(3000, -1, np.int32),
     )
     nothing = instance_set([], np.zeros((0, 4, 4)), "", CueSettings())
-    return Surfaces(Side(samples, Camera(64, 48, 50, 50, 32, 24), nothing), 2.0 * float(S.scale), SurfaceFitSettings())
+    return ChunkSurfaces(
+        Side(samples, Camera(64, 48, 50, 50, 32, 24), nothing), 2.0 * float(S.scale), SurfaceFitSettings()
+    )
 
 
 def test_surfaces_bring_a_rough_relation_together_and_up_holds_it_upright() -> None:
@@ -135,7 +137,7 @@ def test_a_relation_is_believed_by_all_that_speaks_for_it() -> None:
         "likeness": 0.7,
         "rival": 0.0,
     }
-    settings = RegistrationSettings()
+    settings = ConstellationRegistrationSettings()
     # -3.1 + 0.89 * 3 + 0.33 * 8 - 2.6 * 1 + 9.7 * 0 + 1 * 0 + 9.3 * 0.7
     assert belief(scores, settings.belief) == pytest.approx(6.12)
     assert doubt(scores, settings) is None

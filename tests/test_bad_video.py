@@ -24,8 +24,8 @@ from list3r.memory.errors import SourceError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
-from list3r.pipeline.calibration import camera_notes
-from list3r.pipeline.chunk import ChunkTask, process_parts
+from list3r.pipeline.chunks.calibration import camera_notes
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.reports import _runs
 from list3r.pipeline.request import RunOptions, Watch
 from list3r.pipeline.session import Job, plan_session

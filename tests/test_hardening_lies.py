@@ -100,6 +100,18 @@ def test_a_lie_is_one_line_that_names_table_and_row(
         store.edges.all()
 
 
+def test_an_edit_refuses_overlaps_of_local_instances_that_are_gone(
+    hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sqlite3.connect(rich) as database:
+        database.execute("DELETE FROM local_instances WHERE chunk_id = 2 AND local_id = 3")
+        hostile.lies.sign(database)
+    assert run(["verify", str(rich)]) == 1
+    assert "chunk_id, local_id 2, 3 is not in local_instances" in capsys.readouterr().out
+    assert run(["merge", str(rich), "2", "5"]) == 2
+    assert "local" in capsys.readouterr().err
+
+
 def test_a_label_that_is_no_text_is_mended(hostile: SimpleNamespace, rich: Path) -> None:
     with sqlite3.connect(rich) as database:
         database.execute(SOME["instances 3: label"])

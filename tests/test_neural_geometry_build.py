@@ -23,8 +23,8 @@ from list3r.memory.store.store import Store
 from list3r.models.device import Gpu
 from list3r.pipeline import choice
 from list3r.pipeline.choice import settings_asked
-from list3r.pipeline.chunk import ChunkTask, joint_model, process_chunk, process_parts
-from list3r.pipeline.joint_windows import joint_windows
+from list3r.pipeline.chunks.chunk import ChunkTask, joint_model, process_chunk, process_parts
+from list3r.pipeline.chunks.joint_windows import joint_windows
 from list3r.pipeline.request import BuildRequest
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.workers import OrderedPool

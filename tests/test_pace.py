@@ -17,7 +17,7 @@ from list3r.frames.chunking.pace import PaceSettings, depth_step, picture_flows
 from list3r.frames.source import SourceOptions
 from list3r.memory.geometry import umeyama
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunk import ChunkTask, process_parts
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings
 from tests.rgbd_scenes import CAMERA, render
 from tests.test_sfm_build import pose

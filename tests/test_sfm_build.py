@@ -16,7 +16,7 @@ from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
-from list3r.pipeline.chunk import PART_STEP, ChunkTask, process_parts
+from list3r.pipeline.chunks.chunk import PART_STEP, ChunkTask, process_parts
 from list3r.pipeline.precompute import precompute
 from list3r.pipeline.request import RunOptions, Watch
 from list3r.pipeline.settings import BuildSettings

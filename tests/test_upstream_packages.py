@@ -28,8 +28,8 @@ from list3r.cli.app import run
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
 from list3r.memory.errors import OptionError
 from list3r.models.upstream import quiet, upstream_class
-from list3r.pipeline import chunk as chunk_stage
 from list3r.pipeline import session as session_stage
+from list3r.pipeline.chunks import chunk as chunk_stage
 from list3r.reconstruction.networks.feedforward import Network, PictureSize
 from tests import neural_scenes, upstream_networks
 from tests.rgbd_scenes import CAMERA

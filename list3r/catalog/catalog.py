@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.batch.storage import Output, is_remote
 from list3r.catalog.base import MOST_RANKED, Backend, open_backend
-from list3r.catalog.reading import read_content
+from list3r.catalog.reading import printable, read_content
 from list3r.catalog.records import (
     CatalogAnswers,
     CatalogError,
@@ -98,7 +98,7 @@ class Catalog:
 
     def remove(self, name: str) -> None:
         """Forget a memory; its file stays. Raises `CatalogError` where there is none of that name."""
-        if not self._backend.drop(name):
+        if not self._backend.drop(printable(name)):
             raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
 
     def memories(self) -> list[MemoryEntry]:
@@ -107,7 +107,7 @@ class Catalog:
 
     def memory(self, name: str) -> MemoryEntry:
         """Return one memory. Raises `CatalogError` where there is none of that name."""
-        found = self._backend.memories([name])
+        found = self._backend.memories([printable(name)])
         if not found:
             raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
         return found[0]

@@ -18,6 +18,8 @@ def read_content(path: str, name: str | None = None) -> MemoryContent:
 
     Raises `MemoryFileError` for what is no memory, `CatalogError` for one that is being written.
     """
+    if path != printable(path):
+        raise CatalogError(f"{printable(path)} is no text in UTF-8, as a catalogue keeps it; rename the file or folder")
     if is_remote(path):
         with tempfile.TemporaryDirectory() as folder:
             local = fetched(path, Path(folder) / "memory")

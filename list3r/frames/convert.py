@@ -18,7 +18,7 @@ from list3r.memory.errors import ExportError, OptionError, SourceError
 
 
 @dataclass(frozen=True)
-class Layout:
+class OutputLayout:
     """A layout that can be written."""
 
     writer: str
@@ -31,12 +31,12 @@ class Layout:
     """Depth beyond this does not fit into its numbers, metres."""
 
 
-LAYOUTS: dict[str, Layout] = {
-    "tum": Layout("tum.TumWriter", most_depth_m=13.1),
-    "transforms": Layout("transforms.TransformsWriter", unposed=False, most_depth_m=65.5),
-    "colmap": Layout("colmap.ColmapWriter", depth=False),
-    "replica": Layout("replica.ReplicaWriter", unposed=False, most_depth_m=10.0),
-    "r3d": Layout("record3d.Record3dWriter"),
+LAYOUTS: dict[str, OutputLayout] = {
+    "tum": OutputLayout("tum.TumWriter", most_depth_m=13.1),
+    "transforms": OutputLayout("transforms.TransformsWriter", unposed=False, most_depth_m=65.5),
+    "colmap": OutputLayout("colmap.ColmapWriter", depth=False),
+    "replica": OutputLayout("replica.ReplicaWriter", unposed=False, most_depth_m=10.0),
+    "r3d": OutputLayout("record3d.Record3dWriter"),
 }
 """All that `--to` knows."""
 
@@ -90,19 +90,19 @@ def convert(
     return report
 
 
-def _layout(name: str) -> Layout:
+def _layout(name: str) -> OutputLayout:
     if name not in LAYOUTS:
         raise OptionError(f"--to {name} is not known; choose {', '.join(LAYOUTS)}")
     return LAYOUTS[name]
 
 
-def _writer(layout: Layout) -> MakeWriter:
+def _writer(layout: OutputLayout) -> MakeWriter:
     module, _, name = layout.writer.partition(".")
     made = getattr(import_module(f"list3r.frames.writers.{module}"), name)
     return made  # type: ignore[no-any-return]
 
 
-def _check(opened: FrameSource, how: Layout, layout: str, target: Path) -> None:
+def _check(opened: FrameSource, how: OutputLayout, layout: str, target: Path) -> None:
     if target.exists():
         raise ExportError(f"{target} exists; name another folder or remove it first")
     if not target.parent.is_dir():

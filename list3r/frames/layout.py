@@ -35,11 +35,11 @@ class FrameFile:
     pose: Path | None = None
     """A text file with a 4x4 pose."""
     T_source_camera: NDArray[np.float64] | None = None
-    """A pose that was read with the listing, of the camera that `Layout.poses_of` names. Shape (4, 4)."""
+    """A pose that was read with the listing, of the camera that `FolderLayout.poses_of` names. Shape (4, 4)."""
     time_s: float | None = None
     """Seconds of the source's clock, if it has one."""
     confidence: Stored | CodedArray | None = None
-    """How sure the sensor is of each depth pixel, as whole numbers, see `Layout.least_confidence`."""
+    """How sure the sensor is of each depth pixel, as whole numbers, see `FolderLayout.least_confidence`."""
     mask: Stored | None = None
     """Where it is 0 the picture shows nothing that counts: depth is unknown there."""
     lens: Camera | None = None

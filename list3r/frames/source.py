@@ -11,22 +11,18 @@ from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers import (
-    arkitscenes,
     colmap,
     euroc,
     images,
     nerfstudio,
-    polycam,
-    record3d,
     replica,
     rosbag,
     scannet,
-    scannetpp,
     seven_scenes,
     spool,
-    stray,
     tum,
 )
+from list3r.frames.readers.phones import arkitscenes, polycam, record3d, scannetpp, stray
 from list3r.memory.errors import OptionError, SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]

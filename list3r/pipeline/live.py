@@ -27,8 +27,8 @@ from list3r.frames.options import SourceOptions
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError, TrackingError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
-from list3r.pipeline.calibration import estimated_camera, with_camera
-from list3r.pipeline.chunk import ChunkTask, process_parts
+from list3r.pipeline.chunks.calibration import estimated_camera, with_camera
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.reports import BuildReport, LiveReport, build_report

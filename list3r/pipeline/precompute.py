@@ -16,8 +16,8 @@ from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.records import SessionCamera
 from list3r.memory.room import BUILD_MB, check_address_space
-from list3r.pipeline.calibration import estimated_camera, told_camera
-from list3r.pipeline.chunk import ChunkTask, reconstruct
+from list3r.pipeline.chunks.calibration import estimated_camera, told_camera
+from list3r.pipeline.chunks.chunk import ChunkTask, reconstruct
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.pipeline.session import prepare
 from list3r.pipeline.settings import BuildSettings

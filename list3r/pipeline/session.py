@@ -25,11 +25,11 @@ from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
-from list3r.pipeline.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
 from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
-from list3r.pipeline.chunk import ChunkTask, process_parts
+from list3r.pipeline.chunks.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
+from list3r.pipeline.chunks.joint_windows import joint_windows
 from list3r.pipeline.finishing import check_run
-from list3r.pipeline.joint_windows import joint_windows
 from list3r.pipeline.mapping import add_chunk
 from list3r.pipeline.placing import place_chunks
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch

@@ -76,7 +76,7 @@ def import_map(
 
     Example: list3r import dsg.json -m house.l3r
     """
-    from list3r.pipeline.importing import import_map as read
+    from list3r.importers.importing import import_map as read
 
     report = read(source, memory, kind=kind, up=up)
     if json:

@@ -1,4 +1,4 @@
-"""Write a recording as Record3D exports it (`.r3d`), see `list3r.frames.readers.record3d`."""
+"""Write a recording as Record3D exports it (`.r3d`), see `list3r.frames.readers.phones.record3d`."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from list3r.memory.change.detection import across_sessions
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.rows import pack_scores, unpack_scores
 from list3r.memory.library.rules import ConsolidationSettings, World
@@ -148,11 +149,23 @@ class Region:
         self.store.library.overlaps.put(fresh)
         left: set[Key] = set()
         for u, v in stored.keys() - kept:
-            p = unpack_scores(stored[u, v])
+            p = self._read_scores((u, v), stored[u, v])
             most = np.maximum(p.i_on_j, p.j_on_i) >= self.settings.evidence.swallowed
             left.update((u, int(self.shapes(u).local_id[i])) for i in p.i[most])
             left.update((v, int(self.shapes(v).local_id[j])) for j in p.j[most])
         return left
+
+    def _read_scores(self, pair: tuple[int, int], blob: bytes) -> PairScores:
+        """Return the scores of a pair of chunks. Raises `MemoryFileError` where they name what is not there."""
+        p = unpack_scores(blob)
+        for chunk_id, rows in zip(pair, (p.i, p.j), strict=True):
+            if len(rows) and not 0 <= rows.min() <= rows.max() < len(self.shapes(chunk_id).local_id):
+                file = self.store.path
+                raise MemoryFileError(
+                    f"overlaps of chunks {pair[0]} and {pair[1]} name local instances that chunk {chunk_id} does not "
+                    f"have; run `list3r verify {file}`, `list3r repair {file}` saves what is sound"
+                )
+        return p
 
     def _score(self, u: int, v: int) -> PairScores:
         S_u_v = self.rows[u].S_graph_chunk.inverse() @ self.rows[v].S_graph_chunk if u != v else Sim3.identity()
@@ -174,7 +187,7 @@ class Region:
         found = kept.get(pair)
         if found is None or any(a is not b for a, b in zip(found.rows, rows, strict=True)) or found.stamp != stamp:
             shapes = {k: self.shapes(k) for k in pair}
-            known = {pair: unpack_scores(self.store.library.overlaps.get(pair))}
+            known = {pair: self._read_scores(pair, self.store.library.overlaps.get(pair))}
             known = without_moving(known, shapes, self.motions(pair))
             graph = {k: self.rows[k].S_graph_chunk for k in pair}
             scores = across_sessions(known, shapes, graph, self._carving, self.settings.changes)[pair]

@@ -49,7 +49,7 @@ class MatchingSettings:
 
 
 @dataclass(frozen=True)
-class Match:
+class ConstellationMatch:
     """A similarity of two upright frames and the things that agree on it."""
 
     S_v_u: Sim3
@@ -78,7 +78,7 @@ def likeness(u: Constellation, v: Constellation) -> Array:
 
 def match_constellations(
     u: Constellation, v: Constellation, metric: bool, settings: MatchingSettings | None = None
-) -> list[Match]:
+) -> list[ConstellationMatch]:
     """Return the best hypotheses, best first, no two of them alike; none where too little is there."""
     s = settings or MatchingSettings()
     if min(len(u.local_id), len(v.local_id)) < 3:
@@ -93,7 +93,7 @@ def match_constellations(
         return []
     best = np.argsort(-c.scores(tried), kind="stable")[: s.refined]
     found = [c.refined(Sim3(tried.scale[k], tried.rotation[k], tried.translation[k]), metric) for k in best]
-    out: list[Match] = []
+    out: list[ConstellationMatch] = []
     for match in sorted((m for m in found if m is not None), key=lambda m: -m.score):
         if not any(_alike(match.S_v_u, other.S_v_u, u, v, s) for other in out):
             out.append(match)
@@ -168,7 +168,7 @@ class _Candidates:
         sized = np.abs(self._log_size - np.log(S.scale)[:, None]) < self._s.size_range
         return np.asarray(np.where(sized, self._odds * np.maximum(0.0, 1.0 - (off / 2.5) ** 2), 0.0))
 
-    def refined(self, S: Sim3, metric: bool) -> Match | None:
+    def refined(self, S: Sim3, metric: bool) -> ConstellationMatch | None:
         """Return the match that a similarity grows to, None where less than three things agree."""
         pairs = np.zeros(0, np.int64)
         for _ in range(4):
@@ -179,7 +179,7 @@ class _Candidates:
             S = _fit(self._a[pairs], self._b[pairs], self._odds[pairs] / self._sigma[pairs] ** 2, metric)
         gain = self._gain(Sim3(S.scale[None], S.rotation[None], S.translation[None]))[0][pairs]
         off = np.linalg.norm(S.apply(self._a[pairs]) - self._b[pairs], axis=1) / self._sigma[pairs]
-        return Match(S, self._rows[pairs], float(gain.sum()), float(np.sqrt((off**2).mean())))
+        return ConstellationMatch(S, self._rows[pairs], float(gain.sum()), float(np.sqrt((off**2).mean())))
 
     def _one_to_one(self, gain: Array) -> Ints:
         used_u: set[int] = set()

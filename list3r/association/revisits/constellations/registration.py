@@ -19,12 +19,16 @@ from list3r.association.revisits.constellations.constellation import (
     Constellation,
     ConstellationSettings,
 )
-from list3r.association.revisits.constellations.matching import Match, MatchingSettings, match_constellations
+from list3r.association.revisits.constellations.matching import (
+    ConstellationMatch,
+    MatchingSettings,
+    match_constellations,
+)
 from list3r.association.revisits.constellations.surface_fit import (
+    ChunkSurfaces,
     Held,
     SurfaceFit,
     SurfaceFitSettings,
-    Surfaces,
     fit_surfaces,
 )
 from list3r.association.revisits.cross_check import CrossSettings, Side, cross_check
@@ -53,7 +57,7 @@ class BeliefWeights:
 
 
 @dataclass(frozen=True)
-class RegistrationSettings:
+class ConstellationRegistrationSettings:
     """How chunks are registered by their things."""
 
     constellation: ConstellationSettings = field(default_factory=ConstellationSettings)
@@ -90,11 +94,11 @@ class RegistrationSettings:
 
 
 @dataclass(frozen=True)
-class Place:
+class RegisteredChunk:
     """One chunk as registration looks at it."""
 
     constellation: Constellation
-    surfaces: Surfaces
+    surfaces: ChunkSurfaces
     side: Side
 
 
@@ -103,12 +107,14 @@ class Registration:
     """A supposed relation of two chunks, and all that is known of it."""
 
     S_v_u: Sim3
-    match: Match
+    match: ConstellationMatch
     fit: SurfaceFit
     scores: dict[str, float]
 
 
-def register(u: Place, v: Place, metric: bool, settings: RegistrationSettings) -> Registration | None:
+def register(
+    u: RegisteredChunk, v: RegisteredChunk, metric: bool, settings: ConstellationRegistrationSettings
+) -> Registration | None:
     """Return the likeliest relation of two chunks, None where no three things agree anywhere."""
     cu, cv = u.constellation, v.constellation
     matches = match_constellations(cu, cv, metric, settings.matching)
@@ -149,7 +155,7 @@ def belief(scores: Mapping[str, float], weights: BeliefWeights) -> float:
     )
 
 
-def doubt(scores: Mapping[str, float], settings: RegistrationSettings) -> str | None:
+def doubt(scores: Mapping[str, float], settings: ConstellationRegistrationSettings) -> str | None:
     """Return why a relation of these scores is not believed, or None."""
     if scores["agreeing"] < settings.believed_pairs:
         return f"with surfaces brought together only {scores['agreeing']:.0f} of them do"
@@ -175,7 +181,13 @@ def _lowered(S: Sim3, u: Constellation, v: Constellation) -> Sim3:
     return tilt_v.inverse() @ S @ tilt_u
 
 
-def _described(u: Place, v: Place, match: Match, fit: SurfaceFit, settings: RegistrationSettings) -> Registration:
+def _described(
+    u: RegisteredChunk,
+    v: RegisteredChunk,
+    match: ConstellationMatch,
+    fit: SurfaceFit,
+    settings: ConstellationRegistrationSettings,
+) -> Registration:
     check = cross_check(fit.S_v_u, u.side, v.side, None, settings.cross)
     cu, cv = u.constellation, v.constellation
     a = fit.S_v_u.apply(cu.center[match.pairs[:, 0]] @ cu.R_up_chunk)
@@ -204,7 +216,7 @@ def _described(u: Place, v: Place, match: Match, fit: SurfaceFit, settings: Regi
     return Registration(fit.S_v_u, match, fit, scores)
 
 
-def covariance(u: Place, metric: bool, settings: RegistrationSettings) -> Array:
+def covariance(u: RegisteredChunk, metric: bool, settings: ConstellationRegistrationSettings) -> Array:
     """Return the covariance of a believed relation, whose errors are about the middle of u's things.
 
     Of x in S_true = S_v_u exp(x), u's units. Shape (7, 7).

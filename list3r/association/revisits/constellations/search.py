@@ -21,14 +21,14 @@ from list3r.association.revisits.constellations.constellation import (
 )
 from list3r.association.revisits.constellations.matching import match_constellations
 from list3r.association.revisits.constellations.registration import (
-    Place,
+    ConstellationRegistrationSettings,
+    RegisteredChunk,
     Registration,
-    RegistrationSettings,
     covariance,
     doubt,
     register,
 )
-from list3r.association.revisits.constellations.surface_fit import Surfaces
+from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
 from list3r.association.revisits.cross_check import Side
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge
@@ -51,7 +51,7 @@ class ThingSearchSettings:
     most_near: int = 4
     most_looked: int = 16
     """Chunks whose origins lie nearest, of which it is asked how near they lie; reading all takes long."""
-    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    registration: ConstellationRegistrationSettings = field(default_factory=ConstellationRegistrationSettings)
 
 
 @dataclass
@@ -149,15 +149,17 @@ class ThingSearch:
             held = self._known.by_chunk[chunk_id] = state, made
         return held[1]
 
-    def _place(self, chunk_id: int) -> Place:
+    def _place(self, chunk_id: int) -> RegisteredChunk:
         c, side = self._constellation(chunk_id), self._side(chunk_id)
-        return Place(c, Surfaces(side, c.unit, self._settings.registration.surfaces), side)
+        return RegisteredChunk(c, ChunkSurfaces(side, c.unit, self._settings.registration.surfaces), side)
 
     def _middle_keyframe(self, chunk_id: int) -> int:
         keys, _ = self._store.keyframes.descriptors([chunk_id])
         return int(keys[len(keys) // 2, 1]) if len(keys) else self._rows[chunk_id].first_frame
 
-    def _edge(self, u: int, old: Place, new: Place, found: Registration, against: str | None) -> Edge:
+    def _edge(
+        self, u: int, old: RegisteredChunk, new: RegisteredChunk, found: Registration, against: str | None
+    ) -> Edge:
         agree = f"{found.scores['pairs']:.0f} things agree on where they stand"
         confidence = float(
             np.clip(

@@ -68,7 +68,7 @@ class SurfaceFit:
     """Least eigenvalue over largest of the directions of those surfaces: 0 where they leave a shift open."""
 
 
-class Surfaces:
+class ChunkSurfaces:
     """Points and normals of a chunk, looked up often."""
 
     def __init__(self, side: Side, unit: float, settings: SurfaceFitSettings) -> None:
@@ -97,8 +97,8 @@ class Surfaces:
 
 def fit_surfaces(
     S_v_u: Sim3,
-    u: Surfaces,
-    v: Surfaces,
+    u: ChunkSurfaces,
+    v: ChunkSurfaces,
     held: Held,
     metric: bool,
     settings: SurfaceFitSettings | None = None,
@@ -130,7 +130,7 @@ def fit_surfaces(
 
 
 def _pairs(
-    S: Sim3, points: Array, normals: Array, v: Surfaces, reach: float, s: SurfaceFitSettings
+    S: Sim3, points: Array, normals: Array, v: ChunkSurfaces, reach: float, s: SurfaceFitSettings
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
     there = S.apply(points)
     distance, at = v.tree.query(there, distance_upper_bound=reach)
@@ -144,7 +144,7 @@ def _step(
     S: Sim3,
     points: Array,
     normals: Array,
-    v: Surfaces,
+    v: ChunkSurfaces,
     held: Held,
     reach: float,
     metric: bool,

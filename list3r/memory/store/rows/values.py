@@ -272,13 +272,15 @@ REFERENCES = (
     ("keyframes", "chunk_id", "chunks", "chunk_id"),
     ("local_instances", "chunk_id", "chunks", "chunk_id"),
     ("supports", "chunk_id", "chunks", "chunk_id"),
+    ("observations", "chunk_id, local_id", "local_instances", "chunk_id, local_id"),
+    ("supports", "chunk_id, local_id", "local_instances", "chunk_id, local_id"),
     ("anchors", "instance", "instances", "id"),
     ("votes", "chunk_id", "chunks", "chunk_id"),
     ("detected_labels", "instance", "instances", "id"),
     ("events", "instance", "instances", "id"),
     ("events", "session_id", "sessions", "session_id"),
 )
-"""Table, column, and where its values must be found."""
+"""Table, columns, and where their values must be found."""
 
 
 def bad_values(database: sqlite3.Connection, name: str, where: str = "1", arguments: Any = ()) -> Iterator[BadRow]:
@@ -303,8 +305,9 @@ def bad_references(database: sqlite3.Connection, name: str) -> Iterator[str]:
     """Values of a table that point nowhere, and ids that stand for one another in a circle."""
     for source, column, other, target in REFERENCES:
         if source == name:
-            query = f"SELECT DISTINCT {column} FROM {source} WHERE {column} NOT IN (SELECT {target} FROM {other})"
-            yield from (f"{source}: {column} {row[0]} is not in {other}" for row in database.execute(query))
+            query = f"SELECT DISTINCT {column} FROM {source} WHERE ({column}) NOT IN (SELECT {target} FROM {other})"
+            found = database.execute(query)
+            yield from (f"{source}: {column} {', '.join(map(str, row))} is not in {other}" for row in found)
     if name == "keyframes":
         inside = "SELECT 1 FROM chunks c WHERE c.chunk_id = k.chunk_id AND k.frame_index >= c.first_frame"
         query = (

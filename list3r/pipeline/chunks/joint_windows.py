@@ -14,7 +14,7 @@ from list3r.association.revisits.joint_window import JointReconstructor
 from list3r.memory.records import ChunkResult, JointWindow
 from list3r.memory.store.store import Store
 from list3r.models.cards import find_card
-from list3r.pipeline.chunk import ChunkTask, joint_model
+from list3r.pipeline.chunks.chunk import ChunkTask, joint_model
 from list3r.pipeline.workers import OrderedPool
 
 Pool = OrderedPool[ChunkTask, tuple[ChunkResult, ...]]
