@@ -126,7 +126,7 @@ CASES = {
     "frames backwards": ("build {p}/good -m {p}/new.l3r --frames 9:3", "9"),
     "frames beyond the end": ("build {p}/good -m {p}/new.l3r --frames 90:99", "90"),
     "overlap as long as the chunk": ("build {p}/good -m {p}/new.l3r --chunk 20 --overlap 20", "overlap 20"),
-    "no workers": ("build {p}/good -m {p}/new.l3r --workers 0", "--workers 0"),
+    "workers below none": ("build {p}/good -m {p}/new.l3r --workers -1", "--workers -1"),
     "unknown poses": ("build {p}/good -m {p}/new.l3r --poses guess", "--poses guess"),
     "unknown model": ("build {p}/good -m {p}/new.l3r --reconstruction magic", "--reconstruction magic"),
     "unknown kind": ("build {p}/good -m {p}/new.l3r --kind magic", "magic"),

@@ -211,7 +211,7 @@ def test_too_little_address_space_is_one_line(
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (600 * 2**20, 600 * 2**20))
 
-    command = [sys.executable, "-m", "list3r", *words.split()]
+    command = [sys.executable, "-m", "list3r", *words]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     told = subprocess.run(
         command, capture_output=True, text=True, check=False, preexec_fn=limit, cwd=tmp_path, env=environment
