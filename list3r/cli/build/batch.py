@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +22,45 @@ if TYPE_CHECKING:
 _RUN = only("licence", "scale_anchor", "detector", "detector_classes")
 
 
+@dataclass(frozen=True)
+class BatchPlace:
+    """Where the tasks of a batch run, as options."""
+
+    engine: Annotated[str, typer.Option("--engine", help="What runs the tasks: local or ray.")] = "local"
+    address: Annotated[str | None, typer.Option("--address", help="Of the Ray cluster; default: RAY_ADDRESS.")] = None
+    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Tasks side by side; default: what fits.")] = (
+        None
+    )
+    cpus: Annotated[int, typer.Option("--cpus", metavar="N", help="Cores of one task.")] = 1
+    task_memory: Annotated[
+        float | None, typer.Option("--task-memory", metavar="GIB", help="Memory of one task; default: not counted.")
+    ] = None
+    gpus: Annotated[float, typer.Option("--gpus", metavar="N", help="GPUs of one task, or a share of one.")] = 0.0
+    retries: Annotated[
+        int, typer.Option("--retries", metavar="N", help="Tries again where a process was ended from outside.")
+    ] = 3
+    scratch: Annotated[
+        Path | None, typer.Option("--scratch", metavar="DIR", help="On each machine's own disk, for what is under way.")
+    ] = None
+    state: Annotated[
+        Path | None, typer.Option("--state", metavar="FILE", help="The manifest; default: batch.sqlite in --out.")
+    ] = None
+
+
+@dataclass(frozen=True)
+class BatchTasks:
+    """Which tasks, and what they may do, as options."""
+
+    element: Annotated[
+        int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
+    ] = None
+    script: Annotated[
+        str | None, typer.Option("--print", metavar="WHAT", help="Print a script instead: slurm, an array job.")
+    ] = None
+    onto: Annotated[bool, typer.Option("--onto", help="Add videos to memories that no batch made.")] = False
+    force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False
+
+
 def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command("batch")(batch)
@@ -37,33 +76,8 @@ def batch(
     ],
     out: Annotated[str, typer.Option("--out", metavar="DIR", help="Folder or URL of the memories.")],
     *,
-    engine: Annotated[str, typer.Option("--engine", help="What runs the tasks: local or ray.")] = "local",
-    address: Annotated[str | None, typer.Option("--address", help="Of the Ray cluster; default: RAY_ADDRESS.")] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", help="Tasks side by side; default: what fits.")
-    ] = None,
-    cpus: Annotated[int, typer.Option("--cpus", metavar="N", help="Cores of one task.")] = 1,
-    task_memory: Annotated[
-        float | None, typer.Option("--task-memory", metavar="GIB", help="Memory of one task; default: not counted.")
-    ] = None,
-    gpus: Annotated[float, typer.Option("--gpus", metavar="N", help="GPUs of one task, or a share of one.")] = 0.0,
-    retries: Annotated[
-        int, typer.Option("--retries", metavar="N", help="Tries again where a process was ended from outside.")
-    ] = 3,
-    scratch: Annotated[
-        Path | None, typer.Option("--scratch", metavar="DIR", help="On each machine's own disk, for what is under way.")
-    ] = None,
-    state: Annotated[
-        Path | None, typer.Option("--state", metavar="FILE", help="The manifest; default: batch.sqlite in --out.")
-    ] = None,
-    element: Annotated[
-        int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
-    ] = None,
-    script: Annotated[
-        str | None, typer.Option("--print", metavar="WHAT", help="Print a script instead: slurm, an array job.")
-    ] = None,
-    onto: Annotated[bool, typer.Option("--onto", help="Add videos to memories that no batch made.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False,
+    place: BatchPlace,
+    tasks: BatchTasks,
     request: BuildRequest,
     words: src.SourceWords,
     run: Annotated[RunOptions, _RUN],
@@ -81,21 +95,25 @@ def batch(
     from list3r.pipeline.finishing import check_run
 
     check_run(run)
-    resources = TaskResources(cpus, task_memory, gpus)
-    settings = BatchSettings(out, scratch, state, retries, 0 if cpus == 1 else cpus, onto, force)
+    resources = TaskResources(place.cpus, place.task_memory, place.gpus)
+    settings = BatchSettings(
+        out, place.scratch, place.state, place.retries, 0 if place.cpus == 1 else place.cpus, tasks.onto, tasks.force
+    )
     groups = read_tasks(videos, Asked(lambda fields: replace(words, **fields).options(), request, run))
-    if script is not None:
-        if script != "slurm":
-            raise OptionError(f"--print {script} is not known; slurm is")
-        write(slurm_script(_without_print(sys.argv[1:]), len(groups), resources, jobs))
+    if tasks.script is not None:
+        if tasks.script != "slurm":
+            raise OptionError(f"--print {tasks.script} is not known; slurm is")
+        write(slurm_script(_without_print(sys.argv[1:]), len(groups), resources, place.jobs))
         return
     try:
-        if element is not None:
-            if not 0 <= element < len(groups):
-                raise OptionError(f"--only {element}: the memories are numbered 0 to {len(groups) - 1}")
-            report = run_here(groups[element], settings, _told(json))
+        if tasks.element is not None:
+            if not 0 <= tasks.element < len(groups):
+                raise OptionError(f"--only {tasks.element}: the memories are numbered 0 to {len(groups) - 1}")
+            report = run_here(groups[tasks.element], settings, _told(json))
         else:
-            report = run_batch(groups, make_engine(engine, resources, jobs, address), settings, _told(json))
+            report = run_batch(
+                groups, make_engine(place.engine, resources, place.jobs, place.address), settings, _told(json)
+            )
     except KeyboardInterrupt:
         note("", "interrupted; what is done stays, give the same command again to go on")
         raise typer.Exit(1) from None

@@ -89,27 +89,36 @@ class StreamFeed:
         s = self._settings
         last, pause_s = time.monotonic(), s.pause_s
         while not self._stop.is_set():
-            said, came, whole = "it ended", False, False
-            try:
-                for image, finite in self._pictures():
-                    last, pause_s, came, whole = time.monotonic(), s.pause_s, True, finite
-                    self._keep(image, last)
-                    if self._stop.is_set():
-                        return "it was ended"
-                if whole:
-                    return "the stream is over"
-            except av.FFmpegError as error:
-                said = error.strerror or str(error)
+            came_s, whole, said = self._receive()
+            if self._stop.is_set():
+                break
+            if whole:
+                return "the stream is over"
+            if came_s is not None:
+                last, pause_s = came_s, s.pause_s
             if time.monotonic() - last > s.retry_s:
                 return f"the connection was lost ({said}) and did not come back within {s.retry_s:g} s"
-            if came or not self.state().received:
+            if came_s is not None or not self.state().received:
                 self._tell(f"no connection to {without_secrets(self._source)} ({said}); it is tried again")
             with self._lock:
                 self._gap = True
-                self._state = replace(self._state, reconnects=self._state.reconnects + came)
+                self._state = replace(self._state, reconnects=self._state.reconnects + (came_s is not None))
             self._stop.wait(pause_s)
             pause_s = min(2 * pause_s, s.most_pause_s)
         return "it was ended"
+
+    def _receive(self) -> tuple[float | None, bool, str]:
+        """Keep the pictures of one connection: when the last one came, whether the stream is over, how it ended."""
+        last, whole = None, False
+        try:
+            for image, finite in self._pictures():
+                last, whole = time.monotonic(), finite
+                self._keep(image, last)
+                if self._stop.is_set():
+                    break
+        except av.FFmpegError as error:
+            return last, False, error.strerror or str(error)
+        return last, whole, "it ended"
 
     def _pictures(self) -> Iterator[tuple[NDArray[np.uint8], bool]]:
         """Pictures of one connection, RGB, and whether the stream has an end that it states."""

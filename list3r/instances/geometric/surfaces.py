@@ -96,18 +96,25 @@ def merge_coplanar(scene: Scene, planes: list[Plane]) -> list[Plane]:
     for plane in sorted(planes, key=lambda p: -p.area):
         for number, big in enumerate(out):
             both = id(plane) in bounding and id(big) in bounding
-            if _same_surface(scene, big, plane, both):
-                members = np.union1d(big.members, plane.members)
-                joined = _repaint(scene, replace(big, members=members, area=big.area + plane.area))
-                if joined.area < MIN_FILL * float(np.prod(joined.extent())):
-                    continue
-                out[number] = joined
-                if id(big) in bounding:
-                    bounding.add(id(out[number]))
-                break
+            joined = _joined(scene, big, plane, both)
+            if joined is None:
+                continue
+            out[number] = joined
+            if id(big) in bounding:
+                bounding.add(id(joined))
+            break
         else:
             out.append(plane)
     return out
+
+
+def _joined(scene: Scene, big: Plane, plane: Plane, both_bound: bool) -> Plane | None:
+    """Two pieces as one surface; None where they are not one, or would fill too little of it."""
+    if not _same_surface(scene, big, plane, both_bound):
+        return None
+    members = np.union1d(big.members, plane.members)
+    joined = _repaint(scene, replace(big, members=members, area=big.area + plane.area))
+    return joined if joined.area >= MIN_FILL * float(np.prod(joined.extent())) else None
 
 
 def _mounted(scene: Scene, plane: Plane, planes: list[Plane]) -> bool:
