@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from machine import run_list3r, write_json
 
+import list3r
 from list3r.memory.store.store import Store
 from list3r.semantics.nanodet import overlaps
 
@@ -75,7 +76,8 @@ def judged(path: Path) -> dict[str, Any]:
                 others[i.label] = others.get(i.label, 0) + 1
         poses = store.facts.poses
         structure = sum(i.label is not None for i in things.values() if i.structure is not None)
-    answers, _ = run_list3r("query", "find", str(path), "cup on dining table")
+    with list3r.open(path) as memory:
+        first = {match.instance.id for match in memory.find("cup on dining table")[:2]}
     mugs = {home["white mug"], home["printed mug"]}
     return {
         "poses": poses,
@@ -85,7 +87,7 @@ def judged(path: Path) -> dict[str, Any]:
         "called": said,
         "others": dict(sorted(others.items())),
         "structure_named": structure,
-        "find_mugs_first": {m["id"] for m in answers["matches"][:2]} == mugs,
+        "find_mugs_first": first == mugs,
     }
 
 

@@ -26,7 +26,7 @@ def machine() -> dict[str, Any]:
 
 
 def run_list3r(*arguments: str, kept: Path | None = None) -> tuple[dict[str, Any], dict[str, float]]:
-    """Run the program with --json; its answer, its wall seconds and the peak memory of all its processes.
+    """Run the program with --json; its report, its wall seconds and the peak memory of all its processes.
 
     `kept` is a folder for reconstructions, see `kept.py`.
     """
@@ -40,7 +40,8 @@ def run_list3r(*arguments: str, kept: Path | None = None) -> tuple[dict[str, Any
     out = process.stdout.read() if process.stdout else ""
     if process.wait() != 0:
         raise SystemExit(f"list3r {' '.join(arguments)} ended with status {process.returncode}")
-    return json.loads(out), {"wall_s": round(time.monotonic() - started, 2), "peak_mb": round(peak / 1e6, 1)}
+    (report,) = json.loads(out)["matches"]
+    return report, {"wall_s": round(time.monotonic() - started, 2), "peak_mb": round(peak / 1e6, 1)}
 
 
 def _watch(process: subprocess.Popen[str]) -> float:
