@@ -26,6 +26,7 @@ props() {
         --output "$work/told.json" > "$work/told" 2>&1 || true
     all=$(wc -l < "$work/list") passed=$(grep -c '\[PASSED\] Robotics-Prop' "$work/told" || true)
     echo "$passed of $all props pass Robotics-Prop 4.0.0"
+    [ "$all" -gt 0 ] || { echo "error: $1 holds no props; give the folder of \`export --to simready\`" >&2; exit 1; }
     [ "$passed" -eq "$all" ] || { grep -B1 -A2 '\[FAILED\]' "$work/told"; exit 1; }
     rm -r "$work"
 }

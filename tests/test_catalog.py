@@ -141,6 +141,7 @@ def test_vectors_find_what_is_alike(catalog: Catalog) -> None:
     try:
         found = catalog.similar("random", instance_id=3, k=5)
     except CatalogError as error:
+        assert "has no pgvector" in str(error)
         pytest.skip(str(error))
     shown = {("random", t.id) for t in passing(CatalogFilters())}
     cosine = {p: float(v @ query / np.linalg.norm(v) / np.linalg.norm(query)) for p, v in held.items()}
