@@ -11,9 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.sfm.colmap import inverse, pixel_unit, pycolmap, rigid_of
+from list3r.reconstruction.sfm.colmap import pixel_unit, pycolmap
 from list3r.reconstruction.sfm.consistency import epipolar_errors
-from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap, correspondences, mapper_options, sparse_map
+from list3r.reconstruction.sfm.mapping import (
+    MapProblem,
+    SparseMap,
+    correspondences,
+    mapper_options,
+    mapper_with_poses,
+    sparse_map,
+)
 from list3r.reconstruction.sfm.settings import AdjustmentSettings
 
 Poses = NDArray[np.float64]
@@ -32,12 +39,7 @@ def adjust(
     cache = correspondences(problem, camera, "k1", settings.mapping, _agreeing(problem, camera, T_map_cam, gate))
     if cache is None:
         return None
-    mapper = pycolmap.IncrementalMapper(cache)
-    made = pycolmap.Reconstruction()
-    mapper.begin_reconstruction(made)
-    for image_id, image in sorted(made.images.items()):
-        image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
-        made.register_frame(image.frame_id)
+    mapper, made = mapper_with_poses(cache, T_map_cam)
     options = mapper_options(camera, "k1", settings.mapping)
     for gate in settings.gates_px:
         _round(mapper, made, options, gate * pixel_unit(camera), settings, pixel_unit(camera))

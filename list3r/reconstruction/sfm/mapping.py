@@ -197,6 +197,17 @@ def _borne_out(
     return replace(found, T_map_cam=poses, seen=views, points=points)
 
 
+def mapper_with_poses(cache: Any, T_map_cam: Mapping[int, Poses]) -> tuple[Any, Any]:
+    """Return a mapper, and its map, in which all pictures have given poses and no points are made yet."""
+    mapper = pycolmap.IncrementalMapper(cache)
+    made = pycolmap.Reconstruction()
+    mapper.begin_reconstruction(made)
+    for image_id, image in sorted(made.images.items()):
+        image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
+        made.register_frame(image.frame_id)
+    return mapper, made
+
+
 def triangulate(
     problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], settings: MappingSettings | None = None
 ) -> SparseMap | None:
@@ -207,12 +218,7 @@ def triangulate(
     cache = correspondences(MapProblem(known, pairs, problem.matched), camera, "", chosen)
     if cache is None:
         return None
-    mapper = pycolmap.IncrementalMapper(cache)
-    made = pycolmap.Reconstruction()
-    mapper.begin_reconstruction(made)
-    for image_id, image in sorted(made.images.items()):
-        image.frame.set_cam_from_world(image.camera_id, rigid_of(inverse(T_map_cam[image_id - 1])))
-        made.register_frame(image.frame_id)
+    mapper, made = mapper_with_poses(cache, T_map_cam)
     options = mapper_options(camera, "", chosen)
     for image_id in sorted(made.images):
         mapper.triangulate_image(options.triangulation, image_id)
