@@ -87,7 +87,8 @@ def only(*names: str) -> tuple[str, ...]:
 def spread(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with one option for each field of those of its parameters that are dataclasses of options.
 
-    `words: SourceWords` in its signature stands for all fields of `SourceWords`, in that place and order.
+    `words: SourceWords` in its signature stands for all fields of `SourceWords`, in that place and order; a field that
+    is such a dataclass itself stands for its own fields.
     """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
@@ -97,20 +98,35 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
         if not is_dataclass(group):
             options.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
             continue
-        names = told[0] if told else [f.name for f in fields(group)]
-        types = get_type_hints(group, include_extras=True)
-        groups[name] = group, [_as_option(f, types[f.name]) for f in fields(group) if f.name in names]
+        groups[name] = group, [o for o in _options_of(group) if not told or o.name in told[0]]
         options += groups[name][1]
 
     @functools.wraps(command)
     def gathered(**words: Any) -> None:
         given = {n: {p.name: words.pop(p.name) for p in parameters} for n, (_, parameters) in groups.items()}
-        made = {n: group(**{k: _given(group, k, v) for k, v in given[n].items()}) for n, (group, _) in groups.items()}
-        command(**words, **made)
+        command(**words, **{n: _gathered(group, given[n]) for n, (group, _) in groups.items()})
 
     gathered.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
     gathered.__annotations__ = {p.name: p.annotation for p in options}
     return gathered
+
+
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    """Return the options that a dataclass stands for."""
+    types = get_type_hints(group, include_extras=True)
+    inner = [
+        _options_of(types[f.name]) if is_dataclass(types[f.name]) else [_as_option(f, types[f.name])]
+        for f in fields(group)
+    ]
+    return [option for options in inner for option in options]
+
+
+def _gathered(group: Any, given: dict[str, Any]) -> Any:
+    """Return the dataclass made of the values of its options."""
+    types = get_type_hints(group)
+    inner = {f.name: _gathered(types[f.name], given) for f in fields(group) if is_dataclass(types[f.name])}
+    own = {f.name: _given(group, f.name, given[f.name]) for f in fields(group) if f.name in given}
+    return group(**inner, **own)
 
 
 def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Query, Request
@@ -59,6 +59,25 @@ class Vector(BaseModel):
     space: Annotated[str, Field(max_length=200)]
     memory: Annotated[str | None, Field(max_length=200)] = None
     limit: Annotated[int, Field(ge=1, le=MOST_ANSWERS)] = 20
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point, metres or units of the memory."""
+
+    x: Number = None
+    y: Number = None
+    z: Number = None
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box (`lower`, `upper`) or a sphere (`center`, `radius`); numbers of a corner one by one."""
+
+    lower: Corner = None
+    upper: Corner = None
+    center: Corner = None
+    radius: Number = None
 
 
 Paged = Annotated[Page, Depends()]
@@ -138,34 +157,18 @@ class _Questions:
         return self._paged(found, page, found.notes)
 
     def nearest(
-        self,
-        name: str,
-        page: Paged,
-        which: Filtered,
-        x: Number = None,
-        y: Number = None,
-        z: Number = None,
-        id: InstanceId = None,
+        self, name: str, page: Paged, which: Filtered, at: Annotated[Point, Depends()], id: InstanceId = None
     ) -> dict[str, Any]:
         """Things nearest to a point or an instance."""
-        point: Any = None if (x, y, z) == (None, None, None) else (x, y, z)
+        point: Any = None if at == Point() else (at.x, at.y, at.z)
         k = self._wanted(page)
         found = self._catalog.nearest(name, point=point, instance_id=id, k=k, filters=which.filters())
         return self._paged(found, page, found.notes)
 
-    def within(
-        self,
-        name: str,
-        page: Paged,
-        which: Filtered,
-        lower: Corner = None,
-        upper: Corner = None,
-        center: Corner = None,
-        radius: Number = None,
-    ) -> dict[str, Any]:
-        """Things in a box (`lower`, `upper`) or a sphere (`center`, `radius`); numbers of a corner one by one."""
-        region: dict[str, Any] = {"lower": lower, "upper": upper, "center": center, "radius": radius}
-        found = self._catalog.within(name, **region, filters=which.filters())
+    def within(self, name: str, page: Paged, which: Filtered, region: Annotated[Region, Depends()]) -> dict[str, Any]:
+        """Things in a box or a sphere."""
+        bounds: dict[str, Any] = asdict(region)
+        found = self._catalog.within(name, **bounds, filters=which.filters())
         return self._paged(found, page, found.notes, total=len(found))
 
     def similar(

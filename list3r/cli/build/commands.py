@@ -9,10 +9,10 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
+from list3r.cli.build.asked import Asked
 from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
 from list3r.cli.common import JsonOption, spread
 from list3r.cli.terminal import say
-from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import BuildReport
@@ -85,9 +85,7 @@ def build(
     more: src.MoreArgument = None,
     *,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
-    request: BuildRequest,
-    words: src.SourceWords,
-    run: RunOptions,
+    asked: Asked,
     debug: Annotated[
         Path | None, typer.Option("--debug", metavar="DIR", help="Write overlays of masks and tracks there.")
     ] = None,
@@ -97,12 +95,12 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    options = words.options(more)
+    options = asked.words.options(more)
     from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:
-        with watching("building", build_interrupted(memory, run.resume), quiet=json, debug=debug) as watch:
-            return build_any(source, memory, options=options, settings=request, run=run, watch=watch)
+        with watching("building", build_interrupted(memory, asked.run.resume), quiet=json, debug=debug) as watch:
+            return build_any(source, memory, options=options, settings=asked.request, run=asked.run, watch=watch)
 
     say_result(memory, work, report_lines, json)
 

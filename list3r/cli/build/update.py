@@ -9,9 +9,9 @@ import typer
 
 from list3r.cli.ask.changes import changes
 from list3r.cli.build import source_options as src
+from list3r.cli.build.asked import Asked
 from list3r.cli.build.progress import say_result, watching
 from list3r.cli.common import JsonOption, MemoryArgument, spread, with_at
-from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import UpdateReport
@@ -34,16 +34,14 @@ def update(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
-    request: BuildRequest,
-    words: src.SourceWords,
-    run: RunOptions,
+    asked: Asked,
     json: JsonOption = False,
 ) -> None:
     """Add one more video to a memory: it is placed against what is stored, and what has changed is written down.
 
     Example: list3r update house.l3r walk-2/
     """
-    options = words.options(more)
+    options = asked.words.options(more)
     from list3r.pipeline.update import update as update_memory
 
     def interrupted(begun: bool) -> str:
@@ -51,7 +49,7 @@ def update(
 
     def work() -> UpdateReport:
         with watching("updating", interrupted, quiet=json) as watch:
-            return update_memory(memory, source, options=options, settings=request, run=run, watch=watch)
+            return update_memory(memory, source, options=options, settings=asked.request, run=asked.run, watch=watch)
 
     say_result(memory, work, report_lines, json)
 

@@ -237,7 +237,7 @@ class CameraTracker:
         """Register the frame to the segment's model from a guess, kept only when it can be trusted."""
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         s, view = self.settings, self.view(position)
-        found = register(samples, view, T_guess, s.registration, s.noise, prior=prior)
+        found = register(samples, view, T_guess, s.registration, s.noise, prior)
         if found is not None and not blind:
             mover = find_mover(samples, view, T_guess, found, s)
             if mover is not None and self._trusted(mover[1], samples, position, blind):

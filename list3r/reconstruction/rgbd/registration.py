@@ -19,6 +19,9 @@ from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.rgbd.settings import RegistrationSettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
+NormalEquations = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Information, shape (6, 6), and gradient, shape (6,), of the left-hand tangent (translation, rotation)."""
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -41,6 +44,24 @@ class KnownFeatures:
     rays_xy: Floats
     """Where the view sees them, x / z and y / z. Shape (N, 2)."""
 
+    def normal_equations(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NormalEquations:
+        """Return those of the reprojection errors, in pixels of the view."""
+        R = T_model_cam[:3, :3]
+        p = ((self.points - T_model_cam[:3, 3]) @ R).astype(np.float32)
+        inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
+        error: Floats = np.asarray((p[:, :2] * inverse_z - self.rays_xy) * focal_px, np.float32)
+        scale = 1.4826 * float(np.median(np.abs(error))) + 0.05
+        slope_cam = np.zeros((len(p), 2, 3), np.float32)
+        slope_cam[:, 0, 0] = slope_cam[:, 1, 1] = inverse_z[:, 0]
+        slope_cam[:, :, 2] = -p[:, :2] * inverse_z * inverse_z
+        slope_model = (np.float32(focal_px) * slope_cam @ R.T.astype(np.float32)).reshape(-1, 3)
+        slope = -np.concatenate([slope_model, _cross(np.repeat(self.points, 2, axis=0), slope_model)], axis=1)
+        return _normal_equations(slope, error.ravel(), scale)
+
+    def information(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
+        """Return what they tell of the pose found. Shape (6, 6)."""
+        return self.normal_equations(T_model_cam, focal_px)[0]
+
 
 @dataclass(frozen=True)
 class PosePrior:
@@ -55,17 +76,19 @@ class PosePrior:
     pairs: float
     """So many pairs tell as much as one."""
 
-    def information(self) -> NDArray[np.float64]:
+    def normal_equations(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NormalEquations:
+        """Return those of the tangent from where the view is expected to where it is, weighted as so many pairs."""
+        information = self.pairs * self.information(T_model_cam, focal_px)
+        step = T_model_cam @ np.linalg.inv(self.T_model_cam)
+        off = np.concatenate([step[:3, 3], cv2.Rodrigues(step[:3, :3])[0].ravel()])
+        return information, information @ off
+
+    def information(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
         """Return the information of the left-hand tangent (translation, rotation), model coordinates. Shape (6, 6)."""
         about = np.eye(6)
         about[:3, 3:] = -skew(self.T_model_cam[:3, 3])
         weights = np.array([1.0 / self.shift_m**2] * 3 + [1.0 / self.turn_rad**2] * 3)
         return np.asarray(about.T @ (weights[:, None] * about))
-
-    def off(self, T_model_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the tangent from where the view is expected to where it is. Shape (6,)."""
-        step = T_model_cam @ np.linalg.inv(self.T_model_cam)
-        return np.concatenate([step[:3, 3], cv2.Rodrigues(step[:3, :3])[0].ravel()])
 
 
 @dataclass(frozen=True)
@@ -104,10 +127,9 @@ def register(
     T_model_cam: NDArray[np.float64],
     settings: RegistrationSettings,
     noise: SensorNoise,
-    anchors: KnownFeatures | None = None,
-    prior: PosePrior | None = None,
+    told: KnownFeatures | PosePrior | None = None,
 ) -> FrameRegistration | None:
-    """Refine `T_model_cam`; None when too few points meet."""
+    """Refine `T_model_cam` by surfaces, brightness and what else is `told`; None when too few points meet."""
     frame = _Frame(view, noise)
     photometric = model.gray is not None and settings.photometric_weight > 0
     T = np.array(T_model_cam, dtype=np.float64)
@@ -122,14 +144,10 @@ def register(
             more, slope = _photometric(pairs, frame, T)
             information += settings.photometric_weight * more
             gradient += settings.photometric_weight * slope
-        if anchors is not None:
-            more, slope = _anchored(anchors, T, view.camera.fx)
+        if told is not None:
+            more, slope = told.normal_equations(T, view.camera.fx)
             information += more
             gradient += slope
-        if prior is not None:
-            more = prior.pairs * prior.information()
-            information += more
-            gradient += more @ prior.off(T)
         damped = information + 1e-9 * np.trace(information) * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
         T = _exp(step) @ T
@@ -137,10 +155,8 @@ def register(
             break
     assert pairs is not None
     information = _solid_information(pairs, frame, T, settings, photometric)
-    if anchors is not None:
-        information += _anchored(anchors, T, view.camera.fx)[0]
-    if prior is not None:
-        information += prior.information()
+    if told is not None:
+        information += told.information(T, view.camera.fx)
     return FrameRegistration(
         T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
     )
@@ -259,7 +275,7 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
     )
 
 
-def _geometric(pairs: _SurfelPairs, huber: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _geometric(pairs: _SurfelPairs, huber: float) -> NormalEquations:
     """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
     return _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, huber)
 
@@ -289,7 +305,7 @@ def _solid_information(
 
 def _photometric(
     pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> NormalEquations:
     """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
     slope, error = _photometric_slope(pairs, frame, T, least_gradient)
     error -= np.median(error)
@@ -318,25 +334,7 @@ def _spread(error: Floats, least: float) -> float:
     return 1.4826 * float(np.median(np.abs(error))) + least
 
 
-def _anchored(
-    anchors: KnownFeatures, T: NDArray[np.float64], focal_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal equations of the reprojection errors of known features, in pixels of the view."""
-    p = ((anchors.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
-    inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
-    error: Floats = np.asarray((p[:, :2] * inverse_z - anchors.rays_xy) * focal_px, np.float32)
-    scale = 1.4826 * float(np.median(np.abs(error))) + 0.05
-    slope_cam = np.zeros((len(p), 2, 3), np.float32)
-    slope_cam[:, 0, 0] = slope_cam[:, 1, 1] = inverse_z[:, 0]
-    slope_cam[:, :, 2] = -p[:, :2] * inverse_z * inverse_z
-    slope_model = (np.float32(focal_px) * slope_cam @ T[:3, :3].T.astype(np.float32)).reshape(-1, 3)
-    slope = -np.concatenate([slope_model, _cross(np.repeat(anchors.points, 2, axis=0), slope_model)], axis=1)
-    return _normal_equations(slope, error.ravel(), scale)
-
-
-def _normal_equations(
-    slope: Floats, error: Floats, scale: float, huber: float = 1.345
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _normal_equations(slope: Floats, error: Floats, scale: float, huber: float = 1.345) -> NormalEquations:
     """Huber-weighted, with the residuals in units of their robust scale."""
     limit = huber * scale
     weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-9)).astype(np.float32) / np.float32(scale * scale)

@@ -108,74 +108,88 @@ def fit_surfaces(
     if min(len(u.points), len(v.points)) < 100:
         return None
     pick = np.linspace(0, len(u.points) - 1, min(len(u.points), s.source_points)).astype(np.int64)
-    points, normals = u.points[pick], u.normals[pick]
+    fit = _Fit(u.points[pick], u.normals[pick], v, held, metric, s)
     for reach in s.reaches:
         for _ in range(s.steps):
-            step = _step(S_v_u, points, normals, v, held, reach * v.unit, metric, s)
+            step = fit.step(S_v_u, reach)
             if step is None:
                 return None
             S_v_u = step
-    there, at, near = _pairs(S_v_u, points, normals, v, s.reaches[-1] * v.unit, s)
-    if near.sum() < 50:
+    found = fit.pairs(S_v_u, s.reaches[-1])
+    if len(found.near) < 50:
         return None
-    n = v.normals[at[near]]
-    residual = np.einsum("ni,ni->n", there[near] - v.points[at[near]], n)
-    values = np.linalg.eigvalsh(n.T @ n)
+    values = np.linalg.eigvalsh(found.normals.T @ found.normals)
     return SurfaceFit(
         S_v_u=S_v_u,
-        fitting=float(near.mean()),
-        residual=float(np.sqrt((residual**2).mean()) / v.unit),
+        fitting=len(found.near) / len(pick),
+        residual=float(np.sqrt((found.off**2).mean()) / v.unit),
         spread=float(values[0] / values[2]),
     )
 
 
-def _pairs(
-    S: Sim3, points: Array, normals: Array, v: ChunkSurfaces, reach: float, s: SurfaceFitSettings
-) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
-    there = S.apply(points)
-    distance, at = v.tree.query(there, distance_upper_bound=reach)
-    found = np.isfinite(distance)
-    at = np.where(found, at, 0).astype(np.int64)
-    along = np.abs(np.einsum("ni,ni->n", normals @ S.rotation.T, v.normals[at]))
-    return there, at, np.asarray(found & (along >= s.least_cosine))
+@dataclass(frozen=True)
+class _Pairs:
+    """Points of u that lie near a surface of v of one direction."""
+
+    near: Array
+    """Those points, brought to v. Shape (N, 3)."""
+    normals: Array
+    """Of v. Shape (N, 3)."""
+    off: Array
+    """From the points to the surface, along its normal. Shape (N,)."""
 
 
-def _step(
-    S: Sim3,
-    points: Array,
-    normals: Array,
-    v: ChunkSurfaces,
-    held: Held,
-    reach: float,
-    metric: bool,
-    s: SurfaceFitSettings,
-) -> Sim3 | None:
-    """Return the similarity after one step of Gauss and Newton, about the middle of what is paired."""
-    there, at, near = _pairs(S, points, normals, v, reach, s)
-    if near.sum() < 50:
-        return None
-    p, q, n = there[near], v.points[at[near]], v.normals[at[near]]
-    middle = p.mean(axis=0)
-    r = np.einsum("ni,ni->n", q - p, n)
-    weight = (1 - np.minimum(np.abs(r) / reach, 1.0) ** 2) ** 2 / len(r)
-    arm = p - middle
-    J = np.concatenate([n, np.cross(arm, n), np.einsum("ni,ni->n", arm, n)[:, None]], axis=1)
-    A, b = (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r
-    things = S.apply(held.middle_u)
-    arm = things - middle
-    J_a = np.concatenate([np.tile(np.eye(3), (len(things), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
-    off = held.middle_v - things
-    weight_a = s.anchor_weight / (1 + (np.linalg.norm(off, axis=1) / (s.anchor * v.unit)) ** 2) / len(things)
-    A += np.einsum("p,pki,pkj->ij", weight_a, J_a, J_a)
-    b += np.einsum("p,pki,pk->i", weight_a, J_a, off)
-    lean = s.upright * v.unit**2
-    A[3:6, 3:6] += lean * (np.eye(3) - np.outer(held.up_v, held.up_v))
-    b[3:6] += lean * np.cross(S.rotation @ held.up_u, held.up_v)
-    A[6, 6] += s.scaled * v.unit**2
-    b[6] += s.scaled * v.unit**2 * (np.log(held.scale) - float(np.log(S.scale)))
-    free = 6 if metric else 7
-    x = np.zeros(7)
-    x[:free] = np.linalg.solve(A[:free, :free] + 1e-9 * np.trace(A) * np.eye(free), b[:free])
-    turn = Sim3.exp(np.r_[np.zeros(3), x[3:]])
-    about = Sim3(turn.scale, turn.rotation, middle + x[:3] - turn.scale * turn.rotation @ middle)
-    return about @ S
+@dataclass(frozen=True)
+class _Fit:
+    """Surfaces that are being brought together."""
+
+    points: Array
+    """Of u. Shape (N, 3)."""
+    point_normals: Array
+    """Shape (N, 3)."""
+    v: ChunkSurfaces
+    held: Held
+    metric: bool
+    settings: SurfaceFitSettings
+
+    def pairs(self, S: Sim3, reach: float) -> _Pairs:
+        """Return what lies within a reach of one surface."""
+        v = self.v
+        there = S.apply(self.points)
+        distance, at = v.tree.query(there, distance_upper_bound=reach * v.unit)
+        found = np.isfinite(distance)
+        at = np.where(found, at, 0).astype(np.int64)
+        along = np.abs(np.einsum("ni,ni->n", self.point_normals @ S.rotation.T, v.normals[at]))
+        near = found & (along >= self.settings.least_cosine)
+        p, q, n = there[near], v.points[at[near]], v.normals[at[near]]
+        return _Pairs(p, n, np.einsum("ni,ni->n", q - p, n))
+
+    def step(self, S: Sim3, reach: float) -> Sim3 | None:
+        """Return the similarity after one step of Gauss and Newton, about the middle of what is paired."""
+        s, v, held, found = self.settings, self.v, self.held, self.pairs(S, reach)
+        p, n, r = found.near, found.normals, found.off
+        if len(p) < 50:
+            return None
+        middle = p.mean(axis=0)
+        weight = (1 - np.minimum(np.abs(r) / (reach * v.unit), 1.0) ** 2) ** 2 / len(r)
+        arm = p - middle
+        J = np.concatenate([n, np.cross(arm, n), np.einsum("ni,ni->n", arm, n)[:, None]], axis=1)
+        A, b = (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r
+        things = S.apply(held.middle_u)
+        arm = things - middle
+        J_a = np.concatenate([np.tile(np.eye(3), (len(things), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
+        off = held.middle_v - things
+        weight_a = s.anchor_weight / (1 + (np.linalg.norm(off, axis=1) / (s.anchor * v.unit)) ** 2) / len(things)
+        A += np.einsum("p,pki,pkj->ij", weight_a, J_a, J_a)
+        b += np.einsum("p,pki,pk->i", weight_a, J_a, off)
+        lean = s.upright * v.unit**2
+        A[3:6, 3:6] += lean * (np.eye(3) - np.outer(held.up_v, held.up_v))
+        b[3:6] += lean * np.cross(S.rotation @ held.up_u, held.up_v)
+        A[6, 6] += s.scaled * v.unit**2
+        b[6] += s.scaled * v.unit**2 * (np.log(held.scale) - float(np.log(S.scale)))
+        free = 6 if self.metric else 7
+        x = np.zeros(7)
+        x[:free] = np.linalg.solve(A[:free, :free] + 1e-9 * np.trace(A) * np.eye(free), b[:free])
+        turn = Sim3.exp(np.r_[np.zeros(3), x[3:]])
+        about = Sim3(turn.scale, turn.rotation, middle + x[:3] - turn.scale * turn.rotation @ middle)
+        return about @ S

@@ -1,0 +1,17 @@
+"""What building and updating take from the command line besides the source and the memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from list3r.cli.build.source_options import SourceWords
+from list3r.pipeline.request import BuildRequest, RunOptions
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How a video is read and reconstructed, and how the work runs, as options."""
+
+    request: BuildRequest
+    words: SourceWords
+    run: RunOptions
