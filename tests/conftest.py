@@ -175,15 +175,14 @@ def small_picture() -> bytes:
     return out.getvalue()
 
 
-def write_small_room(store: Store, jpeg: bytes = b"") -> None:
-    """Fill an empty store with `SMALL_ROOM`, seen in one chunk of twenty frames; the first may have a picture."""
-    frames = np.arange(20)
+def write_small_room(store: Store, jpeg: bytes = b"", *, frames: int = 20, points: int = 400) -> None:
+    """Fill an empty store with `SMALL_ROOM`, seen in one chunk of so many frames; the first may have a picture."""
     local = tuple(
-        local_instance(k, box_points(center, size, 400, k), rgb, frames)
+        local_instance(k, box_points(center, size, points, k), rgb, np.arange(frames))
         for k, (_, center, size, rgb, _) in enumerate(SMALL_ROOM)
     )
-    session = store.sessions.add("walk", "abc", {"length": 100}, 20)
-    chunk = store.chunks.add(session, chunk_result(0, 0, 20, local, jpeg))
+    session = store.sessions.add("walk", "abc", {"length": 100}, frames)
+    chunk = store.chunks.add(session, chunk_result(0, 0, frames, local, jpeg))
     store.chunks.place({chunk: Sim3.identity()}, {chunk: chunk})
     store.facts.scale_kind, store.facts.scale_source = "metric", "sensor depth"
     store.facts.gravity = "estimated"

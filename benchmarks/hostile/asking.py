@@ -18,18 +18,24 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from PIL import Image
+
 from list3r.cli.app import run
+from list3r.exporters.components import Component
 from list3r.exporters.plan import picture
 from list3r.exporters.plan.layout import PlanSettings
 from list3r.exporters.registry import FORMATS
+from list3r.exporters.simready import thumbnail
+from list3r.memory.store import read_checks
 from list3r.memory.store.read_checks import ReadChecks
+from list3r.memory.store.store import Store
 
 LONGEST_S = 10.0
 """Processor time of a command; the clock may show `WAITING_S` on a busy machine, in which a wait is seen."""
 WAITING_S = 120.0
 SERVING_S = 10.0
-SLOW, SLOW_S = ("simready",), 60.0
-"""Formats that take seconds of a processor for the smallest memory, and what they may take."""
+COSTLY = ("simready", "prompt", "report", "plan", "usd")
+"""Formats that take longer than all other commands about a small memory together; each lie goes through one in turn."""
 MOST_MB = 1024
 READS = (
     "list --structure",
@@ -57,9 +63,9 @@ READS = (
 EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "delete 5")
 
 
-def exports(*, slow: bool = False) -> list[str]:
-    """Return a command for each format whose package is there, of the fast formats or of the slow ones."""
-    known = {n: f for n, f in FORMATS.items() if (n in SLOW) == slow}
+def exports(*, costly: bool = False) -> list[str]:
+    """Return a command for each format whose package is there, of the costly formats or of the others."""
+    known = {n: f for n, f in FORMATS.items() if (n in COSTLY) == costly}
     there = {n: f for n, f in known.items() if not f.package or importlib.util.find_spec(f.package)}
     endings = {
         name: "" if form.folder else ".usda" if name == "usd" else form.suffixes[0] for name, form in there.items()
@@ -127,8 +133,9 @@ def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> dict[str, fr
     Makes those that follow as fast as they can be.
     """
     picture.PlanSettings = functools.partial(  # type: ignore[assignment, misc]
-        PlanSettings, width_px=400, legend_px=4, min_map_px=100, max_map_px=200
+        PlanSettings, width_px=400, legend_px=4, min_map_px=50, max_map_px=100
     )
+    thumbnail._SIDE_PX = 16
     read: dict[str, frozenset[str]] = {}
     for command in commands:
         with _tables_read() as tables:
@@ -140,6 +147,36 @@ def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> dict[str, fr
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
     return read
+
+
+@contextlib.contextmanager
+def checked_once() -> Iterator[None]:
+    """Inside, each table is looked through once and a plan drawn once: for many commands that read one file."""
+    known: dict[str, tuple[list[str], Exception | None]] = {}
+    plans: dict[str, Image.Image] = {}
+    look, draw = read_checks.damage_of, picture.plan_image
+
+    def remembered(database: sqlite3.Connection, name: str, *, pages: bool = True) -> Iterator[str]:
+        if name not in known:
+            try:
+                known[name] = (list(look(database, name, pages=pages)), None)
+            except read_checks.FAILURES as error:
+                known[name] = ([], error)
+        found, failure = known[name]
+        yield from found
+        if failure is not None:
+            raise failure
+
+    def drawn(store: Store, component: Component, how: PlanSettings | None = None) -> Image.Image:
+        if component.name not in plans:
+            plans[component.name] = draw(store, component, how)
+        return plans[component.name]
+
+    read_checks.damage_of, picture.plan_image = remembered, drawn
+    try:
+        yield
+    finally:
+        read_checks.damage_of, picture.plan_image = look, draw
 
 
 @contextlib.contextmanager

@@ -8,14 +8,12 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, Verbosity, given, seed, settings
 
-from hostile.asking import EDITS, READS, SLOW_S, ask, command_on, exports, warm_up
+from hostile.asking import EDITS, READS, ask, checked_once, command_on, exports, warm_up
 from hostile.lies import Lie, lies, write_lie
 from hostile.subject import write_subject
 from hostile.work import Batch, Tally, total
 
 EACH = 50
-SLOWLY = 25
-"""One lie of so many goes through the slow formats."""
 
 
 @cache
@@ -24,7 +22,7 @@ def _subject(folder: Path) -> tuple[Path, dict[str, frozenset[str]]]:
     own = folder / str(os.getpid())
     own.mkdir()
     subject = write_subject(own / "sound.l3r")
-    return subject, warm_up(subject, own, (*READS, *exports()))
+    return subject, warm_up(subject, own, (*READS, *exports(), *exports(costly=True)))
 
 
 def tell(folder: Path, first_seed: int, count: int) -> Batch:
@@ -36,7 +34,10 @@ def tell(folder: Path, first_seed: int, count: int) -> Batch:
 def batch(folder: Path, first_seed: int, n: int) -> Batch:
     """Tell the lies of one batch, and count how commands ended."""
     subject, reads = _subject(folder)
-    tally, told = Tally(), 0
+    tally, told, costly = Tally(), 0, exports(costly=True)
+
+    def meet(lie: Lie, path: Path, command: str) -> None:
+        tally.add(repr(lie), command, ask(command_on(path, command, subject.parent)))
 
     @seed(first_seed * 1_000_003 + n)
     @settings(
@@ -53,14 +54,14 @@ def batch(folder: Path, first_seed: int, n: int) -> Batch:
         path = subject.with_name("lie.l3r")
         write_lie(subject, path, lie)
         told += 1
-        for command in exports(slow=True) if told % SLOWLY == 0 else ():
-            tally.add(repr(lie), command, ask(command_on(path, command, subject.parent), SLOW_S))
-        edits = [EDITS[told // 5 % len(EDITS)]] if told % 5 == 0 else []
-        for command in (*reads, *edits):
-            if command in reads and not reads[command] & lie.tables:
-                tally.counts["reads nothing that lies"] += 1
-                continue
-            tally.add(repr(lie), command, ask(command_on(path, command, subject.parent)))
+        with checked_once():
+            for command in (*READS, *exports(), costly[told % len(costly)]):
+                if reads[command] & lie.tables:
+                    meet(lie, path, command)
+                else:
+                    tally.counts["reads nothing that lies"] += 1
+        if told % 5 == 0:
+            meet(lie, path, EDITS[told // 5 % len(EDITS)])
 
     tell()
     return tally.batch(told)

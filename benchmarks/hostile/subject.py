@@ -32,14 +32,15 @@ from tests.conftest import (
     write_small_room,
 )
 
-FRAMES = 20
+FRAMES, POINTS = 6, 80
+"""Of each session, and of each instance: few, for thousands of commands read them."""
 
 
 def write_subject(path: Path) -> Path:
     """Write two sessions of one room with edges, events, votes, labels, bends and edits; a second in all."""
     with Store.create(path) as store:
         with store.transaction():
-            write_small_room(store, small_picture())
+            write_small_room(store, small_picture(), frames=FRAMES, points=POINTS)
             _add_session(store)
         edits.label(store, 2, "mug")
         edits.merge(store, 3, 4)
@@ -56,7 +57,7 @@ def _add_session(store: Store) -> None:
     edge = Edge(1, chunk, "loop", Sim3.identity(), 0.5, 0.5, 9, 0.01, True, "seen again", {"s_det": 0.5}, (0, 3))
     store.edges.add([edge, replace(edge, accepted=False, frames=(2, 5), reason="it contradicts the others")])
     store.observations.set(Observation(k + 1, chunk, k) for k in range(len(SMALL_ROOM)))
-    store.bends.replace({chunk: Bend(np.array([0.0, 19.0]), np.zeros((2, 7)))})
+    store.bends.replace({chunk: Bend(np.array([0.0, FRAMES - 1.0]), np.zeros((2, 7)))})
     camera = SessionCamera((60.0, 60.0, 32.0, 24.0), (0.01, -0.02, 0.0, 0.0, 0.0), ("the camera was estimated",))
     store.sessions.put(
         replace(store.sessions.get(session), camera=camera, cuts=(7,), depth_step=1, lost_reasons=("too dark",))
@@ -66,7 +67,7 @@ def _add_session(store: Store) -> None:
 
 def _seen() -> Iterable[LocalInstance]:
     for k, (_, center, size, rgb, _structure) in enumerate(SMALL_ROOM):
-        yield local_instance(k, box_points(center, size, 300, k + 50), rgb, np.arange(FRAMES))
+        yield local_instance(k, box_points(center, size, POINTS, k + 50), rgb, np.arange(FRAMES))
 
 
 def _tell_changes(store: Store) -> None:
