@@ -14,7 +14,6 @@ from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.overlap.edges import EdgeEnd, measure_edge
 from list3r.memory.bends import Bend
-from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
 from list3r.memory.store.store import Store
@@ -177,10 +176,3 @@ def _check_bend_of(store: Store) -> None:
     moved = np.linalg.norm(after[frames[-1]].translation - before[frames[-1]].translation)
     assert moved == pytest.approx(0.5 * float(store.chunks.get(chunk).S_world_chunk.scale))
     assert store.verify() == []
-
-
-def test_a_damaged_bend_is_named() -> None:
-    with pytest.raises(MemoryFileError, match="bend of chunk 3"):
-        Bend.of_bytes(b"123", b"", "the bend of chunk 3")
-    with pytest.raises(MemoryFileError, match="damaged"):
-        Bend.of_bytes(np.zeros(2).tobytes(), np.full((2, 7), np.nan).tobytes(), "the bend of chunk 3")

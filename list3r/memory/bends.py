@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
 
 Array = NDArray[np.float64]
@@ -28,17 +27,6 @@ class Bend:
     def none() -> Bend:
         """Return a chunk that does not bend."""
         return Bend(np.zeros(1), np.zeros((1, 7)))
-
-    @staticmethod
-    def of_bytes(frames: bytes, twists: bytes, where: str) -> Bend:
-        """From the columns of a row. Raises `MemoryFileError`, naming `where`, for bytes that are none."""
-        try:
-            at, x = np.frombuffer(frames, "<f8"), np.frombuffer(twists, "<f8").reshape(-1, 7)
-        except ValueError as error:
-            raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error
-        if len(at) != len(x) or not len(at) or not np.isfinite(at).all() or not np.isfinite(x).all():
-            raise MemoryFileError(f"{where} is damaged; run `list3r verify` on the file")
-        return Bend(at, x)
 
     def at(self, frames: Ints) -> Sim3:
         """exp(x) at frames (Frame.index). Batched (F,)."""

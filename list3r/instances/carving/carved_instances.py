@@ -124,7 +124,7 @@ class _Change:
         self, gone: Array, came: Sequence[Array], told: Array, unit: float, settings: ChangedPlaceSettings
     ) -> None:
         self.gone, self.unit, self.settings = gone, unit, settings
-        self._gone, self._told = cKDTree(gone), cKDTree(told)
+        self._told = cKDTree(told)
         self._either = cKDTree(np.concatenate([gone, *came]))
 
     def explains(self, support: Array) -> bool:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
-from list3r.memory.unpacking import open_archive, parse_json
+from list3r.memory.unpacking import open_archive
 
 MAX_BLOB_BYTES = 256 * 2**20
 """No array of one row is larger than this; a blob that claims more is damaged or hostile."""
@@ -119,13 +119,3 @@ def dequantise(grid: bytes, steps: bytes, count: int, where: str) -> NDArray[np.
 def to_json(value: object) -> str:
     """Compact JSON with sorted keys."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
-
-
-def from_json(text: object, where: str) -> Any:
-    """The value of `to_json`. `where` names the row in the `MemoryFileError` raised for damaged text."""
-    try:
-        if not isinstance(text, str):
-            raise TypeError(f"{type(text).__name__} instead of text")
-        return parse_json(text)
-    except (ValueError, TypeError) as error:
-        raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error

@@ -177,10 +177,6 @@ class GroupMembers:
         """Write of local instances which group they are in; they leave those that they were in."""
         self._rows.put(members)
 
-    def put_groups(self, groups: Iterable[tuple[Sequence[Key], bool]]) -> None:
-        """Write groups, each with whether it is shown."""
-        self.put(GroupMember(key, group[0], shown) for group, shown in groups for key in group)
-
     def hidden_groups(self) -> int:
         """Return how many groups are not shown."""
         return self._rows.count("shown = 0 AND chunk_id = first_chunk AND local_id = first_local")
