@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import BadFrame, Frame, FrameSource
-from list3r.frames.inspection import describe, draw_registration, lines
+from list3r.frames.inspection import SourceReport, draw_registration
 from list3r.frames.readers.tum import associate, poses_at
 from list3r.frames.source import SourceOptions, check_bad_share, open_source, require_camera
 from list3r.memory.errors import ExportError, OptionError, SourceError
@@ -237,12 +237,14 @@ def test_the_fingerprint_follows_what_shapes_frames_only(tmp_path: Path) -> None
 
 def test_the_account_is_honest_and_fits_json(tmp_path: Path) -> None:
     info = open_source(write_seven_scenes(tmp_path / "s")).info
-    told = describe(info)
+    report = SourceReport(info)
+    told = report.as_dict()
     assert told["depth_registered"] is False and told["size"] == [640, 480] and told["poses"] is True
-    assert any(line.startswith("note") for line in lines(told))
-    bare = describe(replace(info, camera=None, depth_camera=None, has_depth=False, T_color_depth=None))
+    assert any(line.startswith("note") for line in report.lines())
+    without = SourceReport(replace(info, camera=None, depth_camera=None, has_depth=False, T_color_depth=None))
+    bare = without.as_dict()
     assert bare["camera"] is None and bare["depth_registered"] is False
-    assert any("unknown" in line for line in lines(bare))
+    assert any("unknown" in line for line in without.lines())
     json.dumps(told, allow_nan=False)
 
 

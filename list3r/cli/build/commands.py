@@ -44,7 +44,7 @@ def inspect(
     Example: list3r inspect walk.mp4 --json
     """
     from list3r.exporters.output import replacing
-    from list3r.frames.inspection import describe, draw_registration, lines
+    from list3r.frames.inspection import SourceReport, draw_registration
     from list3r.frames.source import open_source
 
     options = words.options(more)
@@ -52,19 +52,19 @@ def inspect(
         _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
     options.check_fits(opened.info)
-    report = describe(opened.info)
+    found = None
     if calibrate:
         from list3r.frames.registration.calibrate import calibrate as estimate
 
-        report["calibration"] = estimate(source, options).as_dict()
+        found = estimate(source, options)
     if overlay is not None:
         with replacing(overlay) as temporary:
             draw_registration(opened, temporary)
-        report["overlay"] = str(overlay)
+    report = SourceReport(opened.info, found, overlay)
     if json:
-        print_answer([report])
+        print_answer([report.as_dict()])
     else:
-        say(*lines(report))
+        say(*report.lines())
 
 
 def _check_overlay(overlay: Path, source: Path) -> None:
