@@ -25,7 +25,7 @@ from list3r.frames.selection import select, sharpness
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
-_LATER = ("start_s", "end_s", "sharpest", "max_side", "topics", "more")
+_LATER = ("start_s", "end_s", "sharpest", "max_side", "topics", "more", "episode")
 """Options that came later: unsaid, they leave the fingerprints of older memories as they were."""
 _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0

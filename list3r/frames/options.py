@@ -27,6 +27,8 @@ KINDS = (
     "scannet",
     "scannetpp",
     "rosbag",
+    "lerobot",
+    "aria",
     "euroc",
     "nerfstudio",
     "7scenes",
@@ -39,7 +41,7 @@ KINDS = (
 """Kinds of sources; docs/sources.md says what each is made of."""
 
 ROLES = ("color", "depth", "pose")
-"""What topics of a ROS recording can be."""
+"""What topics of a ROS recording, and cameras of LeRobot, can be."""
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
@@ -72,7 +74,8 @@ class SourceOptions:
     depth_scale: float | None = None
     """Stored depth units per metre."""
     topics: tuple[tuple[str, str], ...] | None = None
-    """Of a ROS recording: (role, topic) with the roles color, depth and pose; what is not said is what fits."""
+    """Of a ROS recording: (role, topic) with the roles color, depth and pose; what is not said is what fits. Of a
+    data set of LeRobot: (role, key of a camera)."""
     fps: float | None = None
     """Frames per second: of a source with a clock so many are handed out, of one without this is the rate."""
     max_depth_m: float | None = None
@@ -88,6 +91,8 @@ class SourceOptions:
     depth. Intrinsics are given for pictures as stored."""
     more: tuple[str, ...] | None = None
     """Further video files of the same recording, in order."""
+    episode: int | None = None
+    """Of a data set of LeRobot: the episode's number."""
 
     def check_fits(self, info: SourceInfo) -> None:
         """Raise `OptionError` for what is said of a depth camera that the source has not got."""

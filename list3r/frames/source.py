@@ -14,6 +14,7 @@ from list3r.frames.readers import (
     colmap,
     euroc,
     images,
+    lerobot,
     nerfstudio,
     replica,
     rosbag,
@@ -72,8 +73,11 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
             raise SourceError(f"{root} does not exist; {_WANTED}")
         if options.kind in ("auto", "rosbag") and os.access(root, os.R_OK) and rosbag.is_recording(root):
             return rosbag.BagSource(root, options)
-        if options.topics:
-            raise OptionError(f"--topics is of ROS recordings, and {root} is none; leave it out")
+        if options.kind in ("auto", "lerobot") and lerobot.is_dataset(root):
+            return lerobot.LeRobotSource(root, options)
+        if options.topics or options.episode is not None:
+            name = "--topics is of ROS recordings and" if options.topics else "--episode is of"
+            raise OptionError(f"{name} data sets of LeRobot, and {root} is none; leave it out")
         return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
         raise SourceError(f"{error.filename or root} may not be read; check its permissions") from None

@@ -49,8 +49,11 @@ Topics = Annotated[
     typer.Option(
         "--topics",
         metavar="ROLE=TOPIC,...",
-        help="Topics of a ROS recording: color=/a,depth=/b,pose=/c; default: those that fit.",
+        help="Topics of a ROS recording: color=/a,depth=/b,pose=/c, or cameras of LeRobot; default: those that fit.",
     ),
+]
+Episode = Annotated[
+    int | None, typer.Option("--episode", metavar="N", help="Episode of a data set of LeRobot.", show_default=False)
 ]
 Registered = Annotated[bool, typer.Option("--registered", help="Depth already lies on the colour image's pixels.")]
 DepthScale = Annotated[
@@ -93,6 +96,7 @@ class SourceWords:
     depth_intrinsics: DepthIntrinsics = None
     depth_to_color: DepthToColor = None
     topics: Topics = None
+    episode: Episode = None
     registered: Registered = False
     depth_scale: DepthScale = None
     fps: Fps = None
@@ -117,6 +121,7 @@ class SourceWords:
             depth_intrinsics=words.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
             T_color_depth=words.parse_transform(transform, "--depth-to-color") if transform else None,
             topics=words.parse_topics(self.topics) if self.topics else None,
+            episode=self.episode,
             registered=self.registered,
             depth_scale=self.depth_scale,
             fps=self.fps,

@@ -53,7 +53,7 @@ class VideoSource:
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
-        for number, image in islice(self._pictures(start, stop, threads=False), 0, None, step):
+        for number, image in islice(self.pictures(start, stop), 0, None, step):
             if image is None:
                 yield BadFrame(number, "the video is damaged here")
                 continue
@@ -88,15 +88,15 @@ class VideoSource:
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
         """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""
-        for _, image in self._pictures(0, len(self._chosen), threads=True):
+        for _, image in self.pictures(0, len(self._chosen), threads=True):
             yield None if image is None else small_gray(image, _THUMBNAIL_PX)
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
         """Grey pictures at positions [start, stop), as stored, of at most 640 px; None for one that is damaged."""
-        for _, image in self._pictures(start, stop, threads=False):
+        for _, image in self.pictures(start, stop):
             yield None if image is None else small_gray(image, _LOOKED_AT_PX)
 
-    def _pictures(self, start: int, stop: int, *, threads: bool) -> Iterator[tuple[int, av.VideoFrame | None]]:
+    def pictures(self, start: int, stop: int, *, threads: bool = False) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """Number and picture of the frame handed out of each window at positions [start, stop); None where damaged."""
         windows = range(len(self._chosen))[start:stop]
         starts, stops = self._chosen.starts[windows.start :], self._chosen.stops[windows.start :]

@@ -1,0 +1,105 @@
+"""What a data set of LeRobot (version 3) says of its features and episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from list3r.frames.files import MAX_TEXT_BYTES, check_ordinary
+from list3r.frames.layout import inside, read_json
+from list3r.memory.errors import OptionError, SourceError
+
+INFO = "meta/info.json"
+_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+_MOST_EPISODES = 2**21
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode, and where it lies in the video of each camera."""
+
+    number: int
+    length: int
+    """Frames."""
+    videos: Mapping[str, tuple[Path, float]]
+    """File and the second in it at which the episode begins, of each key."""
+
+
+def read_features(path: Path) -> tuple[dict[str, dict[str, Any]], float]:
+    """Return the features and the frames per second. Raises `SourceError`, also for a data set of another version."""
+    said = read_json(path)
+    version = said.get("codebase_version") if isinstance(said, dict) else None
+    if not isinstance(said, dict) or not isinstance(version, str):
+        raise SourceError(f"{path} states no codebase_version; is it of LeRobot?")
+    if not version.startswith("v3."):
+        raise SourceError(
+            f"{path} is of LeRobot {version}, which keeps a video for each episode; give that video, or convert the "
+            "data set to v3.0 by lerobot's own script"
+        )
+    fps, features, video_path = said.get("fps"), said.get("features"), said.get("video_path", _VIDEO_PATH)
+    if not isinstance(fps, int | float) or not 0 < fps < 10_000 or not isinstance(features, dict):
+        raise SourceError(f"{path} states no fps or no features; was it copied whole?")
+    if video_path != _VIDEO_PATH:
+        raise SourceError(f"{path} has its videos at {video_path!r}, not at {_VIDEO_PATH}; convert it to LeRobot v3.0")
+    found = {str(k): f for k, f in features.items() if isinstance(f, dict)}
+    if not any(f.get("dtype") == "video" for f in found.values()):
+        kept = " (its pictures lie in the tables: convert them to video by lerobot)" if "image" in str(found) else ""
+        raise SourceError(f"{path}: no feature is a video{kept}; a memory needs pictures")
+    return found, float(fps)
+
+
+def read_episode(root: Path, keys: list[str], number: int | None) -> Episode:
+    """The episode that was asked for, or the only one. Raises `SourceError` and `OptionError`."""
+    columns = ["episode_index", "length"]
+    for key in keys:
+        columns += [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    rows = _rows(root, columns)
+    if number is None and len(rows) > 1:
+        raise OptionError(
+            f"{root} has {len(rows)} episodes; choose one by --episode (0 to {max(rows)}), and take in further ones "
+            "by list3r update"
+        )
+    chosen = next(iter(rows)) if number is None else number
+    if chosen not in rows:
+        raise OptionError(f"--episode {chosen}: {root} has the episodes {min(rows)} to {max(rows)}")
+    row = rows[chosen]
+    videos = {}
+    for key in keys:
+        chunk, file, begins_s = (row[f"videos/{key}/{n}"] for n in ("chunk_index", "file_index", "from_timestamp"))
+        name = f"videos/{key}/chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
+        videos[key] = (inside(root, name, root / INFO), float(begins_s))
+        if not videos[key][0].is_file():
+            raise SourceError(f"{root / name} is missing, in which episode {chosen} lies; was the copy finished?")
+    return Episode(chosen, int(row["length"]), videos)
+
+
+def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
+    """The episodes by number, with their `columns`. Raises `SourceError`; `OptionError` without the extra."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise OptionError(f"{root} is a data set of LeRobot, which takes: pip install 'list3r[parquet]'") from None
+    found: dict[int, dict[str, float]] = {}
+    for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
+        try:
+            check_ordinary(path.stat(), path, MAX_TEXT_BYTES)
+            with pq.ParquetFile(path) as file:
+                if file.metadata.num_rows + len(found) > _MOST_EPISODES:
+                    raise SourceError(f"{path} has over {_MOST_EPISODES:,} episodes; is it what it says?")
+                rows = file.read(columns=columns, use_threads=False).to_pylist()
+        except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+            said = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise SourceError(f"{path} is no table that can be read ({said[:160]}); copy it again") from None
+        for row in rows:
+            values = [row.get(name) for name in columns]
+            if not all(isinstance(v, int | float) and np.isfinite(v) and v >= 0 for v in values):
+                raise SourceError(f"{path}: an episode lacks its number, length or place in a video; copy it again")
+            found[int(row["episode_index"])] = row
+    if not found:
+        raise SourceError(f"{root} has no episodes in meta/episodes; was the copy finished?")
+    return found
