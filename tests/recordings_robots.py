@@ -9,8 +9,9 @@ from pathlib import Path
 import av
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from tests.recordings import COUNT, HEIGHT, WIDTH, K, plane_depth, put, shots
+from tests.recordings import COUNT, HEIGHT, WIDTH, K, jpeg, plane_depth, put, shots
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 DEPTH = f"{FRONT}_depth"
@@ -78,3 +79,42 @@ def write_depth_video(path: Path, depths: Iterable[NDArray[np.float32]], *, code
             plane.update(rows.tobytes())
             container.mux(stream.encode(image))
         container.mux(stream.encode())
+
+
+T_RIG_SIDE = np.eye(4)
+"""Place of the second camera of a rig in the first: half a metre to the right, turned to the left."""
+T_RIG_SIDE[:3, :3] = Rotation.from_euler("y", -20, degrees=True).as_matrix()
+T_RIG_SIDE[:3, 3] = 0.5, 0.0, 0.1
+SIDE_K = (130.0, 130.0, 78.0, 60.0)
+
+
+def write_colmap_rig(root: Path, *, binary: bool = True) -> Path:
+    """A model of two cameras on one rig: `K/front.jpg` of the wall's shots, `K/side.jpg` of the second camera."""
+    import pycolmap as pc
+
+    model = pc.Reconstruction()
+    for number, k in ((1, K), (2, SIDE_K)):
+        values = [k[0], k[1], k[2] + 0.5, k[3] + 0.5]
+        model.add_camera(pc.Camera(camera_id=number, model="PINHOLE", width=WIDTH, height=HEIGHT, params=values))
+    rig = pc.Rig(rig_id=1)
+    sensors = [pc.sensor_t(type=pc.SensorType.CAMERA, id=number) for number in (1, 2)]
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], pc.Rigid3d(np.linalg.inv(T_RIG_SIDE)[:3]))
+    model.add_rig(rig)
+    for k, shot in enumerate(shots()):
+        frame = pc.Frame(frame_id=k + 1, rig_id=1)
+        frame.rig_from_world = pc.Rigid3d(np.linalg.inv(shot.T_world_cam)[:3])
+        images = [
+            pc.Image(name=f"{n}/{k:04d}.jpg", camera_id=i, image_id=10 * k + i) for i, n in ((1, "front"), (2, "side"))
+        ]
+        for image in images:
+            image.frame_id = frame.frame_id
+            frame.add_data_id(image.data_id)
+        model.add_frame(frame)
+        for image in images:
+            model.add_image(image)
+            put(root / "images" / image.name, jpeg(shot.color))
+        model.register_frame(frame.frame_id)
+    (root / "sparse/0").mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(str(root / "sparse/0"))
+    return root

@@ -31,6 +31,7 @@ from tests.recordings import (
     write_sens,
     write_stray,
 )
+from tests.recordings_robots import T_RIG_SIDE, write_colmap_rig
 
 
 def frames_of(path: Path, **options: object) -> list[Frame]:
@@ -201,7 +202,40 @@ def test_pictures_with_cameras_of_their_own_are_carried_to_one(tmp_path: Path) -
             assert abs(frame.color[60, u, 0] - (focal * (u - 79.5) / 140.0 + middle)) < 1.0
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_cameras_of_a_rig_stand_where_it_holds_them(binary: bool, tmp_path: Path) -> None:
+    path = write_colmap_rig(tmp_path, binary=binary)
+    info, frames = open_source(path).info, frames_of(path)
+    assert any("2 cameras of rigs" in note for note in info.notes) and len(frames) == 2 * COUNT
+    for k, shot in enumerate(shots()):  # one camera after the other, though their names take turns
+        assert np.allclose(frames[k].T_source_cam, shot.T_world_cam, atol=1e-6)
+        assert np.allclose(frames[COUNT + k].T_source_cam, shot.T_world_cam @ T_RIG_SIDE, atol=1e-6)
+
+
+def _short(path: Path, name: str, missing: int) -> Path:
+    file = path / "sparse/0" / name
+    file.write_bytes(file.read_bytes()[:-missing])
+    return path
+
+
+def _uncalibrated(path: Path) -> Path:
+    file = path / "sparse/0/rigs.txt"
+    head, _, _ = file.read_text().rpartition("CAMERA 2")
+    return _put(file, f"{head}CAMERA 2 0\n").parents[2]
+
+
+def _without(path: Path, name: str) -> Path:
+    (path / "sparse/0" / name).unlink()
+    return path
+
+
 BROKEN = {
+    "a rig that is cut off": lambda root: _short(write_colmap_rig(root), "rigs.bin", 8),
+    "frames that are cut off": lambda root: _short(write_colmap_rig(root), "frames.bin", 40),
+    "cameras that are cut off": lambda root: _short(write_colmap(root, binary=True), "cameras.bin", 4),
+    "a rig that is missing": lambda root: _without(write_colmap_rig(root), "rigs.bin"),
+    "frames that are missing": lambda root: _without(write_colmap_rig(root), "frames.bin"),
+    "a camera with no place on its rig": lambda root: _uncalibrated(write_colmap_rig(root, binary=False)),
     "a zip without metadata": lambda root: _zip(root / "a.r3d", {"rgbd/0.jpg": b"x"}),
     "a zip that ends early": lambda root: _cut(write_record3d(root)),
     "metadata that is no JSON": lambda root: _zip(root / "a.r3d", {"metadata": b"{", "rgbd/0.jpg": b"x"}),
