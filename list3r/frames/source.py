@@ -11,6 +11,7 @@ from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers import (
+    aria,
     colmap,
     euroc,
     images,
@@ -53,6 +54,7 @@ _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp
 _OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 _WANTED = (
     "give a video file, a recording of Record3D (.r3d), Stray Scanner, Polycam or ScanNet (.sens), a ROS bag or mcap, "
+    "a recording of Aria (.vrs), a data set of LeRobot, "
     "a folder in ARKitScenes, nerfstudio (transforms.json), COLMAP, 7-Scenes, TUM RGB-D or Replica layout, or of images"
 )
 
@@ -75,6 +77,10 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
             return rosbag.BagSource(root, options)
         if options.kind in ("auto", "lerobot") and lerobot.is_dataset(root):
             return lerobot.LeRobotSource(root, options)
+        if options.kind in ("auto", "aria") and aria.is_recording(root):
+            if not os.access(root, os.R_OK) or (root.is_file() and root.stat().st_size == 0):
+                raise SourceError(f"{root} is empty or may not be read; check the copy and its permissions")
+            return aria.AriaSource(root, options)
         if options.topics or options.episode is not None:
             name = "--topics is of ROS recordings and" if options.topics else "--episode is of"
             raise OptionError(f"{name} data sets of LeRobot, and {root} is none; leave it out")
