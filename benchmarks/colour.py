@@ -74,6 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="31,32,33")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--discovery", default="", help="such as geometric,learned; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
     parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
     parser.add_argument("--frames", type=int, default=150, help="of each such walk")
@@ -86,22 +87,30 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         root = words.keep or Path(scratch)
-        for seed in (int(word) for word in words.seeds.split(",")):
-            rows.append({"seed": seed, **measured(root / f"seed-{seed}", seed, words.workers)})
+        for seed, method in ((int(w), m) for w in words.seeds.split(",") for m in words.discovery.split(",")):
+            figures = measured(root / f"seed-{seed}", seed, words.workers, method)
+            rows.append({"seed": seed, "discovery": method or "default", **figures})
             print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-            write_json(words.json, {"mean": means(rows), "seeds": rows})
+            write_json(words.json, {"mean": means_of(rows), "seeds": rows})
     print(machine())
-    for key, value in means(rows).items():
+    for key, value in means_of(rows).items():
         print(f"{key:24} {value}")
+
+
+def means_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Over the walks; by discoverer where there are several."""
+    methods = dict.fromkeys(r["discovery"] for r in rows)
+    each = {m: means([r for r in rows if r["discovery"] == m]) for m in methods}
+    return each if len(each) > 1 else means(rows)
 
 
 def means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     """Over the walks that have a figure."""
-    known = {k: [r[k] for r in rows if r[k] is not None] for k in rows[0] if k != "seed"}
+    known = {k: [r[k] for r in rows if r[k] is not None] for k in rows[0] if k not in ("seed", "discovery")}
     return {k: round(statistics.fmean(values), 4) if values else None for k, values in known.items()}
 
 
-def measured(folder: Path, seed: int, workers: int) -> dict[str, Any]:
+def measured(folder: Path, seed: int, workers: int, discovery: str = "") -> dict[str, Any]:
     """The figures of one walk, which is filmed, built and compared in `folder`."""
     settings = WalkSettings(seed=seed, size=SIZE, write_ids=True)
     walk = folder / "walk"
@@ -110,8 +119,9 @@ def measured(folder: Path, seed: int, workers: int) -> dict[str, Any]:
     colour = _colour_only(folder / "colour", walk)
     camera = settings.camera()
     intrinsics = ",".join(f"{v:g}" for v in (camera.fx, camera.fy, camera.cx, camera.cy))
-    memory, depths = folder / "memory.l3r", folder / "reconstructions"
+    memory, depths = folder / f"memory{discovery}.l3r", folder / "reconstructions"
     words = ["build", str(colour), "-m", str(memory), "--force", "--reconstruction", "sfm", "--intrinsics", intrinsics]
+    words += ["--discovery", discovery] if discovery else []
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     report, usage = run_list3r(*words, "--workers", str(workers), kept=depths)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -259,6 +259,16 @@ class _Gathered:
         return {value: points for value, points in every.items() if len(points) >= 10}
 
 
+def gathered_boxes(
+    points: Sequence[NDArray[np.float32]], labels: Sequence[NDArray[np.int64]]
+) -> dict[int, OrientedBox]:
+    """Boxes of true surfaces from points (h, w, 3) and the thing of each, -1 for none, of several views."""
+    every = _Gathered()
+    for p, own in zip(points, labels, strict=True):
+        every.add(p, own, np.ones(own.shape, bool))
+    return every.boxes()
+
+
 def _wide(box: OrientedBox) -> OrientedBox:
     """The box with edges of at least 1 cm."""
     return replace(box, size=np.maximum(box.size, 0.01))

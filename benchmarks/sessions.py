@@ -52,6 +52,7 @@ class ReturnWalk(ChangedWalk):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3,4,5")
+    parser.add_argument("--discovery", default="", help="such as geometric,learned; without it the default")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     parser.add_argument("--workers", default="1")
@@ -62,20 +63,23 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         root = words.keep or Path(scratch)
         seeds = [int(word) for word in words.seeds.split(",") if word]
+        runs = [(seed, method) for seed in seeds for method in words.discovery.split(",")]
         with ThreadPoolExecutor(words.jobs) as pool:
             table = pool.submit(redkitchen, root, words.redkitchen, words.workers) if words.redkitchen else None
-            homes = pool.map(lambda seed: one_home(root / str(seed), seed, words.workers), seeds)
-            for seed, row in zip(seeds, homes, strict=True):
-                rows.append({"seed": seed, **row})
+            homes = pool.map(lambda run: one_home(root / str(run[0]), run[0], words.workers, run[1]), runs)
+            for (seed, method), row in zip(runs, homes, strict=True):
+                rows.append({"seed": seed, "discovery": method or "default", **row})
                 print(json.dumps(rows[-1]), flush=True)
             halves = table.result() if table else None
-    result: dict[str, Any] = {"seeds": rows, "total": total(rows)} | ({"redkitchen": halves} if halves else {})
+    totals = {m: total([r for r in rows if r["discovery"] == m]) for m in dict.fromkeys(r["discovery"] for r in rows)}
+    result: dict[str, Any] = {"seeds": rows, "total": totals if len(totals) > 1 else total(rows)}
+    result |= {"redkitchen": halves} if halves else {}
     print(machine())
     print(json.dumps({k: v for k, v in result.items() if k != "seeds"}, indent=1))
     write_json(words.json, result)
 
 
-def one_home(root: Path, seed: int, workers: str) -> dict[str, Any]:
+def one_home(root: Path, seed: int, workers: str, discovery: str = "") -> dict[str, Any]:
     """Film twice, build, update, measure."""
     first = WalkSettings(seed=seed)
     changes = random_changes(first.world(), seed, moved=3, removed=2, added=2)
@@ -83,12 +87,13 @@ def one_home(root: Path, seed: int, workers: str) -> dict[str, Any]:
         write_walk(root / "first", first)
     if not (root / "second" / "truth.json").exists():
         write_walk(root / "second", ReturnWalk(seed=seed, walk_seed=seed + 1000, start=40, changes=changes))
-    one, two = root / "one.l3r", root / "two.l3r"
+    one, two = root / f"one{discovery}.l3r", root / f"two{discovery}.l3r"
+    common = ("--poses", "estimate", "--workers", workers, *(("--discovery", discovery) if discovery else ()))
     if not one.exists():
-        run_list3r("build", str(root / "first"), "-m", str(one), "--poses", "estimate", "--workers", workers)
+        run_list3r("build", str(root / "first"), "-m", str(one), *common)
     two.unlink(missing_ok=True)
     shutil.copy(one, two)
-    report, usage = run_list3r("update", str(two), str(root / "second"), "--poses", "estimate", "--workers", workers)
+    report, usage = run_list3r("update", str(two), str(root / "second"), *common)
     with Store.open(one) as before, Store.open(two) as after:
         figures = measure(before, after, root)
     return {"placed": report["placed"], "chunks": report["chunks"], "ties": report["ties"], **usage, **figures}
@@ -101,7 +106,8 @@ def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
     S_truth_one = _alignment(truth[0], _path(before, 1))
     S_truth_two = _alignment(truth[0], _path(after, 1))
     moved_m, turned_deg = _placement(truth[1], _path(after, 2), S_truth_two)
-    was = {e: t for t, e, _ in evaluate_scene(_scene(before), scenes[0], S_truth_one)["matched_ids"]}
+    first = evaluate_scene(_scene(before), scenes[0], S_truth_one)
+    was = {e: t for t, e, _ in first["matched_ids"]}
     now = {e: t for t, e, _ in evaluate_scene(_scene(after), scenes[1], S_truth_two)["matched_ids"]}
     done = _changes(scenes)
     unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
@@ -120,7 +126,17 @@ def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
         "missed": sorted((k, t, t in known) for k, t in done - told),
         "false": wrong,
         "false_removed_unseen": sum(k == "removed" and _unseen(scenes[1], t) for k, t in wrong),
+        "first": of_first(first),
     }
+
+
+def of_first(found: dict[str, Any]) -> dict[str, Any]:
+    """Things and relations of the first session alone: counts."""
+    names = ("true_count", "estimated_count", "matched", "duplicates", "merged_pairs")
+    out: dict[str, Any] = {k: {n: found[f"instances_{k}"][n] for n in names} for k in ("0.25", "0.50")}
+    for name, entry in found["relations"]["by_predicate"].items():
+        out[name] = {n: entry[n] for n in ("true_count", "estimated_count", "correct")}
+    return out
 
 
 def _changes(scenes: Sequence[dict[str, Any]], least_px: int = MIN_PX) -> set[tuple[str, int]]:

@@ -26,7 +26,7 @@ ONE_THING, SAME_NAME = 0.5, 0.25
 """IoU with a true thing, by voxels, from which a cluster is one whole, and from which it should have its name."""
 
 
-OTHER_ENDS = (-2.5, -1.0, 1.5)
+OTHER_ENDS = (-2.5, -1.0, 0.0)
 """Where agglomeration stops besides, so that what is joined too far and not far enough is seen."""
 
 

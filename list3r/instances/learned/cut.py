@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from list3r.instances.learned.agglomeration import STRONGEST, agglomerate
 from list3r.instances.learned.graph import ChunkSurface, PieceGraph, piece_graph
@@ -18,10 +21,12 @@ from list3r.instances.learned.things import ThingVerdicts, judge_things
 class CutSettings:
     """Where agglomeration stops. Both were chosen on worlds for training (see training/)."""
 
-    sure: float = 2.0
+    sure: float = 3.0
     """Mean log odds above which fine pieces become parts."""
-    enough: float = 0.0
+    enough: float = 1.5
     """Mean log odds above which parts become things."""
+    hop_m: float = 0.05
+    """Longest gap over which voxels of no piece go to the thing that is nearest."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,35 @@ def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | N
     told = judge(weights, "coarse", coarse)
     own = agglomerate(len(coarse.nodes), coarse.left, coarse.right, told.affinity, coarse.weight, s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
+    labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
     return CloudCut(labels, judge_things(weights, own, coarse, told))
+
+
+def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: float) -> NDArray[np.int32]:
+    """Return labels (N,) in which points of none (-1) have that of the nearest, by ways without a gap above `hop`.
+
+    Sides that are seen at a grazing angle are too thin for pieces, but how deep a thing is, nothing else tells. Gaps
+    count squared, so that ways keep to where points are dense. `points` has shape (N, 3).
+    """
+    free, taken = np.flatnonzero(labels < 0), np.flatnonzero(labels >= 0)
+    if not len(free) or not len(taken):
+        return labels
+    found = cKDTree(points[taken]).query(points[free], distance_upper_bound=hop)
+    gap, nearest = np.asarray(found[0]), np.asarray(found[1], np.int64)
+    near = np.flatnonzero(np.isfinite(gap))
+    pairs = cKDTree(points[free]).query_pairs(hop, output_type="ndarray")
+    starts, at = np.unique(nearest[near], return_inverse=True)
+    between = np.linalg.norm(points[free[pairs[:, 0]]] - points[free[pairs[:, 1]]], axis=1)
+    cost = np.square(np.concatenate([between, gap[near]])) + 1e-9
+    rows, columns = np.concatenate([pairs[:, 0], near]), np.concatenate([pairs[:, 1], len(free) + at])
+    size = len(free) + len(starts)
+    ways = coo_matrix((cost, (rows, columns)), shape=(size, size)).tocsr()
+    indices = np.arange(len(free), size)
+    _, _, source = dijkstra(ways, directed=False, indices=indices, return_predecessors=True, min_only=True)
+    reached = np.flatnonzero(source[: len(free)] >= 0)
+    out = labels.copy()
+    out[free[reached]] = labels[taken[starts[source[reached] - len(free)]]]
+    return out
 
 
 def make_parts(

@@ -38,9 +38,9 @@ FLAT = 0.85
 class LearnedSettings:
     """What is listed, and where agglomeration stops."""
 
-    least_confidence: float = 0.35
-    """Things that are less probably one whole are scraps and not proposed; chosen on worlds for training, where recall
-    and precision meet near it."""
+    least_confidence: float = 0.4
+    """Things that are less probably one whole are scraps and not proposed; chosen on left-out worlds, where recall and
+    precision meet near it."""
     least_name: float = 0.5
     """Names that are less probable are not told."""
     plane_area_m2: float = 0.25

@@ -1,0 +1,204 @@
+"""Where the learned discoverer loses against true masks: one rung of an oracle ladder for each of its steps.
+
+PYTHONPATH=. python benchmarks/discovery_ladder.py --seeds 5001,5004,5008 --json FILE
+
+Each rung takes one more step from the discoverer and the rest from the truth; figures are those of `discovery.py`:
+`true` true masks, `voxels` the true thing of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true thing
+of most of their voxels, `tree` of the clusters that agglomeration passes through those that fit true things best,
+`cut` the clusters where agglomeration stops, those that fit a true thing, `bound` likewise without those that the
+networks take for structure, `unlisted` all of these, `listed` those that are sure enough: what the discoverer
+proposes. What tracking and merging make of it is measured by `discovery_memory.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from discovery import TrueDiscoverer, figures, film_of, seeds_of, summary
+from machine import machine, write_json
+from numpy.typing import NDArray
+
+from list3r.instances.base import Proposals
+from list3r.instances.geometric.cloud import Cloud, build_cloud
+from list3r.instances.geometric.discovery import _proposals
+from list3r.instances.geometric.planes import find_planes
+from list3r.instances.geometric.segments import Segment, Segmentation
+from list3r.instances.geometric.surfaces import estimate_up
+from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
+from list3r.instances.learned.agglomeration import agglomerate
+from list3r.instances.learned.cut import CutSettings, make_parts, spread_labels
+from list3r.instances.learned.discovery import LearnedDiscoverer
+from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
+from list3r.instances.learned.network import judge
+from list3r.instances.learned.pieces import cut_pieces
+from list3r.instances.learned.superpoints import cut_superpoints
+from list3r.instances.learned.things import judge_things
+from list3r.instances.learned.weights import load_weights
+from list3r.instances.library import select_prompts
+from training.samples import chunk_settings, voxel_truth
+from training.worlds.film import Film, frames_of, reconstruction_of
+
+ENDS = np.arange(-4.0, 5.01, 0.5)
+"""Log odds at which the tree of agglomeration is looked at."""
+FITS = 0.25
+"""IoU by voxels from which a cluster fits a true thing."""
+
+SHOWN = (
+    *(f"{kind}{what}_{iou}" for kind in ("", "mask_") for iou in ("0.25", "0.5") for what in ("recall", "precision")),
+    "duplicates_per_thing",
+    "merged_pairs_per_thing",
+)
+
+Labels = NDArray[np.int32]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="5001,5004,5008")
+    parser.add_argument("--fitted", action="store_true")
+    parser.add_argument("--house", type=Path)
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for seed in seeds_of(words.seeds):
+        film, every = film_of(seed, None, words.house, fitted=words.fitted)
+        for rung, said in climb(film, every, seed, words.weights).items():
+            rows.append({"rung": rung, "seed": seed, **said, "cpu_s": 0.0, "frames": 1})
+    table = {r: summary([row for row in rows if row["rung"] == r]) for r in dict.fromkeys(row["rung"] for row in rows)}
+    print(machine())
+    for rung, entry in table.items():
+        print(f"{rung:12}", *(f"{entry[k]:6.3f}" for k in SHOWN))
+    source = "house" if words.house else "fitted worlds" if words.fitted else "worlds"
+    write_json(words.json, {"source": source, "mean": table, "walks": rows})
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A chunk on the ladder."""
+
+    film: Film
+    views: ChunkViews
+    surface: ChunkSurface
+    truth: NDArray[np.int32]
+    """True thing of each voxel, 0 for none. Shape (N,)."""
+    bound: frozenset[int]
+    """True things that are structure."""
+
+    @property
+    def cloud(self) -> Cloud:
+        return self.surface.cloud
+
+
+def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, dict[str, Any]]:
+    """The figures of every rung on one walk."""
+    settings, frames = chunk_settings(every), frames_of(film)
+    reconstruction = reconstruction_of(film, seed=seed)
+    views = chunk_views(frames, reconstruction, settings)
+    shown = [views.view(p) for p in views.anchors]
+    cloud = build_cloud(shown, settings.segment.voxel_m * views.unit)
+    poses = reconstruction.T_chunk_cam
+    up = estimate_up(find_planes(cloud, 0.25 * views.unit**2, views.unit), poses)
+    computed = reconstruction.depth_noise is not None
+    around = Surroundings(up, views.unit, float(np.median(poses[:, :3, 3] @ up)), computed)
+    ids = tuple(film.ids[p][:: views.stride, :: views.stride].astype(np.int32) for p in views.anchors)
+    bound = frozenset(t.id for t in film.things if t.structure)
+    chunk = Chunk(film, views, chunk_surface(cloud, shown, around), voxel_truth(cloud, ids), bound)
+    true_up = poses[0, :3, :3] @ film.T_world_cam[0, :3, :3].T @ np.array([0.0, 0.0, 1.0])
+    discoverer = LearnedDiscoverer(settings, weights)
+    out: dict[str, dict[str, Any]] = {}
+
+    def told(cut: Callable[[int], Proposals]) -> dict[str, Any]:
+        return figures(film, views, [select_prompts(cut(p), settings) for p in views.anchors], true_up)
+
+    true = TrueDiscoverer(film)
+    out["true"] = told(lambda p: true(frames, reconstruction, p))
+    for name, (labels, flat) in rungs(chunk, weights).items():
+        out[name] = told(lambda p, labels=labels, flat=flat: proposed(discoverer, chunk, labels, flat, p))
+    out["listed"] = told(lambda p: discoverer(frames, reconstruction, p))
+    forget_views()
+    return out
+
+
+def proposed(discoverer: LearnedDiscoverer, chunk: Chunk, labels: Labels, flat: NDArray[np.bool_], p: int) -> Proposals:
+    """Clusters as masks on an anchor; `flat` are those that are structure."""
+    segments = tuple(Segment("thing", None, bool(f), 1.0) for f in flat)
+    cut = Segmentation(np.asarray(labels + 1, np.int32), segments, chunk.surface.around.up)
+    image = discoverer._label_view(chunk.views, p, chunk.cloud, cut)
+    camera = chunk.views.reconstruction.camera
+    features = np.ones((len(flat), 1), np.float32)
+    view = chunk.views.view(p)
+    return _proposals(view, image, cut, features, stride=chunk.views.stride, shape=(camera.height, camera.width))
+
+
+def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np.bool_]]]:
+    """Cluster of each voxel (N,), -1 for none, and which clusters are structure, of each rung."""
+    weights, surface, s = load_weights(file), chunk.surface, CutSettings()
+    out = {"voxels": named(chunk, np.where(chunk.truth > 0, chunk.truth, -1))}
+    out["superpoints"] = named(chunk, majority(chunk, cut_superpoints(surface).labels))
+    pieces = cut_pieces(surface)
+    out["pieces"] = named(chunk, majority(chunk, pieces.labels))
+    parts, coarse = make_parts(surface, pieces, judge(weights, "fine", pieces.graph), s.sure)
+    out["parts"] = named(chunk, majority(chunk, parts))
+    told = judge(weights, "coarse", coarse)
+    at = lambda end: agglomerate(len(coarse.nodes), coarse.left, coarse.right, told.affinity, coarse.weight, end)  # noqa: E731
+    out["tree"] = best_of(chunk, [parts, *(np.append(at(e), -1)[parts] for e in ENDS)])
+    own = at(s.enough)
+    labels = np.asarray(np.append(own, -1)[parts], np.int32)
+    labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
+    out["cut"] = best_of(chunk, [labels])
+    verdicts = judge_things(weights, own, coarse, told)
+    free = verdicts.structure <= 0.5
+    out["bound"] = best_of(chunk, [np.where(np.append(free, False)[labels], labels, -1)])
+    out["unlisted"] = labels, ~free
+    return out
+
+
+def named(chunk: Chunk, ids: NDArray[np.int32]) -> tuple[Labels, NDArray[np.bool_]]:
+    """Clusters numbered from 0, from true ids (-1 for none)."""
+    values, number = np.unique(ids, return_inverse=True)
+    shift = int(values[0] == -1)
+    return np.asarray(number - shift, np.int32), np.isin(values[shift:], list(chunk.bound))
+
+
+def majority(chunk: Chunk, labels: Labels) -> NDArray[np.int32]:
+    """The true thing of most voxels of each voxel's cluster, -1 where most are of none. Shape (N,)."""
+    known = labels >= 0
+    codes, votes = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
+    order = np.lexsort((votes, codes >> 16))
+    thing = np.full(int(labels.max(initial=-1)) + 2, -1, np.int32)
+    thing[codes[order] >> 16] = codes[order] & 0xFFFF
+    thing[thing == 0] = -1
+    thing[-1] = -1
+    return thing[labels]
+
+
+def best_of(chunk: Chunk, groupings: list[NDArray[np.int32]]) -> tuple[Labels, NDArray[np.bool_]]:
+    """The clusters of nested groupings that fit true things best, none in another, best first."""
+    size = np.bincount(chunk.truth)
+    found: list[tuple[float, int, int, int]] = []
+    for level, labels in enumerate(groupings):
+        known = labels >= 0
+        count = np.bincount(labels[known])
+        codes, shared = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
+        cluster, thing = codes >> 16, codes & 0xFFFF
+        iou = shared / (count[cluster] + size[thing] - shared)
+        rows = (thing > 0) & (iou >= FITS)
+        fits = (iou[rows].tolist(), cluster[rows].tolist(), thing[rows].tolist())
+        found += [(share, level, k, t) for share, k, t in zip(*fits, strict=True)]
+    ids, done = np.full(len(chunk.truth), -1, np.int32), set()
+    for _, level, cluster, thing in sorted(found, key=lambda e: (-e[0], e[1], e[2])):
+        mine = groupings[level] == cluster
+        if thing not in done and (ids[mine] < 0).all():
+            ids[mine] = thing
+            done.add(thing)
+    return named(chunk, ids)
+
+
+if __name__ == "__main__":
+    main()
