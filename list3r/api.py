@@ -1,4 +1,7 @@
-"""The face of a memory for Python: opening, asking, exporting."""
+"""The face of a memory for Python: opening, asking, exporting.
+
+What answers a question is imported when it is asked, so that a short one starts soon.
+"""
 
 from __future__ import annotations
 
@@ -15,37 +18,30 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Un
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.exporters.registry import ExportOptions
-from list3r.exporters.registry import export as export_memory
-from list3r.exporters.tables import Table, Value, records_of
 from list3r.memory.errors import List3rError, OptionError, naming_extras
-from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance.editing import MemoryEdits
-from list3r.memory.maintenance.history import world_at
-from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
 from list3r.memory.store.store import Store
-from list3r.queries.changes import Changed, changes
-from list3r.queries.find import Found, find
-from list3r.queries.finding.free_words import WordEncoder
-from list3r.queries.info import describe_counts, info
-from list3r.queries.match import FilterOptions, Match, Matches
-from list3r.queries.measure import InstanceDistance, measure
-from list3r.queries.nearest import nearest
-from list3r.queries.path import path
-from list3r.queries.pictures import InstancePicture, KeyframePicture, instance_picture, keyframe_pictures, keyframe_rgb
-from list3r.queries.relations import Place, Relations, relations, relations_of
-from list3r.queries.seen import Sightings, seen, visible
-from list3r.queries.similar import similar
-from list3r.queries.views.camera import PosedCamera, camera_at_pose, camera_at_time, camera_of_frame
-from list3r.queries.within import within
 
 if TYPE_CHECKING:
     import networkx
 
     from list3r.exporters.prompt.scene_text import ScenePrompt
+    from list3r.exporters.registry import ExportOptions
+    from list3r.exporters.tables import Table, Value
     from list3r.frames.options import SourceOptions
+    from list3r.memory.geometry import Sim3
+    from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
     from list3r.pipeline.request import BuildRequest, RunWords
     from list3r.pipeline.settings import BuildSettings
+    from list3r.queries.changes import Changed
+    from list3r.queries.find import Found
+    from list3r.queries.finding.free_words import WordEncoder
+    from list3r.queries.match import FilterOptions, Match, Matches
+    from list3r.queries.measure import InstanceDistance
+    from list3r.queries.pictures import InstancePicture, KeyframePicture
+    from list3r.queries.relations import Place, Relations
+    from list3r.queries.seen import Sightings
+    from list3r.queries.views.camera import PosedCamera
 
 
 P = ParamSpec("P")
@@ -144,6 +140,8 @@ class SceneMemory(MemoryEdits):
         self._lock = threading.RLock()
 
     def __repr__(self) -> str:
+        from list3r.queries.info import describe_counts
+
         try:
             told = f"{self.path.name!r}: {describe_counts(self.store)}"
         except (List3rError, sqlite3.Error):
@@ -167,6 +165,8 @@ class SceneMemory(MemoryEdits):
     @_alone
     def info(self) -> dict[str, Any]:
         """What the memory is, as plain values: sessions, frames, scale, gravity, counts. As `list3r info --json`."""
+        from list3r.queries.info import info
+
         return info(self.store)
 
     def _repr_png_(self) -> bytes:
@@ -204,11 +204,15 @@ class SceneMemory(MemoryEdits):
     @_alone
     def instances_at(self, session_id: int) -> list[Instance]:
         """All things, structure too, as they were after a session. Raises `OptionError` for one that there is not."""
+        from list3r.memory.maintenance.history import world_at
+
         return world_at(self.store, session_id)
 
     @_alone
     def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> list[Changed]:
         """What was moved, removed and added in the sessions after `since`, the newest session first."""
+        from list3r.queries.changes import changes
+
         return changes(self.store, since, min_confidence=min_confidence)
 
     @_alone
@@ -242,6 +246,8 @@ class SceneMemory(MemoryEdits):
 
             >>> memory.nearest((0.5, 1.2, 0.8), k=3, color="red", max_distance=1.0)
         """
+        from list3r.queries.nearest import nearest
+
         if isinstance(target, str):
             encoder = self.word_encoder()
             return nearest(self.store, words=target, k=k, max_distance=max_distance, encoder=encoder, **filters)
@@ -268,6 +274,8 @@ class SceneMemory(MemoryEdits):
 
             >>> memory.within(camera=memory.camera(frame=120), max_depth=3.0)
         """
+        from list3r.queries.within import within
+
         return within(
             self.store,
             lower=lower,
@@ -290,6 +298,8 @@ class SceneMemory(MemoryEdits):
         **filters: Unpack[FilterOptions],
     ) -> list[Match]:
         """The things that look most like an instance (its id), or like a vector of a named embedding space."""
+        from list3r.queries.similar import similar
+
         if isinstance(target, int | np.integer):
             return similar(self.store, instance_id=int(target), space=space, k=k, **filters)
         return similar(self.store, vector=target, space=space, k=k, **filters)
@@ -309,6 +319,7 @@ class SceneMemory(MemoryEdits):
 
             >>> memory.similar_to_picture("mug.jpg", box_xyxy=(120, 80, 180, 150))
         """
+        from list3r.queries.similar import similar
         from list3r.semantics.picture_query import picture_query
 
         asked = picture_query(self.store, image, box_xyxy)
@@ -328,6 +339,8 @@ class SceneMemory(MemoryEdits):
             >>> memory.find("white mug on table")
             >>> memory.find("the biggest red thing near the door", k=1)
         """
+        from list3r.queries.find import find
+
         return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self.word_encoder())
 
     def word_encoder(self) -> WordEncoder | None:
@@ -339,6 +352,8 @@ class SceneMemory(MemoryEdits):
     @_alone
     def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
         """When and in which frames an instance was seen; stretches with breaks of at most `gap_s` count as one."""
+        from list3r.queries.seen import seen
+
         return seen(self.store, instance_id, gap_s=gap_s)
 
     @_alone
@@ -354,6 +369,8 @@ class SceneMemory(MemoryEdits):
 
         >>> memory.visible(memory.camera(time_s=12.5))
         """
+        from list3r.queries.seen import visible
+
         return visible(self.store, camera, min_visible=min_visible, max_depth=max_depth, **filters)
 
     @_alone
@@ -371,6 +388,8 @@ class SceneMemory(MemoryEdits):
         A pose is a `position` in the world and the rotation R_world_cam (OpenCV axes) as a quaternion w, x, y, z.
         Raises `OptionError` unless one of the three is given.
         """
+        from list3r.queries.views.camera import camera_at_pose, camera_at_time, camera_of_frame
+
         posed = position is not None and quat_wxyz is not None
         if (frame is not None) + (time_s is not None) + posed != 1 or (position is None) != (quat_wxyz is None):
             raise OptionError(
@@ -402,21 +421,29 @@ class SceneMemory(MemoryEdits):
             >>> memory.relations(predicate="left_of", object=4, viewpoint=(0.0, 0.0, 1.5))
             >>> memory.relations(predicate="between", object=4, other=7)
         """
+        from list3r.queries.relations import relations
+
         return relations(self.store, subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
 
     @_alone
     def relations_of(self, instance_id: int) -> list[Relation]:
         """The stored relations of an instance, each told once: not that it supports what is said to be on it."""
+        from list3r.queries.relations import relations_of
+
         return relations_of(self.store, self.store.instances.get(instance_id).id)
 
     @_alone
     def measure(self, a: int, b: int) -> InstanceDistance:
         """How far two instances are apart, between surfaces and centres. Raises `UnknownIdError` and `OptionError`."""
+        from list3r.queries.measure import measure
+
         return measure(self.store, a, b)
 
     @_alone
     def path_between(self, start: int, end: int, *, structure: bool = True) -> Relations:
         """The fewest relations that lead from one instance to another; not over floor and walls without `structure`."""
+        from list3r.queries.path import path
+
         return path(self.store, start, end, structure=structure)
 
     @_alone
@@ -425,6 +452,8 @@ class SceneMemory(MemoryEdits):
 
         >>> pandas.DataFrame(memory.to_records()).set_index("id")
         """
+        from list3r.exporters.tables import records_of
+
         return records_of(self.store, table)
 
     @_alone
@@ -440,6 +469,8 @@ class SceneMemory(MemoryEdits):
     @_alone
     def pictures(self, instance_ids: Sequence[int] | None = None) -> list[KeyframePicture]:
         """The keyframes whose picture is stored, with what shows in each; only those of some instances where asked."""
+        from list3r.queries.pictures import keyframe_pictures
+
         return keyframe_pictures(self.store, instance_ids)
 
     @_alone
@@ -448,11 +479,15 @@ class SceneMemory(MemoryEdits):
 
         >>> Image.fromarray(memory.picture(12).crop()).save("mug.png")
         """
+        from list3r.queries.pictures import instance_picture
+
         return instance_picture(self.store, instance_id)
 
     @_alone
     def pixels(self, picture: KeyframePicture) -> NDArray[np.uint8]:
         """The pixels of one of `pictures()`, RGB. Shape (H, W, 3)."""
+        from list3r.queries.pictures import keyframe_rgb
+
         return keyframe_rgb(self.store, picture)
 
     def prompt(self, tokens: int = 2000, question: str | None = None) -> ScenePrompt:
@@ -491,6 +526,8 @@ class SceneMemory(MemoryEdits):
 
             >>> memory.export("ply", "house.ply", color="rgb")
         """
+        from list3r.exporters.registry import export as export_memory
+
         with self.store.snapshot():
             return export_memory(self, format, path, **options)
 

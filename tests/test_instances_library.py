@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ from list3r.instances.geometric.rules.joining import join_candidates
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings, build_library
 from list3r.instances.overlays import draw_debug
-from list3r.memory.masks import decode_mask
+from list3r.memory.masks import decode_mask, shown_surface
 from list3r.memory.records import LocalInstance, LocalLibrary
+from list3r.memory.store.store import Store
 from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.keyframe_record import make_keyframes
+from tests.conftest import chunk_result
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 
@@ -249,3 +253,27 @@ def test_scale_does_not_matter_without_a_metre() -> None:
     mug, tin = find(library, frames, MUG), find(library, frames, TIN)
     assert mug.local_id != tin.local_id
     assert np.ptp(mug.support.points, axis=0).max() < 5.0 * 0.2
+
+
+def test_every_instance_shows_in_a_kept_picture(
+    scene: tuple[list[Frame], Reconstruction, LocalLibrary], tmp_path: Path
+) -> None:
+    frames, reconstruction, library = scene
+    late = library.instances[-1]  # comes into view bit by bit
+    track = replace(late.track, visible_fraction=np.linspace(0.1, 1.0, len(late.track.frames), dtype=np.float32))
+    library = replace(library, instances=(*library.instances[:-1], replace(late, track=track)))
+    first = replace(reconstruction, keyframes=np.array([0]))
+    kept = make_keyframes(frames, first, True, library=library)
+    pictured = {k.frame_index for k in kept}
+    for track in (i.track for i in library.instances):
+        shown = shown_surface(track.visible_fraction, track.areas_px)
+        assert shown[np.isin(track.frames, list(pictured))].max() >= 0.8 * shown.max()
+    key, *alone = kept
+    assert key.descriptor.any() and alone and all(k.jpeg for k in kept)
+    assert not any(k.descriptor.any() or k.depth_small.size or k.keypoints_xy.size for k in alone)
+    assert len(make_keyframes(frames, first, False, library=library)) == 1
+    with Store.create(tmp_path / "room.l3r") as store, store.transaction():
+        chunk = store.chunks.add(store.sessions.add("walk", "a", {}, 30), chunk_result(0, 0, 30, ()))
+        store.keyframes.add(chunk, kept[1:])
+        assert set(store.keyframes.with_picture(1)) == pictured - {0}
+        assert store.keyframes.descriptors([1])[0][:, 1].tolist() == [0]

@@ -13,8 +13,9 @@ import list3r
 from list3r.cli.app import run
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.geometry import Sim3
+from list3r.memory.records import Observation
 from list3r.memory.store.store import Store
-from tests.conftest import chunk_result, instance, small_picture, write_small_room
+from tests.conftest import box_points, chunk_result, instance, local_instance, small_picture, write_small_room
 
 MUG = 3
 
@@ -82,3 +83,19 @@ def test_the_command_writes_it(room: Path, tmp_path: Path, capsys: pytest.Captur
     assert np.asarray(Image.open(out)).shape == (48, 64, 3)
     assert run(["picture", str(room), str(MUG), "--out", str(tmp_path / "mug.tiff")]) == 2
     assert ".jpg or .png" in capsys.readouterr().err
+
+
+def test_the_picture_shows_most_of_what_is_known_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "room.l3r"
+    with Store.create(path) as store, store.transaction():
+        session = store.sessions.add("walk", "a", {}, 40)
+        for index, count in enumerate((20, 400)):  # the first chunk saw a corner of it
+            points = box_points((1.0, 0.0, 0.5), (0.3, 0.3, 0.3), count, index)
+            local = local_instance(0, points, (200, 80, 40), np.array([20 * index]))
+            made = chunk_result(index, 20 * index, 20, (local,), small_picture())
+            chunk = store.chunks.add(session, made)
+            store.chunks.place({chunk: Sim3.identity()}, {chunk: chunk})
+        store.instances.put([instance(7, (1.0, 0.0, 0.5), (0.3, 0.3, 0.3), (200, 80, 40))])
+        store.observations.set([Observation(7, 1, 0), Observation(7, 2, 0)])
+    with list3r.open(path) as memory:
+        assert memory.picture(7).frame_index == 20

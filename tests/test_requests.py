@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import get_type_hints
 
 import pytest
-import typer
 
-from list3r.cli.app import app
+from list3r.cli.app import commands
 from list3r.frames.base import Camera, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.options import SourceOptions
@@ -37,7 +36,7 @@ def test_python_takes_the_words_of_the_run_by_the_same_names_and_types() -> None
 
 @pytest.mark.parametrize("command", ["build", "update"])
 def test_every_field_that_can_be_asked_is_an_option_of_the_command(command: str) -> None:
-    parameters = {p.name: p for p in typer.main.get_command(app).commands[command].params}  # type: ignore[attr-defined]
+    parameters = {p.name: p for p in commands().commands[command].params}  # type: ignore[attr-defined]
     for f in (*fields(BuildRequest), *fields(RunOptions)):
         help_ = f.metadata["help"]
         assert parameters[f.name].help == help_.text

@@ -7,6 +7,7 @@ it is said.
 from __future__ import annotations
 
 import functools
+import importlib
 import os
 import signal
 import sys
@@ -18,29 +19,32 @@ import typer
 import typer.core
 
 from list3r.cli.answer import print_error, wants_json
-from list3r.cli.ask import memory as memory_commands
-from list3r.cli.ask import picture as picture_commands
-from list3r.cli.ask import query as query_commands
-from list3r.cli.build import batch as batch_commands
-from list3r.cli.build import commands as build_commands
-from list3r.cli.build import exchange as exchange_commands
-from list3r.cli.build import update as update_commands
-from list3r.cli.catalog import commands as catalog_commands
-from list3r.cli.edit import commands as edit_commands
-from list3r.cli.edit import export as export_commands
-from list3r.cli.edit import files as file_commands
-from list3r.cli.edit import scale as scale_commands
-from list3r.cli.measure import commands as evaluation_commands
-from list3r.cli.models import commands as model_commands
-from list3r.cli.models import detect as detect_commands
-from list3r.cli.models import embed as embed_commands
-from list3r.cli.serve import mcp as mcp_commands
-from list3r.cli.serve import service as service_commands
-from list3r.cli.serve import view as view_commands
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
 from list3r.memory.errors import List3rError, naming_extras
 from list3r.memory.room import BUILD_MB, check_address_space
 
+MODULES: dict[str, tuple[str, ...]] = {
+    "build.commands": ("inspect", "build", "demo"),
+    "build.exchange": ("convert", "import"),
+    "ask.memory": ("info", "list", "show"),
+    "ask.query": ("query",),
+    "ask.picture": ("picture",),
+    "edit.commands": ("merges", "undo", "merge", "split", "label", "delete"),
+    "models.embed": ("embed",),
+    "edit.export": ("export",),
+    "edit.files": ("verify", "repair", "doctor"),
+    "measure.commands": ("eval",),
+    "build.update": ("update",),
+    "edit.scale": ("scale",),
+    "models.detect": ("detect",),
+    "models.commands": ("models", "precompute"),
+    "serve.mcp": ("mcp", "ask-config"),
+    "serve.view": ("view",),
+    "build.batch": ("batch",),
+    "catalog.commands": ("catalog",),
+    "serve.service": ("serve",),
+}
+"""The commands that each module of this folder adds; it is imported when one of them is asked for, or the help."""
 GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
     "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config"),
@@ -66,53 +70,11 @@ class GroupedCommands(typer.core.TyperGroup):
                     formatter.write_dl(rows)
 
 
-app = typer.Typer(
-    name="list3r",
-    cls=GroupedCommands,
-    help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-for module in (
-    build_commands,
-    exchange_commands,
-    memory_commands,
-    query_commands,
-    picture_commands,
-    edit_commands,
-    embed_commands,
-    export_commands,
-    file_commands,
-    evaluation_commands,
-    update_commands,
-    scale_commands,
-    detect_commands,
-    model_commands,
-    mcp_commands,
-    view_commands,
-    batch_commands,
-    catalog_commands,
-    service_commands,
-):
-    module.register(app)
-
 _BUILDING = ("build", "update", "demo", "precompute", "batch")
 _INTERRUPTED = 130
 """Status that typer gives when Ctrl-C reaches it."""
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 _COMMAND_ERROR: type[Exception] = typer.BadParameter.__mro__[2]
-
-
-@app.callback(invoke_without_command=True)
-def _version(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
-    if version:
-        from list3r import __version__
-
-        say(f"list3r {__version__}")
-        raise typer.Exit
 
 
 def main() -> None:
@@ -131,9 +93,35 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 @functools.cache
-def commands() -> Any:
-    """Return the tree of all commands and their options; making it takes longer than many a question."""
+def commands(asked: str | None = None) -> Any:
+    """Return the tree of all commands and their options, or of those that one of them is made with.
+
+    Making all of it takes longer than many a question.
+    """
+    app = typer.Typer(
+        name="list3r",
+        cls=GroupedCommands,
+        help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example.",
+        no_args_is_help=True,
+        add_completion=False,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback(invoke_without_command=True)(_version)
+    one = any(asked in names for names in MODULES.values())
+    for module, names in MODULES.items():
+        if asked in names or not one:
+            importlib.import_module(f"list3r.cli.{module}").register(app)
     return typer.main.get_command(app)
+
+
+def _version(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+    if version:
+        from list3r import __version__
+
+        say(f"list3r {__version__}")
+        raise typer.Exit
 
 
 def run(arguments: list[str]) -> int:
@@ -143,7 +131,8 @@ def run(arguments: list[str]) -> int:
         if arguments and arguments[0] in _BUILDING:
             check_address_space(BUILD_MB, f"list3r {arguments[0]}")
         with naming_extras():
-            status = commands().main(arguments, prog_name="list3r", standalone_mode=False)
+            program = commands(arguments[0] if arguments else None)
+            status = program.main(arguments, prog_name="list3r", standalone_mode=False)
         flush()
         if status == _INTERRUPTED:
             raise KeyboardInterrupt

@@ -3,7 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+FULL_SIDE_PX = 96.0
+"""A mask whose area has at least this side shows an instance as well as a larger one."""
+
+
+def shown_surface(
+    visible_fraction: ArrayLike, area_px: ArrayLike, full_side_px: float = FULL_SIDE_PX
+) -> NDArray[np.float64]:
+    """Return how much of an instance's surface pictures show, in [0, 1]; less, linearly in its side, where it is small.
+
+    `visible_fraction` is the share of its surface that is seen, `area_px` the area of its mask. Shapes broadcast.
+    """
+    side = np.sqrt(np.asarray(area_px, np.float64)) / full_side_px
+    return np.asarray(np.asarray(visible_fraction, np.float64) * np.minimum(1.0, side))
 
 
 def encode_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint32]:

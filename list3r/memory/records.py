@@ -110,7 +110,10 @@ class LocalLibrary:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What a chunk remembers of one frame so that a later one can be placed against it."""
+    """What a chunk remembers of one frame so that a later one can be placed against it.
+
+    A frame that is kept for its picture alone has zeros as descriptor, no features and no depth.
+    """
 
     frame_index: int
     T_chunk_cam: NDArray[np.float64]

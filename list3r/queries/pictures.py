@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.files import too_many_pixels
 from list3r.memory.errors import MemoryFileError, OptionError
-from list3r.memory.masks import decode_mask
+from list3r.memory.masks import FULL_SIDE_PX, decode_mask, shown_surface
 from list3r.memory.records import ChunkRow, Instance, MaskTrack, Observation
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance
@@ -26,8 +25,8 @@ Box = tuple[float, float, float, float]
 class PictureSettings:
     """How the picture of an instance is chosen."""
 
-    full_side_px: float = 96.0
-    """A mask whose area has at least this side is as good as a larger one; smaller ones count less, linearly."""
+    full_side_px: float = FULL_SIDE_PX
+    """As in `list3r.memory.masks.shown_surface`."""
     projected_frames: int = 12
     """So many keyframes at most are looked at for an instance that was followed in none of them."""
 
@@ -49,7 +48,7 @@ class InstanceSight:
     def worth(self, settings: PictureSettings | None = None) -> float:
         """Tell how well a picture shows the instance, in [0, 1]: how much of it, and whether large enough to see."""
         s = settings or PictureSettings()
-        return self.visible_fraction * min(1.0, math.sqrt(self.area_px) / s.full_side_px)
+        return float(shown_surface(self.visible_fraction, self.area_px, s.full_side_px))
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def keyframe_pictures(store: Store, instance_ids: Sequence[int] | None = None) -
     keeper: dict[tuple[int, int], ChunkRow] = {}
     for chunk_id in sorted(chunks if instance_ids is None else followed):
         chunk = chunks[chunk_id]
-        frames = [k.frame_index for k in store.keyframes.of(chunk_id) if k.jpeg]
+        frames = store.keyframes.with_picture(chunk_id)
         for frame in frames:
             keeper.setdefault((chunk.session_id, frame), chunk)
             sights.setdefault((chunk.session_id, frame), {})
@@ -195,22 +194,44 @@ def keyframe_rgb(store: Store, picture: KeyframePicture) -> NDArray[np.uint8]:
 
 
 def instance_picture(store: Store, instance_id: int, settings: PictureSettings | None = None) -> InstancePicture:
-    """Return the stored keyframe that shows an instance best: most of it, and large enough.
+    """Return the stored picture that shows most of an instance's surface, large enough to see.
 
-    An instance that was followed in no stored keyframe is projected into those that look its way. Raises
+    An instance that was followed in no stored picture is projected into those that look its way. Raises
     `UnknownIdError`, and `OptionError` where no stored picture shows it.
     """
     settings = settings or PictureSettings()
     instance = checked_instance(store, instance_id)
-    found = [(p, s) for p in keyframe_pictures(store, [instance.id]) for s in p.sights]
-    if not found:
+    views = [v for o in store.observations.of(instance.id) for v in _views(store, o, settings)]
+    if not views:
         return _projected(store, instance, settings)
-    picture, sight = max(found, key=lambda f: (f[1].worth(settings), f[1].area_px, -f[0].frame_index))
-    rgb = keyframe_rgb(store, picture)
-    mask = decode_mask(sight.mask, (rgb.shape[0], rgb.shape[1])) if rgb.shape[:2] == picture.image_size else None
-    return InstancePicture(
-        instance.id, picture.session_id, picture.frame_index, rgb, sight.box_xyxy, mask, sight.visible_fraction
-    )
+    largest = max(v.points for v in views)
+    best = max(views, key=lambda v: (v.shown * v.points / largest, v.sight.area_px, -v.frame_index))
+    rgb, sight = decode_picture(store.keyframes.get(best.chunk_id, best.frame_index).jpeg), best.sight
+    mask = decode_mask(sight.mask, (rgb.shape[0], rgb.shape[1])) if rgb.shape[:2] == best.image_size else None
+    session = store.chunks.get(best.chunk_id).session_id
+    return InstancePicture(instance.id, session, best.frame_index, rgb, sight.box_xyxy, mask, sight.visible_fraction)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A stored picture in which a local instance of an instance was followed."""
+
+    chunk_id: int
+    frame_index: int
+    image_size: tuple[int, int]
+    points: int
+    """Surface points of the local instance: how much of the instance its chunk knows."""
+    shown: float
+    """Share of those that shows, see `shown_surface`."""
+    sight: InstanceSight
+
+
+def _views(store: Store, o: Observation, settings: PictureSettings) -> list[_View]:
+    track = store.local_instances.mask_track(o.chunk_id, o.local_id)
+    found = _sights(o, track, store.keyframes.with_picture(o.chunk_id))
+    support = store.supports.get(o.chunk_id, o.local_id) if found else None
+    points = 1 if support is None else max(len(support.points), 1)
+    return [_View(o.chunk_id, n, track.image_size, points, s.worth(settings), s) for n, s in found]
 
 
 def _projected(store: Store, instance: Instance, settings: PictureSettings) -> InstancePicture:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.records import FrameSamples, Keyframe, LocalLibrary
+from list3r.memory.masks import shown_surface
+from list3r.memory.records import Feature, FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.features.learned import LearnedDetector, as_bytes
 from list3r.reconstruction.features.local import Features, detect, points_at
@@ -25,14 +26,73 @@ def make_keyframes(
     keep_jpeg: bool,
     settings: KeyframeSettings | None = None,
     detector: LearnedDetector | None = None,
+    library: LocalLibrary | None = None,
 ) -> tuple[Keyframe, ...]:
-    """Return the keyframes of a chunk in order of time; a `detector` takes the place of SIFT."""
+    """Return the keyframes of a chunk in order of time; a `detector` takes the place of SIFT.
+
+    With pictures and a `library` also frames that are kept for their picture alone, so that of every instance one of
+    the best views is kept.
+    """
     chosen = settings or KeyframeSettings()
     kept = [int(p) for p in reconstruction.keyframes if reconstruction.posed[p]]
-    made = [_make_keyframe(frames[p], reconstruction, p, chosen, detector) for p in kept]
+    made = {p: _make_keyframe(frames[p], reconstruction, p, chosen, detector) for p in kept}
     if keep_jpeg:
-        made = [replace(k, jpeg=_jpeg(frames[p].color, chosen.jpeg_quality)) for k, p in zip(made, kept, strict=True)]
-    return tuple(made)
+        if library is not None and made:
+            like = made[kept[0]].descriptor
+            for p in frames_to_show(library, reconstruction, kept, chosen):
+                made[p] = _picture_alone(reconstruction, p, like)
+        made = {p: replace(k, jpeg=_jpeg(frames[p].color, chosen.jpeg_quality)) for p, k in made.items()}
+    return tuple(made[p] for p in sorted(made))
+
+
+def frames_to_show(
+    library: LocalLibrary, reconstruction: Reconstruction, kept: Sequence[int], settings: KeyframeSettings
+) -> list[int]:
+    """Return the positions of further frames that show instances of which the `kept` ones show too little.
+
+    The frame that serves most of them is taken first, of equal ones that which shows most of their surface.
+    """
+    shown = _shown_surfaces(library, reconstruction, settings)
+    wanted = settings.shown_share * shown.max(axis=0, initial=0.0)
+    lacking = shown[kept].max(axis=0, initial=0.0) < wanted
+    out: list[int] = []
+    while lacking.any():
+        serves = (shown >= wanted) & lacking
+        surface = np.where(serves, shown, 0.0).sum(axis=1)
+        best = int(np.lexsort((-surface, -serves.sum(axis=1)))[0])
+        out.append(best)
+        lacking &= ~serves[best]
+    return out
+
+
+def _shown_surfaces(
+    library: LocalLibrary, reconstruction: Reconstruction, settings: KeyframeSettings
+) -> NDArray[np.float64]:
+    """How much of each instance each posed frame shows. Shape (F, instances)."""
+    place = {int(n): k for k, n in enumerate(reconstruction.frame_indices) if reconstruction.posed[k]}
+    out = np.zeros((len(reconstruction.frame_indices), len(library.instances)))
+    for column, instance in enumerate(library.instances):
+        track = instance.track
+        shown = shown_surface(track.visible_fraction, track.areas_px, settings.full_side_px)
+        for n, share in zip(track.frames.tolist(), shown.tolist(), strict=True):
+            if n in place:
+                out[place[n], column] = share
+    return out
+
+
+def _picture_alone(reconstruction: Reconstruction, position: int, like: Feature) -> Keyframe:
+    """A frame that is kept for its picture alone: nothing is placed against it."""
+    camera = reconstruction.camera
+    return Keyframe(
+        frame_index=int(reconstruction.frame_indices[position]),
+        T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
+        descriptor=np.zeros_like(like),
+        keypoints_xy=np.zeros((0, 2), np.float32),
+        keypoint_descriptors=np.zeros((0, 0), np.uint8),
+        points_cam=np.zeros((0, 3), np.float32),
+        depth_small=np.zeros((0, 0), np.float32),
+        camera_small=(camera.fx, camera.fy, camera.cx, camera.cy),
+    )
 
 
 def frame_samples(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from list3r.memory.masks import FULL_SIDE_PX
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.networks.settings import NetworkSettings
@@ -18,6 +19,11 @@ class KeyframeSettings:
     depth_width: int = 160
     """Width of the small depth image, px."""
     jpeg_quality: int = 85
+    shown_share: float = 0.8
+    """A further frame is kept as a picture where the others show less than this share of the surface of an instance
+    that it shows; in [0, 1], with 0 keyframes alone are kept."""
+    full_side_px: float = FULL_SIDE_PX
+    """As in `list3r.memory.masks.shown_surface`."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     learned_count: int = 800
     """Most learned features on a frame."""

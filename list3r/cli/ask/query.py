@@ -1,4 +1,4 @@
-"""query nearest, within, relations, similar, find, seen, path."""
+"""query nearest, within, relations, similar, find, seen, path, changes."""
 
 from __future__ import annotations
 
@@ -8,27 +8,26 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.ask.changes import changes
 from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
 from list3r.cli.ask.words import OF_LOOKS, CameraWords, FilterWords, LikeWords, NearWords, RegionWords, RelationWords
 from list3r.cli.catalog.questions import with_catalog
-from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memory, print_table, spread
+from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memory, print_table, spread, with_at
 from list3r.cli.terminal import say
-
-query_app = typer.Typer(
-    help="Ask what is near, inside, in sight, alike, related, described or changed.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-"""The group that the commands of questions belong to."""
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
+    group = typer.Typer(
+        help="Ask what is near, inside, in sight, alike, related, described or changed.",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+    )
     for command in (nearest, within, relations, similar, find):
-        query_app.command(command.__name__)(with_catalog(spread(command)))
-    for other in (seen, path):
-        query_app.command(other.__name__)(spread(other))
-    app.add_typer(query_app, name="query")
+        group.command(command.__name__)(with_at(with_catalog(spread(command))))
+    for other in (seen, path, changes):
+        group.command(other.__name__)(with_at(spread(other)))
+    app.add_typer(group, name="query")
 
 
 def nearest(

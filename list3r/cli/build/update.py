@@ -1,4 +1,4 @@
-"""update, query changes: one more video for a memory, and what it changed."""
+"""update: one more video for a memory."""
 
 from __future__ import annotations
 
@@ -7,25 +7,18 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from list3r.cli.ask.changes import changes
 from list3r.cli.build import source_options as src
 from list3r.cli.build.asked import Asked
 from list3r.cli.build.progress import say_result, watching
-from list3r.cli.common import JsonOption, MemoryArgument, spread, with_at
+from list3r.cli.common import JsonOption, MemoryArgument, spread
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import UpdateReport
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the program, after those of `query`."""
+    """Add the command to the program."""
     app.command("update")(update)
-    query = next(g.typer_instance for g in app.registered_groups if g.name == "query")
-    assert query is not None
-    query.command("changes")(changes)
-    for command in query.registered_commands:
-        if command.callback is not None:
-            command.callback = with_at(command.callback)
 
 
 @spread

@@ -29,14 +29,14 @@ CatalogOption = Annotated[
 ]
 Files = Annotated[list[str], typer.Argument(metavar="FILE...", help="Memory files, or folders of them.")]
 _DEFAULT = "catalog.sqlite"
-_app = typer.Typer(help="Many memories in one catalogue.", no_args_is_help=True, rich_markup_mode=None)
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
+    group = typer.Typer(help="Many memories in one catalogue.", no_args_is_help=True, rich_markup_mode=None)
     for name, command in (("add", add), ("remove", remove), ("list", list_), ("check", check), ("rebuild", rebuild)):
-        _app.command(name)(command)
-    app.add_typer(_app, name="catalog")
+        group.command(name)(command)
+    app.add_typer(group, name="catalog")
 
 
 def add(

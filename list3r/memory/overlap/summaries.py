@@ -140,7 +140,8 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
 
 
 def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
-    centers = [k.T_chunk_cam[:3, 3] for k in store.keyframes.of(chunk.chunk_id)] or [np.zeros(3)]
+    placed = [k for k in store.keyframes.of(chunk.chunk_id) if k.descriptor.any()]
+    centers = [k.T_chunk_cam[:3, 3] for k in placed] or [np.zeros(3)]
     if len(planes.points) == 0:
         return 1.0
     distance = np.linalg.norm(planes.points[:, None] - np.array(centers)[None], axis=2)

@@ -217,7 +217,7 @@ def _described(
     with memory_said("what finds and follows things"):
         library = build_library(frames, reconstruction, s.instances, discoverer or named, tracker)
     clock.mark("instances")
-    keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, _detector(s))
+    keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, _detector(s), library)
     samples = frame_samples(reconstruction, library, s.models.samples)
     if reconstruction.depth_noise is None:  # stereo has no depth where things move; what it sees through is error
         library = flag_moving(samples, library, reconstruction.camera, s.motion)

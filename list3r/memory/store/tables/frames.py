@@ -114,6 +114,13 @@ class Keyframes:
         """Return the keyframes of a chunk in order."""
         return [row.keyframe for row in self._rows.all("chunk_id = ?", (chunk_id,))]
 
+    def with_picture(self, chunk_id: int) -> list[int]:
+        """Return Frame.index of the keyframes of a chunk that have a picture, in order."""
+        query = "SELECT frame_index FROM keyframes WHERE chunk_id = ? AND length(jpeg) > 0 ORDER BY frame_index"
+        rows = self._connection.rows(query, (chunk_id,))
+        self._connection.sound("keyframes", (chunk_id for _ in rows))
+        return [int(row[0]) for row in rows]
+
     def get(self, chunk_id: int, frame_index: int) -> Keyframe:
         """Return one keyframe. Raises `MemoryFileError` when the memory has none there."""
         found = self._rows.first("chunk_id = ? AND frame_index = ?", (chunk_id, frame_index))
@@ -124,12 +131,14 @@ class Keyframes:
     def descriptors(self, chunk_ids: Sequence[int] | None = None) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return (chunk id, Frame.index) (K, 2) and descriptors (K, D) of the keyframes of some chunks or of all.
 
-        A descriptor of another length than the first one's is left as zeros.
+        Frames kept for their picture alone are left out. A descriptor of another length than the first one's is left
+        as zeros.
         """
         where = "" if chunk_ids is None else f"WHERE chunk_id IN ({','.join(str(int(k)) for k in chunk_ids)})"
         query = f"SELECT chunk_id, frame_index, descriptor FROM keyframes {where} ORDER BY chunk_id, frame_index"
         rows = self._connection.rows(query)
         self._connection.sound("keyframes", (row[0] for row in rows))
+        rows = [row for row in rows if any(row[2])]
         keys = np.array([(r[0], r[1]) for r in rows], dtype=np.int64).reshape(-1, 2)
         out = np.zeros((len(rows), len(rows[0][2]) // 4 if rows else 0), np.float32)
         for k, row in enumerate(rows):
