@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from machine import write_json
 
 from list3r.exporters.registry import FORMATS
 from list3r.memory.geometry import OrientedBox, Sim3
@@ -49,19 +50,26 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=600.0, help="Processor seconds of one export, at most.")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     words = parser.parse_args()
-    rows: list[dict[str, Any]] = []
+    done = json.loads(words.json.read_text(encoding="utf-8")) if words.json and words.json.exists() else {}
+    rows: list[dict[str, Any]] = done.get("rows", [])
     with tempfile.TemporaryDirectory() as folder:
         for count in (int(word) for word in words.instances.split(",")):
+            known = {r["format"] for r in rows if r["instances"] == count}
+            names = [n for n in words.formats.split(",") if n not in known and is_here(n)]
             memory = Path(folder) / f"made-{count}.l3r"
-            write_memory(memory, count)
-            for name in words.formats.split(","):
-                package = FORMATS[name].package
-                if not package or importlib.util.find_spec(package):
-                    rows.append({"instances": count, **measure(memory, name, Path(folder) / "out", words.limit)})
-                    print(rows[-1], flush=True)
-            memory.unlink()
-    if words.json:
-        words.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            if names:
+                write_memory(memory, count)
+            for name in names:
+                rows.append({"instances": count, **measure(memory, name, Path(folder) / "out", words.limit)})
+                print(rows[-1], flush=True)
+                write_json(words.json, {"rows": rows})
+            memory.unlink(missing_ok=True)
+
+
+def is_here(name: str) -> bool:
+    """Tell whether the package that a format takes is installed."""
+    package = FORMATS[name].package
+    return not package or importlib.util.find_spec(package) is not None
 
 
 def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, Any]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -131,14 +129,6 @@ def test_same_memory_same_bytes(name: str, make_memory: Callable[..., Path], tmp
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_an_empty_memory_can_be_exported(name: str, tmp_path: Path) -> None:
-    Store.create(tmp_path / "empty.l3r").close()
-    with Store.open(tmp_path / "empty.l3r") as store:
-        written = export(store, name, usual_path(tmp_path, name))
-    assert all(p.stat().st_size > 0 for p in written) and written[0] == usual_path(tmp_path, name)
-
-
-@pytest.mark.parametrize("name", FILES)
 def test_components_are_never_laid_over_each_other(name: str, split_memory: Path, tmp_path: Path) -> None:
     path = usual_path(tmp_path, name)
     with Store.open(split_memory) as store:
@@ -164,13 +154,6 @@ def test_a_suffix_that_lies_is_refused(make_memory: Callable[..., Path], tmp_pat
         export(store, "usd", tmp_path / "scene.glb")
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_an_absent_folder_is_one_line(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
-    with Store.open(make_memory()) as store, pytest.raises(ExportError, match="does not exist; create it") as caught:
-        export(store, name, usual_path(tmp_path / "absent", name))
-    assert "\n" not in str(caught.value)
-
-
 def test_what_must_not_be_replaced_is_kept(make_memory: Callable[..., Path], tmp_path: Path) -> None:
     memory = make_memory()
     content = memory.read_bytes()
@@ -189,41 +172,6 @@ def test_a_folder_without_permission_is_one_line(make_memory: Callable[..., Path
     (tmp_path / "locked").mkdir(mode=0o500)
     with Store.open(make_memory()) as store, pytest.raises(ExportError, match="not writable"):
         export(store, "json", tmp_path / "locked" / "out.json")
-
-
-LIMITED = """
-import resource, sys
-from pathlib import Path
-import list3r
-from list3r.exporters.registry import FORMATS, export
-from list3r.memory.errors import ExportError
-with list3r.open(sys.argv[1]) as memory:
-    for name in sys.argv[3:]:
-        path = Path(sys.argv[2]) / f"out{FORMATS[name].suffixes[0]}"
-        path.write_text("old")
-        resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
-        try:
-            export(memory, name, path)
-        except ExportError as error:
-            assert "\\n" not in str(error), error
-            assert "cannot be written" in str(error), error
-            assert path.read_text() == "old"
-        else:
-            raise AssertionError(name)
-"""
-"""Every format against a disk that takes 500 bytes of a file."""
-
-
-def test_a_full_disk_leaves_the_old_file(make_memory: Callable[..., Path], tmp_path: Path) -> None:
-    pytest.importorskip("resource")
-    folder = tmp_path / "out"
-    folder.mkdir()
-    memory = make_memory()
-    names = [name for name, form in FORMATS.items() if not form.folder and name != "rerun" and installed(form.package)]
-    command = [sys.executable, "-c", LIMITED, memory, folder, *names]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert {p.name for p in folder.iterdir()} == {usual_path(folder, name).name for name in names}
 
 
 def test_a_failure_inside_leaves_nothing(make_memory: Callable[..., Path], tmp_path: Path) -> None:

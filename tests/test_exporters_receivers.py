@@ -103,39 +103,6 @@ def test_a_folder_of_others_is_refused_and_parts_stand_apart(room: Path, tmp_pat
         assert {"transforms.json", "transforms.component_1.json", "points.component_1.ply"} <= written
 
 
-@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
-def test_an_interruption_leaves_the_folder_that_was_there(
-    kind: str, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with list3r.open(room) as memory:
-        memory.export(kind, tmp_path / "out")
-        before = {p.relative_to(tmp_path): p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
-
-        def stop(*_: object, **__: object) -> None:
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(Path, "write_text", stop)
-        for place in ("out", "new"):
-            with pytest.raises(KeyboardInterrupt):
-                memory.export(kind, tmp_path / place)
-        assert {p.relative_to(tmp_path): p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
-        assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("kind", ["colmap", "nerfstudio", "prompt", "simready"])
-def test_folders_of_empty_memories_and_absent_places(kind: str, tmp_path: Path) -> None:
-    pytest.importorskip("pxr")
-    with Store.create(tmp_path / "empty.l3r") as store, store.transaction():
-        store.facts.scale_kind = "metric"
-    with list3r.open(tmp_path / "empty.l3r") as memory:
-        assert all(p.is_file() for p in memory.export(kind, tmp_path / kind))
-        with pytest.raises(ExportError, match="does not exist; create it first"):
-            memory.export(kind, tmp_path / "absent" / kind)
-        (tmp_path / "file").write_text("mine")
-        with pytest.raises(ExportError, match="is a file; name a folder"):
-            memory.export(kind, tmp_path / "file")
-
-
 def test_the_head_of_a_jpeg_states_its_size() -> None:
     assert jpeg_size(small_picture()) == (48, 64)
     assert jpeg_size(b"\x89PNG....") is None and jpeg_size(b"") is None and jpeg_size(small_picture()[:40]) is None

@@ -16,6 +16,7 @@ from list3r.exporters.output import replacing_folder, units
 from list3r.exporters.simready.prop import Prop, PropFacts, write_prop
 from list3r.exporters.usd.labels import set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind
+from list3r.exporters.usd.stage import errors_of_disk
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.records import Instance
@@ -48,7 +49,7 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
         )
     facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density)
     main = read_components(store)[0]
-    with replacing_folder(folder, "simready") as temporary:
+    with replacing_folder(folder, "simready") as temporary, errors_of_disk(folder):
         props: list[Prop] = []
         fixed: list[tuple[Instance, InstanceMesh]] = []
         for i in main.instances:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,13 +51,20 @@ def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = Non
     path = Path(path)
     with replacing(path) as temporary:
         stage = usd_stage(store, settings)
-        try:
+        with errors_of_disk(path):
             saved = _save(stage, temporary, path.stem)
-        except Tf.ErrorException as error:
-            raise ExportError(f"{path} cannot be written; is the disk full?") from error
         if not saved:
             raise ExportError(f"{path} cannot be written; is the disk full?")
     return (path,)
+
+
+@contextlib.contextmanager
+def errors_of_disk(path: Path) -> Iterator[None]:
+    """Raise `ExportError` for what USD cannot write of an export."""
+    try:
+        yield
+    except Tf.ErrorException as error:
+        raise ExportError(f"{path} cannot be written; is the disk full?") from error
 
 
 def _save(stage: Usd.Stage, path: Path, name: str) -> bool:
