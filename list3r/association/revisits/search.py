@@ -22,6 +22,7 @@ from list3r.association.revisits.cues import (
     NO_CUES,
     CueSettings,
     InstanceCues,
+    InstanceSet,
     compare_instances,
     instance_set,
     loop_score,
@@ -40,7 +41,11 @@ from list3r.association.revisits.verification import VerificationSettings, verif
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, Keyframe
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
+
+_KEPT_BYTES = 16 << 20
+"""Features of instances that are kept between chunks."""
 
 
 @dataclass(frozen=True)
@@ -173,6 +178,13 @@ def _tells(keyframe: Keyframe) -> bool:
     return bool(keyframe.depth_small.size) and len(keyframe.keypoints_xy) > 0
 
 
+class InstanceSets(LruCache[int, tuple[object, InstanceSet]]):
+    """Instances of the chunks that were compared last, with what they were made of."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, lambda held: held[1].feature.nbytes + held[1].center.nbytes)
+
+
 class _Lookout:
     """The new chunk, and the stored ones it is compared with, read once each."""
 
@@ -189,7 +201,7 @@ class _Lookout:
     def cues(self, u: int) -> InstanceCues:
         """Tell how the instances of a stored chunk agree with those of the new one."""
         if u not in self._cues:
-            here, there = self._side(self._id).instances, self._side(u).instances
+            here, there = self._instances(self._id), self._instances(u)
             self._cues[u] = compare_instances(there, here, self._settings.cues)
         return self._cues[u]
 
@@ -288,14 +300,23 @@ class _Lookout:
 
     def _side(self, chunk_id: int) -> Side:
         if chunk_id not in self._sides:
-            row = self._rows[chunk_id]
-            samples, nodes = self._store.chunks.samples(chunk_id), self._store.local_instances.nodes([chunk_id])
-            space = self._store.chunks.feature_space(chunk_id)
-            instances = instance_set(nodes, samples.T_chunk_cam, space, self._settings.cues)
+            row, samples = self._rows[chunk_id], self._store.chunks.samples(chunk_id)
             height, width = row.image_size
-            moving = frozenset(n.local_id for n in nodes if n.dynamic)
-            self._sides[chunk_id] = Side(samples, Camera(width, height, *row.intrinsics), instances, moving)
+            moving = frozenset(self._store.local_instances.dynamic(chunk_id))
+            camera = Camera(width, height, *row.intrinsics)
+            self._sides[chunk_id] = Side(samples, camera, self._instances(chunk_id), moving)
         return self._sides[chunk_id]
+
+    def _instances(self, chunk_id: int) -> InstanceSet:
+        """Return the instances of a chunk, read once while the store is open: a place is compared again and again."""
+        store, kept = self._store, self._store.derived.of(InstanceSets)
+        key = (store.chunks.checksum(chunk_id), self._settings.cues)
+        held = kept.get(chunk_id)
+        if held is None or held[0] != key:
+            samples, nodes = store.chunks.samples(chunk_id), store.local_instances.nodes([chunk_id])
+            space = store.chunks.feature_space(chunk_id)
+            held = kept.put(chunk_id, (key, instance_set(nodes, samples.T_chunk_cam, space, self._settings.cues)))
+        return held[1]
 
     def _id_of(self, scored: _Scored) -> tuple[int, int]:
         return scored.candidate.u, scored.candidate.frame_u

@@ -24,6 +24,7 @@ from list3r.memory.change.ledger import ChangeLedger, Group, read_ledger, write_
 from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.identities import Identities
+from list3r.memory.library.redundancy import cull, follow
 from list3r.memory.library.region import DirtySet, Region
 from list3r.memory.library.rows import log_decisions, moved
 from list3r.memory.library.rules import (
@@ -71,14 +72,20 @@ def consolidate(
     summaries, before = chunk_summaries(store, s.shapes), store.library.settled.all()
     ledger, world = read_ledger(store, chunks), _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))
+    whole = False
     if ledger is None or world is None or _most_moved(store, moved, len(before), world, s):
         moved |= settle(store, summaries, s.hysteresis)
-        world = look_at_world(store, settled_chunks(store), summaries, s)
-        dirty = DirtySet(frozenset(c.chunk_id for c in chunks), moved, before, frozenset(), whole=True)
-    else:
-        dirty = DirtySet(moved, moved, before, edited_since(store, world.edits), whole=False)
+        world, whole = look_at_world(store, settled_chunks(store), summaries, s), True
     region = Region(store, summaries, world, s)
+    edited = edited_since(store, 0 if whole else world.edits)
+    culled = cull(region, moved, edited)
+    if whole:
+        dirty = DirtySet(frozenset(region.rows), culled.settled, before, frozenset(), whole=True)
+    else:
+        dirty = DirtySet(culled.settled, culled.settled, before, edited, whole=False)
     report = _derive(region, dirty, ledger, last, ended=ended)
+    followed = follow(region, moved, culled, report.written or ())
+    report = report if report.written is None else replace(report, written=report.written | followed)
     if ended and not dirty.whole:
         _put_exactly(region, report.written or ())
     store.facts[WORLD] = replace(world, edits=last_edit(store))
@@ -163,7 +170,8 @@ def _put_exactly(region: Region, written: Collection[int]) -> None:
             continue
         (instance,) = store.instances.of([n])
         there = moved(moved(instance, anchor.S_exact_settled.inverse()), now)
-        seen_in = [store.chunks.get(k) for k in sorted({o.chunk_id for o in store.observations.of(n)})]
+        seen_by = sorted({o.chunk_id for o in store.observations.of(n)} & region.rows.keys())
+        seen_in = [store.chunks.get(k) for k in seen_by]
         records.append(replace(there, position_sigma_m=position_sigma(there.center, seen_in)))
         fresh[n] = Anchor(anchor.chunk_id, now)
     store.instances.put(records)

@@ -71,9 +71,11 @@ class Region:
     def __init__(self, store: Store, summaries: Summaries, world: World, settings: ConsolidationSettings) -> None:
         self.store, self.world, self.settings = store, world, settings
         self.summaries = summaries
-        self.rows = store.library.settled.all()
+        self.settled = store.library.settled.all()
         """The settled chunks by id."""
-        self._extents = np.array([r.extent for r in self.rows.values()])
+        self.rows = {k: r for k, r in self.settled.items() if k not in store.library.redundant.chunks()}
+        """Those of them that are not redundant."""
+        self._extents: Array | None = None
         self._T_world_graph = store.facts.S_world_graph
         self._carving = FreeSpaceCarving(store, settings.changes.visibility)
         self.has_motion = store.local_instances.any_dynamic()
@@ -84,6 +86,7 @@ class Region:
         self._times: dict[int, dict[tuple[int, int], float]] = {}
         self._pairs: dict[tuple[int, int], _LinkedPair] = {}
         self._paired: set[int] = set()
+        self._scores: dict[tuple[int, int], PairScores] = {}
         self._linked: tuple[frozenset[tuple[int, int]], tuple[Numbering, Links]] | None = None
 
     # ------------------------------------------------------------------ one chunk
@@ -110,7 +113,7 @@ class Region:
     def pose(self, chunk_id: int) -> Sim3:
         """Return S_world_chunk where the chunk is settled."""
         if chunk_id not in self._poses:
-            self._poses[chunk_id] = self._T_world_graph @ self.rows[chunk_id].S_graph_chunk
+            self._poses[chunk_id] = self._T_world_graph @ self.settled[chunk_id].S_graph_chunk
         return self._poses[chunk_id]
 
     def pose_before(self, row: SettledRow) -> Sim3:
@@ -129,7 +132,19 @@ class Region:
 
     def near(self, chunk_id: int, here: SettledRow | None = None) -> list[int]:
         """Return the chunks that lie near a chunk, itself among them; `here` if not where it is settled."""
-        return neighbours(self.rows, chunk_id, here, self._extents)
+        if self._extents is None:
+            self._extents = np.array([r.extent for r in self.rows.values()]).reshape(-1, 2, 3)
+        return neighbours(self.rows, chunk_id, here or self.settled[chunk_id], self._extents)
+
+    def leave(self, chunk_id: int) -> None:
+        """Take out a chunk that is redundant."""
+        self.rows.pop(chunk_id, None)
+        self._extents = None
+
+    def enter(self, chunk_id: int) -> None:
+        """Take in a chunk that is not redundant any more."""
+        self.rows = dict(sorted({**self.rows, chunk_id: self.settled[chunk_id]}.items()))
+        self._extents = None
 
     def components(self, keys: Iterable[Key]) -> dict[int, int]:
         """Return the connected component of each chunk that has one of these local instances."""
@@ -144,7 +159,8 @@ class Region:
         stored = self.store.library.overlaps.all(sorted(dirty.chunks))
         near = {(min(k, n), max(k, n)) for k in dirty.chunks for n in self.near(k)}
         kept = {p for p in near if p in stored and dirty.moved.isdisjoint(p)}
-        fresh = {p: pack_scores(self._score(*p)) for p in sorted(near - kept)}
+        fresh = {p: pack_scores(self.score(*p)) for p in sorted(near - kept)}
+        self._scores.clear()
         self.store.library.overlaps.drop(stored.keys() - near)
         self.store.library.overlaps.put(fresh)
         left: set[Key] = set()
@@ -167,9 +183,14 @@ class Region:
                 )
         return p
 
-    def _score(self, u: int, v: int) -> PairScores:
-        S_u_v = self.rows[u].S_graph_chunk.inverse() @ self.rows[v].S_graph_chunk if u != v else Sim3.identity()
-        return pair_scores(self.shapes(u), self.shapes(v), S_u_v, self.store.derived.of(GrownCells))
+    def score(self, u: int, v: int) -> PairScores:
+        """Return how the local instances of two chunks meet where the chunks are settled."""
+        if (u, v) not in self._scores:
+            a, b = self.settled[u].S_graph_chunk, self.settled[v].S_graph_chunk
+            S_u_v = a.inverse() @ b if u != v else Sim3.identity()
+            grown = self.store.derived.of(GrownCells)
+            self._scores[u, v] = pair_scores(self.shapes(u), self.shapes(v), S_u_v, grown)
+        return self._scores[u, v]
 
     def pairs_of(self, chunk_ids: Iterable[int]) -> dict[tuple[int, int], PairScores]:
         """Return the scores of all pairs of which one is among these chunks, in order."""

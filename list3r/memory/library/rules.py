@@ -32,6 +32,16 @@ _POSED = 80
 
 
 @dataclass(frozen=True)
+class RedundancySettings:
+    """When a chunk adds nothing to what others of its session saw."""
+
+    chunks: int = 8
+    """Earlier chunks that must have seen each of its local instances; 0: no chunk is redundant."""
+    covered: float = 0.75
+    """Share of a local instance's surface that lies on one of another chunk, for that to have seen it."""
+
+
+@dataclass(frozen=True)
 class ConsolidationSettings:
     """How the library is derived from the chunks."""
 
@@ -46,6 +56,7 @@ class ConsolidationSettings:
     labels: LabelSettings = field(default_factory=LabelSettings)
     shapes: ShapeSettings = field(default_factory=ShapeSettings)
     gravity: GravitySettings = field(default_factory=GravitySettings)
+    redundancy: RedundancySettings = field(default_factory=RedundancySettings)
     whole_chunks: int = 6
     """Up to so many chunks the library is derived as a whole; then only what a chunk touches."""
     whole_share: float = 0.3

@@ -11,6 +11,7 @@ from list3r.memory.change.ledger import Group
 from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.instances import DerivedInstance, Members, derived_instance, with_agreement
+from list3r.memory.library.redundancy import sightings
 from list3r.memory.library.rows import moved, record_of
 from list3r.memory.library.session_changes import SessionChanges
 from list3r.memory.library.uncertainty import position_sigma
@@ -53,7 +54,8 @@ class Writer:
         fresh = {n: g for g, n in of.items() if n is not None and g in weighed.evidence}
         for g in recut - weighed.evidence.keys():
             fresh |= dict.fromkeys(store.observations.owners(g[:1]).values(), g)
-        before = store.observations.owners([k for g in weighed.evidence for k in g])
+        like = {row.key: row.like for row in store.library.redundant.like(k for g in weighed.evidence for k in g)}
+        before = store.observations.owners([*(k for g in weighed.evidence for k in g), *like])
         known = store.instances.states().keys() if self._g.dirty.whole else set(before.values())
         gone = sorted(known - fresh.keys() - set(of.values()))
         was = {i.id: i for i in store.instances.of([*sorted(fresh), *gone])}
@@ -63,6 +65,7 @@ class Writer:
         for n in gone:
             store.instances.drop(n, dict(ids.aliases).get(n))
         now = {key: n for n, g in fresh.items() for key in g}
+        now |= {key: now[other] for key, other in like.items() if other in now}
         store.observations.forget(before.keys() - now.keys())
         store.observations.set(Observation(n, *key) for key, n in now.items() if before.get(key) != n)
         order = sorted(fresh)
@@ -136,7 +139,8 @@ class Writer:
         return {of[groups[at]]: text for at, text in found.items() if groups[at] in of}
 
     def _group_of(self, n: int) -> Group:
-        return tuple((o.chunk_id, o.local_id) for o in self._store.observations.of(n))
+        found = ((o.chunk_id, o.local_id) for o in self._store.observations.of(n))
+        return tuple(key for key in found if key[0] in self._region.rows)
 
     def _put(self, ids: Sequence[int], groups: Mapping[int, Group], labels: Mapping[int, str | None]) -> None:
         store = self._store
@@ -148,6 +152,8 @@ class Writer:
             times = {f: t for k in chunks for f, t in self._region.times_of(k).items()}
             exact = store.chunks.get(found.anchor).S_world_chunk @ self._region.pose(found.anchor).inverse()
             record = moved(record_of(found, labels.get(n), times, self._world, metric=metric), exact)
+            if self._store.library.redundant.chunks() and (seen := sightings(self._region, groups[n])) is not None:
+                record = seen.on(record)
             sigma = position_sigma(record.center, [store.chunks.get(k) for k in chunks])
             records.append(replace(record, state=self._states[n], position_sigma_m=sigma))
             anchors[n] = Anchor(found.anchor, exact)

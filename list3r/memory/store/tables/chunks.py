@@ -177,8 +177,11 @@ class Chunks:
 
     def checksum(self, chunk_id: int) -> int:
         """Return a checksum of all that is known of one chunk; another one after a rollback, which may reuse its id."""
-        key = int(chunk_id)
-        return hash((self._connection.rollbacks, self.checksums().get(key, 0), *self._local_instances.signature(key)))
+        key, rows = int(chunk_id), self._by_id()
+        if self._crcs is None or (key in rows and key not in self._crcs):
+            self.checksums()
+        known = self._crcs or {}
+        return hash((self._connection.rollbacks, known.get(key, 0), *self._local_instances.signature(key)))
 
     def stage_seconds(self) -> dict[str, float]:
         """Return the CPU seconds spent so far by stage, over all chunks."""

@@ -6,7 +6,7 @@ as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -67,6 +67,17 @@ class GroupMember:
     key: Key
     first: Key
     shown: bool
+
+
+@dataclass(frozen=True)
+class RedundantInstance:
+    """A local instance of a chunk that adds nothing to what other chunks of its session saw."""
+
+    key: Key
+    like: Key
+    """The local instance of another chunk that is the same instance; its own key where there is none."""
+    frames: Annotated[NDArray[np.int32], Shape((-1,))]
+    """Frame.index of the frames in which it is seen. Shape (V,)."""
 
 
 _KEY = joined(("chunk_id", "local_id"), ("key",), tuple, lambda *key: (key,))
@@ -182,6 +193,48 @@ class GroupMembers:
         return self._rows.count("shown = 0 AND chunk_id = first_chunk AND local_id = first_local")
 
 
+_LIKE = joined(("like_chunk", "like_local"), ("like",), tuple, lambda *key: (key,))
+
+
+class Redundant:
+    """The table of redundant chunks. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        columns = Columns.of(RedundantInstance, _KEY, _LIKE)
+        self._rows = Table(connection, "redundant", columns, "chunk_id, local_id")
+        self._known: set[int] | None = None
+        self._version = -1
+        connection.on_forget(self.forget)
+
+    def chunks(self) -> Set[int]:
+        """Return the ids of all redundant chunks; not to be changed."""
+        version = self._connection.data_version
+        if self._known is None or version != self._version:
+            rows = self._connection.rows("SELECT DISTINCT chunk_id FROM redundant")
+            self._known, self._version = {k for (k,) in rows}, version
+        return self._known
+
+    def of(self, chunk_ids: Sequence[int]) -> list[RedundantInstance]:
+        """Return the local instances of some redundant chunks, in no order."""
+        return self._rows.among("chunk_id", chunk_ids)
+
+    def like(self, keys: Iterable[Key]) -> list[RedundantInstance]:
+        """Return those that are the same instance as one of these local instances, in order."""
+        return [row for key in keys for row in self._rows.all("like_chunk = ? AND like_local = ?", key)]
+
+    def put(self, chunk_id: int, instances: Sequence[RedundantInstance]) -> None:
+        """Say what a chunk adds nothing to; without any it is not redundant."""
+        known = set(self.chunks())
+        self._rows.delete("chunk_id = ?", (chunk_id,))
+        self._rows.add_all(instances)
+        self._known = known | {chunk_id} if instances else known - {chunk_id}
+
+    def forget(self) -> None:
+        """Read the rows again when they are next asked for."""
+        self._known = None
+
+
 @dataclass(frozen=True)
 class _AnchorRow:
     instance: int
@@ -210,7 +263,7 @@ class Anchors:
 
 
 class LibraryState:
-    """The four tables, and which chunks the library does not know yet."""
+    """The five tables, and which chunks the library does not know yet."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -218,6 +271,7 @@ class LibraryState:
         self.overlaps = Overlaps(connection)
         self.members = GroupMembers(connection)
         self.anchors = Anchors(connection)
+        self.redundant = Redundant(connection)
         self.touched: set[int] | None = None
         """Chunks that were placed or measured anew since the library was derived; None where that is not known."""
         connection.on_forget(self._forget)
@@ -238,10 +292,11 @@ class LibraryState:
             self._connection.execute(f"DELETE FROM {name}")
         self._connection.execute("DELETE FROM memory WHERE key = 'library'")
         self.settled.forget()
+        self.redundant.forget()
 
     def _forget(self) -> None:
         self.touched = None
 
 
-PASSING = ("settled", "overlaps", "members", "anchors")
+PASSING = ("settled", "overlaps", "members", "anchors", "redundant")
 """The tables of this page."""
