@@ -11,6 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from list3r.memory.description.colors import Reference
 from list3r.memory.geometry import Sim3
 from list3r.memory.library import instances as library_things
 from list3r.memory.library.consolidation import consolidate
@@ -230,6 +231,20 @@ def test_things_of_chunks_that_trembled_lie_where_the_chunks_lie_when_a_session_
     for i in store.instances.all():
         assert np.allclose(i.aabb, before[i.id] + (off if i.id in own else 0.0), atol=1e-9)
     assert own and store.verify() == []
+
+
+def test_in_another_light_only_the_words_are_others(walks: ModuleType, store: Store) -> None:
+    for index, place in enumerate(ORDERS["there and back"]):
+        add(store, visit(walks, index, place))
+    words = [(i.description, i.color_name, i.color_rgb) for i in store.instances.all()]
+    with store.transaction():
+        world = store.facts[WORLD]
+        assert world is not None
+        store.facts[WORLD] = dataclasses.replace(world, chunks=4, light=Reference(40.0, (6.0, 6.0)))
+        store.instances.put(dataclasses.replace(i, description="lit otherwise") for i in store.instances.all())
+        assert consolidate(store, settings=GROW).written == frozenset()
+    assert [(i.description, i.color_name, i.color_rgb) for i in store.instances.all()] == words
+    check(store)
 
 
 def test_a_part_that_is_joined_to_another_is_merged_with_it(walks: ModuleType, store: Store) -> None:

@@ -26,7 +26,7 @@ from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.redundancy import cull, follow
 from list3r.memory.library.region import DirtySet, Region
-from list3r.memory.library.rows import log_decisions, moved
+from list3r.memory.library.rows import in_light, log_decisions, moved
 from list3r.memory.library.rules import (
     WORLD,
     ConsolidationReport,
@@ -70,7 +70,8 @@ def consolidate(
         return ConsolidationReport(0, 0, (), (), 0)
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
     summaries, before = chunk_summaries(store, s.shapes), store.library.settled.all()
-    ledger, world = read_ledger(store, chunks), _standing_world(store, summaries, s, ended=ended)
+    ledger, known = read_ledger(store, chunks), store.facts[WORLD]
+    world = _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))
     whole = False
     if ledger is None or world is None or _most_moved(store, moved, len(before), world, s):
@@ -86,6 +87,8 @@ def consolidate(
     report = _derive(region, dirty, ledger, last, ended=ended)
     followed = follow(region, moved, culled, report.written or ())
     report = report if report.written is None else replace(report, written=report.written | followed)
+    if not whole and known is not None and world.light != known.light:
+        _describe_anew(region)
     if ended and not dirty.whole:
         _put_exactly(region, report.written or ())
     store.facts[WORLD] = replace(world, edits=last_edit(store))
@@ -100,7 +103,9 @@ def _standing_world(store: Store, summaries: Summaries, s: ConsolidationSettings
     if world is None or len(chunks) < 2 * world.chunks or not (ended or len(chunks) <= _LOOKED_AT):
         return world
     now = look_at_world(store, chunks, summaries, s)
-    return replace(world, chunks=now.chunks) if world.near(now) else None
+    if replace(world, light=now.light).near(now) and store.library.looks.count() == sum(store.instances.count()):
+        return replace(world, chunks=now.chunks, light=world.light if world.near(now) else now.light)
+    return None
 
 
 def _replaced(store: Store, settled: Collection[int]) -> set[int] | None:
@@ -155,6 +160,18 @@ def _derive(
 def _told_otherwise(group: Group, before: ChangeLedger, now: ChangeLedger) -> bool:
     """Return whether an instance has moved, or come to have events, or the other way round."""
     return before.current(group) != now.current(group) or before.shows(group) != now.shows(group)
+
+
+def _describe_anew(region: Region) -> None:
+    """Write the words for instances in the light of the world as it is now, where they are others."""
+    store, metric = region.store, region.store.facts.scale_kind != "relative"
+    known = {looks.instance: looks for looks in store.library.looks.all()}
+    before = store.instances.all()
+    after = [in_light(i, known[i.id], region.world, metric=metric) for i in before]
+    words = [
+        (a, (a.description, a.color_name) != (b.description, b.color_name)) for a, b in zip(after, before, strict=True)
+    ]
+    store.instances.put(a for a, others in words if others)
 
 
 def _put_exactly(region: Region, written: Collection[int]) -> None:

@@ -1,9 +1,9 @@
 """Chunks that add nothing to what others of their session saw.
 
-A camera that stays in one room comes to the same things again and again. As a keyframe whose points enough other
-keyframes see is culled (ORB-SLAM, IEEE T-RO 2015, VI-E), a chunk all of whose local instances lie on what enough earlier
-chunks of its session saw is redundant: no group is formed, weighed or derived with it, so that a chunk costs what is
-near, not how often it was seen (decision 0113). What it saw counts among the observations of the instances that it saw.
+A camera that stays in one room comes to the same things again and again. As ORB-SLAM (IEEE T-RO 2015) culls keyframes
+whose points enough other keyframes see, a chunk all of whose local instances lie on what enough earlier chunks of its
+session saw is redundant: no group is formed, weighed or derived with it, so that a chunk costs what is near, not how
+often it was seen (decision 0113). What it saw counts among the observations of the instances that it saw.
 
 It is decided when a chunk settles, of what was settled before it; what was not redundant once stays so.
 """
@@ -99,7 +99,7 @@ def follow(region: Region, moved: Collection[int], culled: Culled, written: Coll
     anew; return their ids.
     """
     store = region.store
-    rows = store.library.redundant.of(sorted(store.library.redundant.chunks() & moved))
+    rows = store.library.redundant.of(sorted(store.library.redundant.chunks() & set(moved)))
     owners = store.observations.owners(sorted(culled.like))
     store.observations.forget(row.key for row in rows if row.like not in owners)
     store.observations.set(Observation(owners[row.like], *row.key) for row in rows if row.like in owners)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.colors import color_words, main_color
+from list3r.memory.description.colors import Swatch, color_words, main_color
 from list3r.memory.description.describe import describe
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.instances import DerivedInstance
 from list3r.memory.library.rules import World
@@ -18,6 +18,7 @@ from list3r.memory.overlap.pair_scores import Key, PairScores
 from list3r.memory.records import Instance, MergeDecision
 from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.store.store import Store
+from list3r.memory.store.tables.library import Looks
 
 _SCORES = np.dtype(
     [("i", "<i4"), ("j", "<i4"), ("i_on_j", "<f8"), ("j_on_i", "<f8"), ("shared", "<i4"), ("frame_iou", "<f8")]
@@ -46,13 +47,10 @@ def record_of(
     geometry: InstanceGeometry = found.geometry
     seen = [times[f] for f in found.frames if f in times] or [0.0]
     name, rgb = main_color(found.swatches, world.light)
-    color = color_words(found.swatches, world.light)
-    words = describe(found.shape, color, geometry.box.size, world.unit, metric=metric, structure=geometry.structure)
-    words = words if found.resting else f"moving {words}"
     return Instance(
         id=geometry.id,
         label=label,
-        description=words,
+        description=_description(found, geometry.box.size, geometry.structure, world, metric=metric),
         center=geometry.box.center,
         aabb=geometry.aabb,
         box=geometry.box,
@@ -68,6 +66,39 @@ def record_of(
         best_view=found.best_view,
         dynamic=found.dynamic,
     )
+
+
+def _description(
+    found: DerivedInstance | _Look, size: Array, structure: str | None, world: World, *, metric: bool
+) -> str:
+    color = color_words(found.swatches, world.light)
+    words = describe(found.shape, color, size, world.unit, metric=metric, structure=structure)
+    return words if found.resting else f"moving {words}"
+
+
+@dataclass(frozen=True)
+class _Look:
+    """The looks of an instance as they were derived."""
+
+    shape: str
+    resting: bool
+    swatches: tuple[Swatch, ...]
+
+
+def looks_of(found: DerivedInstance) -> Looks:
+    """Return what is kept of the looks of an instance."""
+    colors = np.array([(*s.rgb, *s.lab, s.share) for s in found.swatches], np.float64)
+    return Looks(found.geometry.id, found.shape, found.resting, colors)
+
+
+def in_light(instance: Instance, looks: Looks, world: World, *, metric: bool) -> Instance:
+    """Return an instance with the words for it in the light of the world."""
+    rows = looks.swatches.tolist()
+    swatches = tuple(Swatch((int(r), int(g), int(b)), (x, y, z), share) for r, g, b, x, y, z, share in rows)
+    look = _Look(looks.shape, looks.resting, swatches)
+    name, rgb = main_color(swatches, world.light)
+    words = _description(look, instance.box.size, instance.structure, world, metric=metric)
+    return replace(instance, description=words, color_name=name, color_rgb=rgb)
 
 
 def moved(instance: Instance, S: Sim3) -> Instance:

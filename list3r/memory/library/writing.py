@@ -12,7 +12,7 @@ from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.instances import DerivedInstance, Members, derived_instance, with_agreement
 from list3r.memory.library.redundancy import sightings
-from list3r.memory.library.rows import moved, record_of
+from list3r.memory.library.rows import looks_of, moved, record_of
 from list3r.memory.library.session_changes import SessionChanges
 from list3r.memory.library.uncertainty import position_sigma
 from list3r.memory.library.weighing import Named, Weighed, Weighing
@@ -159,6 +159,7 @@ class Writer:
             anchors[n] = Anchor(found.anchor, exact)
         store.instances.put(records)
         store.library.anchors.put(anchors)
+        store.library.looks.put(looks_of(self._derived[n]) for n in ids)
         if self._world.space and ids:
             features = np.array([self._derived[n].feature for n in ids], np.float32)
             store.embeddings.put(self._world.space, list(ids), features)

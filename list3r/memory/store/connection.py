@@ -69,6 +69,7 @@ class Connection:
         """What follows the rows that a transaction changes; in this order as it commits."""
         self._checks = ReadChecks(database, self._committed, whole=_size(database) <= WHOLE_BYTES)
         self._writing = False
+        self._held_version: int | None = None
         self._guard = threading.RLock()
         self._on_forget: list[weakref.WeakMethod[Callable[[], None]]] = []
         self.rollbacks = 0
@@ -206,6 +207,7 @@ class Connection:
             self._check_process()
             try:
                 self._database.execute("BEGIN IMMEDIATE")
+                self._held_version = None
                 self._writing = True
                 try:
                     yield
@@ -272,6 +274,7 @@ class Connection:
                 return
             try:
                 self._database.execute("BEGIN")
+                self._held_version = None
             except FAILURES as error:
                 raise MemoryFileError(explained(self.path, error)) from error
             try:
@@ -315,8 +318,11 @@ class Connection:
 
     @property
     def data_version(self) -> int:
-        """Another number as soon as another connection has changed the file."""
-        return int(self.rows("PRAGMA data_version")[0][0])
+        """Another number as soon as another connection has changed the file; what is open stands on one state of it."""
+        self._check_process()
+        if self._held_version is None or not self._database.in_transaction:
+            self._held_version = int(self.rows("PRAGMA data_version")[0][0])
+        return self._held_version
 
     def stamp(self) -> tuple[int, int, bool]:
         """Changes whenever the content may have: by other processes, by this store, by a rollback."""

@@ -32,8 +32,7 @@ _PARTS = 500
 BOXES = "instance_boxes"
 WORDS = "words"
 _OF_INSTANCES = {
-    name: name
-    for name in ("instances", "relations", "observations", "embeddings", "overlaps", "members", "redundant")
+    name: name for name in ("instances", "relations", "observations", "embeddings", "overlaps", "members", "redundant")
 } | {BOXES: "instances", WORDS: "instances"}
 """Tables that grow with what there is to see and are read in part, and the table whose rows tell how large they are."""
 

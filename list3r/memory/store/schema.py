@@ -176,12 +176,16 @@ MIGRATIONS: tuple[str, ...] = (
         OR key LIKE 'camera _%' OR key LIKE 'lost _%' OR key LIKE 'cuts _%' OR key LIKE 'depth step _%'
         OR key LIKE 'label votes _%';
     """,
-    # 9: chunks that saw nothing that others of their session had not seen, and which of those showed it
+    # 9: chunks that saw nothing that others of their session had not seen, and which of those showed it; what the words
+    # for an instance are made of
     """
     CREATE TABLE redundant (
         chunk_id INTEGER NOT NULL, local_id INTEGER NOT NULL, like_chunk INTEGER NOT NULL,
         like_local INTEGER NOT NULL, frames BLOB NOT NULL, PRIMARY KEY (chunk_id, local_id)) WITHOUT ROWID;
     CREATE INDEX redundant_by_like ON redundant (like_chunk, like_local);
+    CREATE TABLE looks (
+        instance INTEGER PRIMARY KEY REFERENCES instances, shape TEXT NOT NULL, resting INTEGER NOT NULL,
+        swatches BLOB NOT NULL);
     """,
 )
 

@@ -106,6 +106,7 @@ class Instances:
         self._connection.execute("DELETE FROM instance_boxes WHERE id = ?", (instance_id,))
         self._embeddings.drop(instance_id)
         self._library.anchors.drop(instance_id)
+        self._library.looks.drop(instance_id)
         self._labels.drop(instance_id)
         self._relations.drop(instance_id)
         self._events.drop(instance_id, alias_of)

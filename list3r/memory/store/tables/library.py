@@ -262,8 +262,44 @@ class Anchors:
         self._rows.delete("instance = ?", (instance_id,))
 
 
+@dataclass(frozen=True)
+class Looks:
+    """What the description of an instance is made of, in any light."""
+
+    instance: int
+    shape: str
+    """See `memory.description.describe.shape_word`."""
+    resting: bool
+    """Whether it stands still."""
+    swatches: Annotated[NDArray[np.float64], Shape((-1, 7))]
+    """RGB, CIE L*a*b* and share of its colours, the commonest first. Shape (S, 7)."""
+
+
+class LooksTable:
+    """The table of looks. What writes is called inside `transaction()`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._rows = Table(connection, "looks", Columns.of(Looks), "instance")
+
+    def put(self, looks: Iterable[Looks]) -> None:
+        """Write the looks of instances."""
+        self._rows.put(looks)
+
+    def all(self) -> list[Looks]:
+        """Return the looks of all instances by id."""
+        return self._rows.all()
+
+    def count(self) -> int:
+        """Return of how many instances the looks are known."""
+        return self._rows.count()
+
+    def drop(self, instance_id: int) -> None:
+        """Forget the looks of an instance."""
+        self._rows.delete("instance = ?", (instance_id,))
+
+
 class LibraryState:
-    """The five tables, and which chunks the library does not know yet."""
+    """The six tables, and which chunks the library does not know yet."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -272,6 +308,7 @@ class LibraryState:
         self.members = GroupMembers(connection)
         self.anchors = Anchors(connection)
         self.redundant = Redundant(connection)
+        self.looks = LooksTable(connection)
         self.touched: set[int] | None = None
         """Chunks that were placed or measured anew since the library was derived; None where that is not known."""
         connection.on_forget(self._forget)
@@ -298,5 +335,5 @@ class LibraryState:
         self.touched = None
 
 
-PASSING = ("settled", "overlaps", "members", "anchors", "redundant")
+PASSING = ("settled", "overlaps", "members", "anchors", "redundant", "looks")
 """The tables of this page."""
