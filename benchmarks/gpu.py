@@ -28,7 +28,7 @@ from list3r.instances.base import Proposals
 from list3r.models.cards import find_card
 from list3r.models.device import MemoryBudget, find_gpu, pictures_that_fit
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.networks.feedforward import half_precision
+from list3r.reconstruction.feedforward.network import half_precision
 from list3r.reconstruction.networks.pi3 import NETWORK as PI3
 
 SIZE = (364, 504)

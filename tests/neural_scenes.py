@@ -22,6 +22,11 @@ CLASSES = {
     "vggt": ("vggt.models.vggt", "VGGT"),
     "mapanything": ("mapanything.models", "MapAnything"),
     "da3": ("depth_anything_3.api", "DepthAnything3"),
+    "dust3r": ("dust3r.model", "AsymmetricCroCo3DStereo"),
+    "mast3r": ("mast3r.model", "AsymmetricMASt3R"),
+    "cut3r": ("dust3r.model", "ARCroco3DStereo"),
+    "ttt3r": ("dust3r.model", "ARCroco3DStereo"),
+    "fast3r": ("fast3r.models.fast3r", "Fast3R"),
 }
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +18,17 @@ from list3r.memory.geometry import Sim3
 from list3r.models.cards import MemoryFigures
 from list3r.models.device import MemoryBudget, is_out_of_memory, pictures_that_fit
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.networks.feedforward import PictureSize, inverted, shrink, sigmoid_of_expp1
-from list3r.reconstruction.networks.output import (
+from list3r.reconstruction.feedforward.network import inverted, sigmoid_of_expp1
+from list3r.reconstruction.feedforward.output import (
     WindowOutput,
-    focal_from_points,
     to_reconstruction,
     with_given_poses,
 )
+from list3r.reconstruction.feedforward.pictures import LANCZOS, CutSize, PictureSize, pictures
+from list3r.reconstruction.feedforward.points import pinhole
+from list3r.reconstruction.feedforward.windows import between, join, regauged, run_windows
 from list3r.reconstruction.networks.pi3 import read
 from list3r.reconstruction.networks.vggt import decode_poses
-from list3r.reconstruction.networks.windows import between, join, regauged, run_windows
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from tests import neural_scenes
 from tests.rgbd_scenes import CAMERA, pose_errors
@@ -48,6 +51,13 @@ def made_with(name: str, folder: Path, **more: object) -> Reconstruction:
     return make_reconstructor(name, options)(neural_scenes.rgb_only(frames), CAMERA)
 
 
+def small(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of 160 x 112 for networks after DUSt3R, cut from 160 x 120."""
+    adapter = import_module(f"list3r.reconstruction.networks.{name}")
+    if isinstance(adapter.NETWORK.loader, CutSize):
+        monkeypatch.setattr(adapter, "NETWORK", replace(adapter.NETWORK, loader=CutSize(longest=160)))
+
+
 def check_true(made: Reconstruction, *, focal_share: float = 0.01) -> float:
     """Poses, depth and focal length are the film's, at one scale; the scale."""
     frames = neural_scenes.film()
@@ -64,12 +74,15 @@ def check_true(made: Reconstruction, *, focal_share: float = 0.01) -> float:
     error = np.abs(made.depth[known] / scale / depth[known] - 1)
     assert np.median(error) < 1e-3 and np.quantile(error, 0.9) < 0.03
     assert abs(made.camera.fx / CAMERA.fx - 1) < focal_share and abs(made.camera.fy / CAMERA.fy - 1) < focal_share
-    assert (made.camera.cx, made.camera.cy) == (159.5, 119.5)
+    assert (made.camera.cx, made.camera.cy) == pytest.approx((159.5, 119.5), abs=0.6)
     return scale
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_network_gives_the_known_geometry_back(name: str, upstream: None, tmp_path: Path) -> None:
+def test_each_network_gives_the_known_geometry_back(
+    name: str, upstream: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small(name, monkeypatch)
     made = made_with(name, tmp_path / "weights", camera_known=False)
     # Height and width are rounded to whole patches on their own, so that the picture is stretched by a percent or two.
     check_true(made, focal_share=0.025)
@@ -81,8 +94,9 @@ def test_each_network_gives_the_known_geometry_back(name: str, upstream: None, t
 def test_known_intrinsics_are_told_to_networks_that_listen(name: str, upstream: None, tmp_path: Path) -> None:
     made_with(name, tmp_path / "weights", camera_known=True)
     told = neural_scenes.upstream(name).told.cpu().numpy()
-    height, width = PictureSize(max_pixels=255_000).of(240, 320) if name == "pi3x" else (392, 518)
-    assert np.allclose(told[0, 0], CAMERA.fx * width / 320) and np.allclose(told[1, 1], CAMERA.fy * height / 240)
+    place = import_module(f"list3r.reconstruction.networks.{name}").NETWORK.loader.place(240, 320)
+    (tall, wide), (height, width) = place.inner, place.size
+    assert np.allclose(told[0, 0], CAMERA.fx * wide / 320) and np.allclose(told[1, 1], CAMERA.fy * tall / 240)
     first_centre = 0.5 if name == "pi3x" else 0.0  # what the package calls the centre of the first pixel
     assert np.allclose(told[:2, 2], ((width - 1) / 2 + first_centre, (height - 1) / 2 + first_centre))
 
@@ -129,7 +143,7 @@ def test_given_poses_that_stand_still_leave_the_scale_open() -> None:
     frames = list(neural_scenes.film(4))
     still = [type(f)(f.index, f.time_s, f.color, None, np.eye(4)) for f in frames]
     one = window(4)
-    same = WindowOutput(np.tile(np.eye(4), (4, 1, 1)), one.depth, one.confidence, one.focal)
+    same = replace(one, T_window_cam=np.tile(np.eye(4), (4, 1, 1)))
     made = to_reconstruction(still, Camera(56, 42, 50, 50, 27.5, 20.5), same)
     with pytest.raises(TrackingError, match="stands still"):
         with_given_poses(made, still)
@@ -143,7 +157,11 @@ def window(count: int = 8, seed: int = 0, size: tuple[int, int] = (42, 56)) -> W
     T[:, :3, 3] = rng.normal(0, 0.5, (count, 3))
     depth = 2.0 + rng.random((count, 1, 1)) + 0.01 * np.arange(size[1])[None, None] + np.zeros((count, *size))
     return WindowOutput(
-        T, depth.astype(np.float32), np.full((count, *size), 0.9, np.float32), np.full((count, 2), 50.0)
+        T,
+        depth.astype(np.float32),
+        np.full((count, *size), 0.9, np.float32),
+        np.full((count, 2), 50.0),
+        np.tile([(size[1] - 1) / 2, (size[0] - 1) / 2], (count, 1)),
     )
 
 
@@ -176,7 +194,7 @@ def test_pi3_outputs_made_by_hand_are_read_in_our_conventions() -> None:
     assert np.allclose(points, truth.T_window_cam[:, :3, 3], atol=1e-6)
 
 
-def test_focal_lengths_survive_noise_and_ignore_what_is_not_believed() -> None:
+def test_pinholes_survive_noise_and_ignore_what_is_not_believed() -> None:
     rng = np.random.default_rng(3)
     height, width = 84, 112
     z = rng.uniform(1, 4, (height, width))
@@ -185,8 +203,8 @@ def test_focal_lengths_survive_noise_and_ignore_what_is_not_believed() -> None:
     points = np.stack([x, y, z], axis=-1).astype(np.float32)
     weights = np.ones((height, width), np.float32)
     points[:10], weights[:10] = rng.normal(0, 9, (10, width, 3)), 0.0
-    assert np.allclose(focal_from_points(points, weights), (90.0, 85.0), rtol=0.01)
-    assert np.isnan(focal_from_points(points, weights * 0)).all()
+    assert np.allclose(pinhole(points, weights), (90.0, 85.0, 55.5, 41.5), rtol=0.01)
+    assert np.isnan(pinhole(points, weights * 0)).all()
 
 
 @pytest.mark.parametrize("shared", [1, 2, 5])
@@ -201,7 +219,7 @@ def test_windows_join_into_the_gauge_of_the_first(shared: int) -> None:
 
 def test_windows_without_a_common_valid_frame_cannot_be_joined() -> None:
     one, two = window(3), window(3)
-    lost = WindowOutput(two.T_window_cam * np.nan, two.depth, two.confidence, two.focal)
+    lost = replace(two, T_window_cam=two.T_window_cam * np.nan)
     with pytest.raises(DegenerateError, match="share no frame"):
         between(one, lost)
 
@@ -213,13 +231,11 @@ def test_frames_that_the_network_cannot_pose_are_left_out() -> None:
     focal = output.focal.copy()
     focal[1] = 1e9
     frames = neural_scenes.film(4)
-    made = to_reconstruction(
-        frames, Camera(56, 42, 1, 1, 0, 0), WindowOutput(T, output.depth, output.confidence, focal)
-    )
+    made = to_reconstruction(frames, Camera(56, 42, 1, 1, 0, 0), replace(output, T_window_cam=T, focal=focal))
     assert made.posed.tolist() == [True, False, False, True]
     assert np.isfinite(made.T_chunk_cam).all() and (made.depth[2] == 0).all()
     with pytest.raises(TrackingError, match="no usable pose"):
-        to_reconstruction(frames, CAMERA, WindowOutput(T * np.nan, output.depth, output.confidence, output.focal))
+        to_reconstruction(frames, CAMERA, replace(output, T_window_cam=T * np.nan))
 
 
 def test_windows_are_halved_until_they_fit() -> None:
@@ -273,7 +289,8 @@ def test_picture_sizes_are_whole_patches_and_keep_the_aspect() -> None:
             assert size.max_pixels is None or h * w <= size.max_pixels
             assert size.longest is None or max(h, w) == size.longest
     assert PictureSize(max_pixels=255_000).of(480, 640) == (434, 574)
-    assert shrink([np.zeros((48, 64, 3), np.uint8)], 14, 28).shape == (1, 14, 28, 3)
+    place = PictureSize(longest=28).place(48, 64)
+    assert pictures([np.zeros((48, 64, 3), np.uint8)], place, LANCZOS).shape == (1, 28, 28, 3)
 
 
 def test_vggt_poses_decode() -> None:

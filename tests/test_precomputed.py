@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera, Frame
+from list3r.instances.geometric.features import color_feature
 from list3r.instances.library import build_library
 from list3r.instances.registry import check_choice, make_discoverer
 from list3r.instances.settings import InstanceSettings
@@ -288,13 +289,24 @@ def test_masks_become_candidates_that_know_what_they_are(tmp_path: Path) -> None
     assert len(outside.score) == 0
 
 
-@pytest.mark.parametrize(
-    ("features", "words"), [(None, "no masks and features"), (np.eye(1, dtype=np.float32), "features has 1 rows")]
-)
-def test_masks_without_their_features_are_refused(features: np.ndarray | None, words: str, tmp_path: Path) -> None:
-    write_piece(tmp_path / "a.npz", with_things(piece(), features))
+def test_things_without_features_are_known_by_their_colours(tmp_path: Path) -> None:
+    write_piece(tmp_path / "a.npz", with_things(piece(), None))
+    write_manifest(tmp_path, Manifest("relative", "some model", 10, 3))
+    made = reader(tmp_path)(frames(0, 10), CAMERA)  # type: ignore[operator]
+    folders = (("discovery/precomputed", str(tmp_path)),)
+    find = make_discoverer("precomputed", "own", folders, "cpu", InstanceSettings())
+    assert find.feature_space == "precomputed-some-model-colors@1/36"
+    both = find(frames(0, 10), made, 2)
+    color = frames(0, 10)[2].color
+    assert np.allclose(both.features, [color_feature(color[both.labels == n]) for n in (1, 2)], atol=1e-6)
+
+
+@pytest.mark.parametrize("things", [False, True])
+def test_masks_that_are_missing_or_have_too_few_features_are_refused(things: bool, tmp_path: Path) -> None:
+    one = with_things(piece(), np.eye(1, dtype=np.float32)) if things else piece()
+    write_piece(tmp_path / "a.npz", one)
     write_manifest(tmp_path, Manifest())
-    with pytest.raises(OptionError, match=words):
+    with pytest.raises(OptionError, match="features has 1 rows" if things else "has no masks"):
         make_discoverer("precomputed", "own", (("discovery/precomputed", str(tmp_path)),), "cpu", InstanceSettings())
     with pytest.raises(OptionError, match="--weights discovery=DIR"):
         make_discoverer("precomputed", "own", (), "cpu", InstanceSettings())

@@ -30,17 +30,33 @@ from list3r.memory.errors import OptionError
 from list3r.models.upstream import quiet, upstream_class
 from list3r.pipeline import session as session_stage
 from list3r.pipeline.chunks import chunk as chunk_stage
-from list3r.reconstruction.networks.feedforward import Network, PictureSize
+from list3r.reconstruction.feedforward.network import Network
+from list3r.reconstruction.feedforward.pictures import CutSize, PictureSize
 from tests import neural_scenes, upstream_networks
 from tests.rgbd_scenes import CAMERA
 from tests.upstream_networks import Truth
 
-PACKAGES = {"pi3": "pi3", "pi3x": "pi3", "vggt": "vggt", "mapanything": "mapanything", "da3": "depth_anything_3"}
+PACKAGES = {
+    "pi3": "pi3",
+    "pi3x": "pi3",
+    "vggt": "vggt",
+    "mapanything": "mapanything",
+    "da3": "depth_anything_3",
+    "dust3r": "dust3r",
+    "mast3r": "mast3r",
+    "cut3r": "dust3r",
+    "ttt3r": "dust3r",
+    "fast3r": "fast3r",
+}
 NAMES = [name for name, package in PACKAGES.items() if find_spec(package) is not None]
 if not NAMES:
     pytest.skip("no geometry network's own package is installed (docs/models.md)", allow_module_level=True)
-SIZE = PictureSize(longest=140)
-"""Of the pictures: 140 x 98 or 140 x 112 in patches of 14."""
+
+
+def small(network: Network) -> Network:
+    """The network with pictures of 140 x 98 or 140 x 112, in patches of 16 of 128 x 96."""
+    cuts = isinstance(network.loader, CutSize)
+    return replace(network, loader=CutSize(longest=128) if cuts else PictureSize(longest=140))
 
 
 @dataclass(frozen=True)
@@ -58,8 +74,8 @@ class Real:
 
 @pytest.fixture(scope="module", params=NAMES)
 def real(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Real]:
-    adapter = import_module(f"list3r.reconstruction.{request.param}")
-    network: Network = replace(adapter.NETWORK, size=SIZE)
+    adapter = import_module(f"list3r.reconstruction.networks.{request.param}")
+    network = small(adapter.NETWORK)
     folder = tmp_path_factory.mktemp(request.param)
     with pytest.MonkeyPatch.context() as patch:
         try:
@@ -90,7 +106,7 @@ def taught(real: Real, monkeypatch: pytest.MonkeyPatch) -> Truth:
         upstream_networks.TEACHERS[real.name](model, truth)
         return model
 
-    adapter = import_module(f"list3r.reconstruction.{real.name}")
+    adapter = import_module(f"list3r.reconstruction.networks.{real.name}")
     monkeypatch.setattr(adapter, "NETWORK", replace(real.network, load_class=load))
     return truth
 
@@ -114,8 +130,11 @@ class Here:
         """What a function makes of its argument."""
         return work(question)
 
-    def stop(self) -> None:
-        """Nothing runs."""
+    def __enter__(self) -> Here:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
 
 
 def build(real: Real, tmp_path: Path, *more: str) -> list[str]:
@@ -185,12 +204,12 @@ def half_as_on_a_gpu(patch: pytest.MonkeyPatch) -> None:
 def test_answers_have_their_shapes_in_half_precision(real: Real, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     half_as_on_a_gpu(monkeypatch)
     film = neural_scenes.film()[:3]
-    height, width = real.network.size.of(CAMERA.height, CAMERA.width)
+    height, width = real.network.loader.place(CAMERA.height, CAMERA.width).size
     stack = torch.stack([torch.from_numpy(f.color).permute(2, 0, 1) / 255.0 for f in film])
     stack = torch.nn.functional.interpolate(stack, size=(height, width), mode="bilinear")
-    K = torch.tensor([[115.0, 0, width / 2], [0, 115.0, height / 2], [0, 0, 1]]) if told else None
+    K = torch.tensor([[115.0, 0, width / 2], [0, 115.0, height / 2], [0, 0, 1]]).repeat(3, 1, 1) if told else None
     model = real.load()
-    for half in (False, True):
+    for half in (False, True) if real.network.half else (False,):
         with quiet(), torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
             said = real.network.answer(model, stack, K)
         assert said.T_window_cam.shape == (3, 4, 4) and said.focal.shape == (3, 2)
@@ -219,7 +238,7 @@ def test_told_intrinsics_are_the_rays_of_the_pixels(real: Real) -> None:
         model._encode_n_views = look
     K = torch.tensor([[115.0, 0, 68.0], [0, 117.0, 50.0], [0, 0, 1]])
     with quiet(), torch.inference_mode():
-        real.network.answer(model, torch.rand(2, 3, 98, 140), K)
+        real.network.answer(model, torch.rand(2, 3, 98, 140), K.repeat(2, 1, 1))
     x, y = (torch.arange(140) - 68.0) / 115.0, (torch.arange(98) - 50.0) / 117.0
     expected = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     torch.testing.assert_close(seen[0].float(), expected, atol=1e-5, rtol=1e-5)

@@ -7,6 +7,7 @@ what the last layers put out, before the packages' own activations and assembly,
 from __future__ import annotations
 
 import functools
+import json
 import math
 from collections.abc import Callable
 from importlib import import_module
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 from torch.nn import functional
 
@@ -191,12 +193,76 @@ def _teach_mapanything(model: Any, truth: Truth) -> None:
         _hook(head, make)
 
 
+def _grown(values: torch.Tensor) -> torch.Tensor:
+    """What grows to values (..., 3) where a package makes x expm1(|x|) / |x| of x."""
+    length = values.norm(dim=-1, keepdim=True).clamp(min=1e-8)
+    return values / length * torch.log1p(length)
+
+
+def _raw_points(truth: Truth, points: torch.Tensor, rows: slice) -> torch.Tensor:
+    """Points (n, h, w, 3) and confidence before a head's activations. Shape (n, 4, h, w)."""
+    raw = torch.cat([_grown(points), truth.logit()[rows][..., None]], dim=-1)
+    return raw.permute(0, 3, 1, 2)
+
+
+def _tokens(raw: torch.Tensor) -> torch.Tensor:
+    """What a head of one linear layer says in its tokens (n, s, c) of maps (n, c', h, w)."""
+    return functional.pixel_unshuffle(raw, 16).flatten(2).transpose(1, 2)
+
+
+def _local_points(truth: Truth) -> torch.Tensor:
+    slopes = truth.slopes()
+    return truth.z()[..., None] * torch.cat([slopes, torch.ones_like(slopes[..., :1])], dim=-1)
+
+
+def _teach_cut3r(model: Any, truth: Truth) -> None:
+    def before(_module: Any, inputs: tuple[Any, ...]) -> None:
+        truth.look(torch.cat([(v["img"] + 1) / 2 for v in inputs[0]]))
+
+    def pose(out: torch.Tensor) -> torch.Tensor:
+        quat = truth.quat_xyzw()[:, [3, 0, 1, 2]]
+        return truth.next("pose", torch.cat([_grown(truth.T[:, :3, 3]), quat], dim=1), len(out))
+
+    def own(out: torch.Tensor) -> torch.Tensor:
+        return truth.next("own", _tokens(_raw_points(truth, _local_points(truth), slice(None))), len(out))
+
+    model.register_forward_pre_hook(before)
+    _hook(model.downstream_head.pose_head, pose)
+    _hook(model.downstream_head.proj, own)
+
+
+def _teach_dust3r(model: Any, truth: Truth) -> None:
+    def before(_module: Any, inputs: tuple[Any, ...]) -> None:
+        truth.look(torch.cat([(v["img"] + 1) / 2 for v in inputs]))
+
+    def head(second: bool, tokens: bool) -> Callable[[torch.Tensor], torch.Tensor]:
+        def say(_out: torch.Tensor) -> torch.Tensor:
+            half = len(truth.T) // 2
+            rows = slice(half, None) if second else slice(0, half)
+            local = _local_points(truth)[rows]
+            T = torch.linalg.inv(truth.T[:half]) @ truth.T[rows]
+            seen = torch.einsum("nij,nhwj->nhwi", T[:, :3, :3], local) + T[:, None, None, :3, 3]
+            raw = _raw_points(truth, seen, rows)
+            return _tokens(raw) if tokens else raw
+
+        return say
+
+    model.register_forward_pre_hook(before)
+    for n, module in enumerate((model.downstream_head1, model.downstream_head2)):
+        linear = hasattr(module, "proj")
+        _hook(module.proj if linear else module.head_pts3d, head(n == 1, linear))
+
+
 TEACHERS: dict[str, Callable[[Any, Truth], None]] = {
     "pi3": _teach_pi3,
     "pi3x": _teach_pi3,
     "vggt": _teach_vggt,
     "mapanything": _teach_mapanything,
     "da3": _teach_da3,
+    "dust3r": _teach_dust3r,
+    "mast3r": _teach_dust3r,
+    "cut3r": _teach_cut3r,
+    "ttt3r": _teach_cut3r,
 }
 
 
@@ -218,7 +284,35 @@ def cut_down(name: str, patch: pytest.MonkeyPatch) -> dict[str, Any]:
         patch.setattr(module, "CameraHead", functools.partial(module.CameraHead, trunk_depth=1))
         patch.setattr(module, "DPTHead", functools.partial(module.DPTHead, **layers))
         return {"embed_dim": 64}
+    if name in ("dust3r", "mast3r", "cut3r", "ttt3r"):
+        return _croco(name)
     return {"model_name": "da3-small"} if name == "da3" else _mapanything()
+
+
+def _croco(name: str) -> dict[str, Any]:
+    """Networks after CroCo, narrower and with fewer layers."""
+    plan: dict[str, Any] = {
+        "pos_embed": "RoPE100",
+        "patch_embed_cls": "PatchEmbedDust3R",
+        "img_size": (96, 128),
+        "head_type": "linear",
+        "output_mode": "pts3d",
+        "depth_mode": ("exp", -math.inf, math.inf),
+        "conf_mode": ("exp", 1, math.inf),
+        "enc_embed_dim": 32,
+        "enc_depth": 1,
+        "enc_num_heads": 2,
+        "dec_embed_dim": 32,
+        "dec_depth": 4,
+        "dec_num_heads": 2,
+        "landscape_only": False,
+    }
+    if name == "dust3r":
+        return plan
+    if name == "mast3r":
+        return plan | {"head_type": "catconv", "output_mode": "pts3d+desc24", "two_confs": True}
+    state = {"state_size": 16, "state_pe": "2d", "local_mem_size": 8, "state_dec_num_heads": 2, "rgb_head": False}
+    return plan | state | {"output_mode": "pts3d+pose", "pose_head": True, "pose_mode": plan["depth_mode"]}
 
 
 def _two_layers(*ends: int) -> range:
@@ -315,6 +409,11 @@ def save(cls: Any, told: dict[str, Any], folder: Path) -> Path:
     import copy
 
     torch.manual_seed(0)
+    if hasattr(cls, "config_class"):  # of transformers, whose own way of saving its configuration cannot hold
+        folder.mkdir(parents=True)
+        save_file(cls(cls.config_class(**copy.deepcopy(told))).state_dict(), folder / "model.safetensors")
+        (folder / "config.json").write_text(json.dumps(told), encoding="utf-8")
+        return folder
     model = cls(**copy.deepcopy(told))
     model.save_pretrained(folder, config=told)
     return folder

@@ -35,6 +35,8 @@ APACHE = Licence("Apache-2.0", "permissive")
 MIT = Licence("MIT", "permissive")
 BSD3 = Licence("BSD-3-Clause", "permissive")
 CC_BY_NC = Licence("CC-BY-NC-4.0", "noncommercial")
+CC_BY_NC_SA = Licence("CC-BY-NC-SA-4.0", "noncommercial")
+FAIR_NC = Licence("FAIR Noncommercial Research License", "noncommercial")
 VGGT_LICENCE = Licence("VGGT License v1", "custom")
 SAM_LICENCE = Licence("SAM License", "custom")
 DINOV3_LICENCE = Licence("DINOv3 License", "custom")
@@ -204,6 +206,51 @@ CARDS: tuple[ModelCard, ...] = (
         MemoryFigures(10000, 600, "DA3-Streaming's table, giant weights: 28.3 GB at 120 frames of 504x378"),
         504 * 378,
         "base and small weights are free for any use",
+    ),
+    ModelCard(
+        "dust3r",
+        "geometry",
+        CC_BY_NC_SA,
+        (Weights("naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt", CC_BY_NC_SA),),
+        ("dust3r",),
+        "git clone --recursive https://github.com/naver/dust3r, and its folder on PYTHONPATH",
+        about="pairs of pictures, brought into chunks here",
+    ),
+    ModelCard(
+        "mast3r",
+        "geometry",
+        CC_BY_NC_SA,
+        (Weights("naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric", CC_BY_NC_SA),),
+        ("mast3r", "dust3r"),
+        "git clone --recursive https://github.com/naver/mast3r, and its folder on PYTHONPATH",
+        about="pairs of pictures, brought into chunks here",
+    ),
+    ModelCard(
+        "cut3r",
+        "geometry",
+        CC_BY_NC_SA,
+        (),
+        ("dust3r", "accelerate"),
+        "git clone https://github.com/CUT3R/CUT3R, its folder src on PYTHONPATH, pip install accelerate einops",
+        about="one picture after another; its dust3r is not that of DUSt3R",
+    ),
+    ModelCard(
+        "ttt3r",
+        "geometry",
+        CC_BY_NC_SA,
+        (),
+        ("dust3r", "accelerate"),
+        "git clone https://github.com/Inception3D/TTT3R, its folder src on PYTHONPATH, pip install accelerate einops",
+        about="cut3r, which forgets less; takes the weights of cut3r",
+    ),
+    ModelCard(
+        "fast3r",
+        "geometry",
+        FAIR_NC,
+        (Weights("jedyang97/Fast3R_ViT_Large_512", FAIR_NC),),
+        ("fast3r",),
+        f"{_GIT}/facebookresearch/fast3r",
+        about="all pictures at once, points without poses",
     ),
     _hub(
         "eomt", "discovery", Weights("tue-mps/coco_panoptic_eomt_large_640", MIT), "masks, query embeddings and labels"

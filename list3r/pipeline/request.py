@@ -41,7 +41,9 @@ class BuildRequest:
     reconstruction: str | None = field(
         default=None,
         metadata=option(
-            "rgbd, sfm, pi3, pi3x, vggt, mapanything, da3, precomputed or auto (rgbd with depth, else sfm).", "MODEL"
+            "rgbd, sfm, pi3, pi3x, vggt, mapanything, da3, dust3r, mast3r, cut3r, ttt3r, fast3r, precomputed or auto "
+            "(rgbd with depth, else sfm).",
+            "MODEL",
         ),
     )
     preset: str | None = field(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
+from list3r.memory.errors import TrackingError
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,18 @@ class Reconstruction:
         assert self.T_chunk_cam.shape == (count, 4, 4)
         assert self.depth.shape == self.confidence.shape == (count, self.camera.height, self.camera.width)
 
+    def part(self, which: slice) -> Reconstruction:
+        """Return some of the frames, without keyframes."""
+        return replace(
+            self,
+            frame_indices=self.frame_indices[which],
+            posed=self.posed[which],
+            T_chunk_cam=self.T_chunk_cam[which],
+            depth=self.depth[which],
+            confidence=self.confidence[which],
+            keyframes=np.zeros(0, np.int64),
+        )
+
 
 Around = Callable[[int, int], tuple[Sequence[Frame], Sequence[Frame]]]
 """(step, count) gives up to `count` frames before and as many behind a chunk, `step` apart, in order of time."""
@@ -122,11 +136,42 @@ class Reconstructor(Protocol):
     """A reconstruction model."""
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Reconstruct a chunk, or a joint window of frames from two places.
-
-        Raises `TrackingError` when no two frames can be related.
-        """
+        """Reconstruct a chunk. Raises `TrackingError` when no two frames can be related."""
         ...
+
+
+@dataclass(frozen=True)
+class WindowSide:
+    """The frames of one place in a joint window."""
+
+    frames: Sequence[Frame]
+    camera: Camera
+    """Of the frames."""
+    camera_known: bool
+    """False where the camera is a guess, of which only the size counts."""
+
+
+@runtime_checkable
+class JointModel(Protocol):
+    """A model that reconstructs frames of several places together, though they share no frame."""
+
+    def joint(self, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
+        """Reconstruct all sides in one gauge. Raises `TrackingError` when a side cannot be posed."""
+        ...
+
+
+def reconstruct_jointly(model: Reconstructor, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
+    """Reconstruct frames of several places in one gauge, as one chunk where the model has no way of its own.
+
+    Raises `TrackingError` when a side cannot be posed, or when such a chunk would have several cameras.
+    """
+    if isinstance(model, JointModel):
+        return model.joint(sides)
+    if len({side.camera for side in sides}) > 1:
+        raise TrackingError("the places were filmed by different cameras")
+    made = model([frame for side in sides for frame in side.frames], sides[0].camera)
+    ends = np.cumsum([0, *(len(side.frames) for side in sides)]).tolist()
+    return tuple(made.part(slice(*span)) for span in itertools.pairwise(ends))
 
 
 def backproject(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:

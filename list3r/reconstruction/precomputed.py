@@ -18,9 +18,9 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import DegenerateError, OptionError, TrackingError
 from list3r.memory.geometry import Sim3
 from list3r.reconstruction.base import DepthNoise, Reconstruction
-from list3r.reconstruction.networks.output import WindowOutput, to_reconstruction, with_given_poses
-from list3r.reconstruction.networks.settings import NetworkSettings
-from list3r.reconstruction.networks.windows import between, regauged
+from list3r.reconstruction.feedforward.output import WindowOutput, to_reconstruction, with_given_poses
+from list3r.reconstruction.feedforward.settings import NetworkSettings
+from list3r.reconstruction.feedforward.windows import between, regauged
 from list3r.reconstruction.precomputed_files import Manifest, read_frames, read_manifest, read_piece
 from list3r.reconstruction.registry import ModelOptions
 
@@ -74,29 +74,25 @@ class PrecomputedReconstructor:
         Raises `TrackingError` when fewer than two are held, `OptionError` for files that are damaged or do not fit.
         """
         wanted = np.array([f.index for f in frames], np.int64)
-        output, principal, noise = self._gather(wanted)
+        output, noise = self._gather(wanted)
         try:
             made = to_reconstruction(frames, camera, output, noise, self._settings)
         except TrackingError:
             raise TrackingError(f"{self._path} holds too little of frames {wanted[0]} to {wanted[-1]}") from None
-        sy, sx = (full / small for full, small in zip(made.depth.shape[1:], output.depth.shape[1:], strict=True))
-        cx, cy = (float(v) for v in (np.nanmedian(principal, axis=0) + 0.5) * (sx, sy) - 0.5)
-        made = replace(made, camera=replace(made.camera, cx=cx, cy=cy), scale_kind=self._folder.manifest.scale)
+        made = replace(made, scale_kind=self._folder.manifest.scale)
         return with_given_poses(made, frames) if self._poses == "given" else made
 
-    def _gather(self, wanted: NDArray[np.int64]) -> tuple[WindowOutput, NDArray[np.float64], DepthNoise | None]:
-        """The answer for the wanted frames, in the gauge of the first file, principal points (F, 2), px, and noise."""
+    def _gather(self, wanted: NDArray[np.int64]) -> tuple[WindowOutput, DepthNoise | None]:
+        """The answer for the wanted frames, in the gauge of the first file, and its noise."""
         output: WindowOutput | None = None
         noises: list[DepthNoise] = []
-        principal = np.full((len(wanted), 2), np.nan)
         filled = np.zeros(len(wanted), bool)
         for k in self._folder.holding(wanted):
             piece = read_piece(self._folder.files[k])
             where = np.flatnonzero(np.isin(wanted, piece.frames))
             rows = np.searchsorted(piece.frames, wanted[where])
-            part = WindowOutput(
-                piece.T_world_cam[rows], piece.depth[rows], piece.confidence[rows], piece.intrinsics[rows, :2]
-            )
+            K = piece.intrinsics[rows]
+            part = WindowOutput(piece.T_world_cam[rows], piece.depth[rows], piece.confidence[rows], K[:, :2], K[:, 2:])
             if output is None:
                 output = _unknown(len(wanted), part.depth.shape[1:])
             if output.depth.shape[1:] != part.depth.shape[1:]:
@@ -108,13 +104,12 @@ class PrecomputedReconstructor:
             fresh = where[~shared]
             for target, source in zip(output.arrays(), part.arrays(), strict=True):
                 target[fresh] = source[~shared]
-            principal[fresh] = piece.intrinsics[rows[~shared], 2:]
             filled[fresh] = True
             if piece.depth_noise is not None:
                 noises.append(DepthNoise(*piece.depth_noise.tolist()).scaled(scale))
         if output is None:
             raise TrackingError(f"{self._path} holds none of the frames {wanted[0]} to {wanted[-1]}")
-        return output, principal, _roughest(noises)
+        return output, _roughest(noises)
 
     def _between(
         self, output: WindowOutput, where: NDArray[np.int64], part: WindowOutput, shared: NDArray[np.bool_], k: int
@@ -142,5 +137,6 @@ def _unknown(count: int, size: tuple[int, ...]) -> WindowOutput:
         np.full((count, 4, 4), np.nan),
         np.zeros((count, *size), np.float32),
         np.zeros((count, *size), np.float32),
+        np.full((count, 2), np.nan),
         np.full((count, 2), np.nan),
     )

@@ -184,6 +184,16 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         raise OptionError(f"{path} cannot be read: {reason}") from None
 
 
+def read_array(path: Path) -> NDArray[Any]:
+    """Return the array of an .npy file. Raises `OptionError` when it is damaged, or holds anything but numbers."""
+    try:
+        check_ordinary(path.stat(), path, MAX_BYTES)
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0][:160]
+        raise OptionError(f"{path} cannot be read: {reason}") from None
+
+
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
     """One array, its size checked against its header before any of it is unpacked."""
     with archive.open(entry) as stream:

@@ -66,6 +66,11 @@ MODELS: dict[str, ModelEntry] = {
     "vggt": ModelEntry("networks.vggt"),
     "mapanything": ModelEntry("networks.mapanything"),
     "da3": ModelEntry("networks.da3"),
+    "dust3r": ModelEntry("networks.dust3r"),
+    "mast3r": ModelEntry("networks.mast3r"),
+    "cut3r": ModelEntry("networks.cut3r"),
+    "ttt3r": ModelEntry("networks.ttt3r"),
+    "fast3r": ModelEntry("networks.fast3r"),
     "precomputed": ModelEntry("precomputed", reads_files=True),
 }
 """All that `--reconstruction` knows."""

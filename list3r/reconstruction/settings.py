@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from list3r.memory.masks import FULL_SIDE_PX
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.networks.settings import NetworkSettings
+from list3r.reconstruction.feedforward.settings import NetworkSettings
 from list3r.reconstruction.rgbd.settings import RgbdSettings
 from list3r.reconstruction.sfm.settings import SfmSettings
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
-import numpy as np
-
-from list3r.frames.base import Camera, Frame, FrameSource, guessed_camera
+from list3r.frames.base import Frame, FrameSource, guessed_camera
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import TrackingError
 from list3r.memory.records import JointWindow
-from list3r.reconstruction.base import Reconstruction, Reconstructor
+from list3r.reconstruction.base import Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.keyframe_record import frame_samples
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
@@ -42,21 +39,19 @@ class RgbdJointReconstructor:
         Raises `SourceError` when a session's source is no longer there.
         """
         u, v = self._read(u_session, u_frames), self._read(v_session, v_frames)
-        camera = self._camera(u_session)
-        if camera != self._camera(v_session) or not u or not v:
+        if not u or not v:
             return None
         try:
-            made = self._reconstructor([*u, *v], camera)
+            one, two = reconstruct_jointly(self._reconstructor, (self._side(u_session, u), self._side(v_session, v)))
         except TrackingError:
             return None
-        one, two = _part(made, slice(0, len(u))), _part(made, slice(len(u), None))
         if min(int(one.posed.sum()), int(two.posed.sum())) < 2:
             return None
-        return JointWindow(frame_samples(one), frame_samples(two), made.scale_kind)
+        return JointWindow(frame_samples(one), frame_samples(two), one.scale_kind)
 
-    def _camera(self, session_id: int) -> Camera:
+    def _side(self, session_id: int, frames: Sequence[Frame]) -> WindowSide:
         info = self._source(session_id).info
-        return info.camera or guessed_camera(info)
+        return WindowSide(frames, info.camera or guessed_camera(info), info.camera is not None)
 
     def _source(self, session_id: int) -> FrameSource:
         if session_id not in self._sources:
@@ -71,16 +66,3 @@ class RgbdJointReconstructor:
             return []
         read = source.read(wanted[0], wanted[-1] + 1)
         return [f for f in read if isinstance(f, Frame) and f.index in set(indices)]
-
-
-def _part(made: Reconstruction, which: slice) -> Reconstruction:
-    """Return some of the frames."""
-    return replace(
-        made,
-        frame_indices=made.frame_indices[which],
-        posed=made.posed[which],
-        T_chunk_cam=made.T_chunk_cam[which],
-        depth=made.depth[which],
-        confidence=made.confidence[which],
-        keyframes=np.zeros(0, np.int64),
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,10 @@ from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.common import JsonOption, spread
 from list3r.cli.terminal import say
+from list3r.memory.errors import OptionError
+
+if TYPE_CHECKING:
+    from list3r.reconstruction.outputs.base import OutputOptions
 
 
 def register(app: typer.Typer) -> None:
@@ -30,6 +34,14 @@ def convert(
             "--to", metavar="LAYOUT", help="tum, transforms, colmap, replica, r3d; of predictions: precomputed."
         ),
     ],
+    frame_size: Annotated[
+        str | None,
+        typer.Option("--frame-size", metavar="WxH", help="Of predictions: size of the video's frames, where cut."),
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option("--masks", metavar="DIR", help="Of predictions: things, as EntitySAM saves them."),
+    ] = None,
     words: src.SourceWords,
     json: JsonOption = False,
 ) -> None:
@@ -38,7 +50,10 @@ def convert(
     Example: list3r convert walk.r3d walk-tum --to tum
     """
     if to == "precomputed":
-        _convert_predictions(Path(source), folder, words.every, json)
+        from list3r.reconstruction.outputs.base import OutputOptions
+
+        options = OutputOptions(words.every, None if frame_size is None else read_size(frame_size), masks)
+        _convert_predictions(Path(source), folder, options, json)
         return
     from list3r.frames.convert import convert as write
 
@@ -52,11 +67,19 @@ def convert(
     say(*(f"note: {line}" for line in report.notes))
 
 
-def _convert_predictions(source: Path, folder: Path, every: int, json: bool) -> None:
-    """Bring what VGGT or DA3 saved to the layout that `--reconstruction precomputed` reads."""
-    from list3r.reconstruction.predictions import convert_predictions
+def read_size(text: str) -> tuple[int, int]:
+    """Return height and width of `WxH`. Raises `OptionError`."""
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise OptionError(f"--frame-size {text}: give width and height in pixels, such as 1920x1080")
+    return int(height), int(width)
 
-    frames = convert_predictions(source, folder, every)
+
+def _convert_predictions(source: Path, folder: Path, options: OutputOptions, json: bool) -> None:
+    """Bring what a network's own program saved to the layout that `--reconstruction precomputed` reads."""
+    from list3r.reconstruction.outputs.registry import convert_predictions
+
+    frames = convert_predictions(source, folder, options)
     if json:
         print_answer([{"layout": "precomputed", "path": str(folder), "frames": frames}])
     else:

@@ -29,7 +29,7 @@ from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibr
 from list3r.models.cache import locate
 from list3r.models.device import memory_said
 from list3r.pipeline.settings import BuildSettings
-from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor
+from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
@@ -288,16 +288,24 @@ def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
 
 
 def joint_model(task: ChunkTask) -> Reconstructor:
-    """Return what reconstructs joint windows of frames of two places in the way of the chunks.
+    """Return what reconstructs joint windows of frames of two places in the way of the chunks."""
+    known = _source(task.path, task.options).info.camera is not None
+    return _JointModel(replace(task.settings, poses="estimate"), known)
 
-    A network is loaded when the first window is asked for.
-    """
-    free, known = replace(task.settings, poses="estimate"), _source(task.path, task.options).info.camera is not None
 
-    def reconstruct(frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        return _model(free, known)(frames, camera)
+class _JointModel:
+    """A `JointModel` that is made when the first window is asked for."""
 
-    return reconstruct
+    def __init__(self, settings: BuildSettings, camera_known: bool) -> None:
+        self._settings, self._camera_known = settings, camera_known
+
+    def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
+        """Reconstruct a chunk."""
+        return _model(self._settings, self._camera_known)(frames, camera)
+
+    def joint(self, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
+        """Reconstruct all sides in one gauge."""
+        return reconstruct_jointly(_model(self._settings, self._camera_known), sides)
 
 
 @lru_cache(maxsize=2)

@@ -19,14 +19,14 @@ import numpy as np
 
 from list3r.models.images import normalised
 from list3r.models.upstream import load_upstream
-from list3r.reconstruction.networks.feedforward import (
+from list3r.reconstruction.feedforward.network import (
     FeedforwardReconstructor,
     Network,
-    PictureSize,
     numpy,
     sigmoid_of_expp1,
 )
-from list3r.reconstruction.networks.output import WindowOutput
+from list3r.reconstruction.feedforward.output import WindowOutput
+from list3r.reconstruction.feedforward.pictures import TabledSize
 from list3r.reconstruction.registry import ModelOptions
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ def _backbones_of_the_package() -> Iterator[None]:
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
     """See `feedforward.Answer`."""
     views: list[dict[str, Any]] = [
-        {"img": p[None], "data_norm_type": ["dinov2"]} | ({} if K is None else {"intrinsics": K[None]})
-        for p in normalised(pictures)
+        {"img": p[None], "data_norm_type": ["dinov2"]} | ({} if K is None else {"intrinsics": K[n][None]})
+        for n, p in enumerate(normalised(pictures))
     ]
     cuda = pictures.is_cuda
     said = model.infer(
@@ -87,7 +87,22 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
         depth=np.stack([numpy(view["depth_z"][0, ..., 0]) for view in said]).astype(np.float32),
         confidence=np.where(solid, confidence, np.float32(0)),
         focal=K_found[:, [0, 1], [0, 1]],
+        principal=K_found[:, :2, 2],
     )
 
 
-NETWORK = Network("mapanything", "mapanything.models", "MapAnything", PictureSize(longest=518), answer, load)
+SHAPES = (
+    (1.000, 518, 518),
+    (1.321, 518, 392),
+    (1.542, 518, 336),
+    (1.762, 518, 294),
+    (2.056, 518, 252),
+    (3.083, 518, 168),
+    (0.757, 392, 518),
+    (0.649, 336, 518),
+    (0.567, 294, 518),
+    (0.486, 252, 518),
+)
+"""The shapes of pictures that it was trained with: width by height, width and height, px."""
+
+NETWORK = Network("mapanything", "mapanything.models", "MapAnything", TabledSize(SHAPES), answer, load)

@@ -3,7 +3,7 @@
 Pictures (1, n, 3, h, w) in [0, 1], sides multiples of 14, at most 255,000 pixels, aspect ratio kept: a square picture
 changes the camera that the network sees. Out come `local_points` (1, n, h, w, 3) in each camera, `conf` as logits and
 `camera_poses`, camera to world with OpenCV axes. There is no frame of reference (the first pose is not the identity),
-no scale (pi3x: about metres, which is not relied on), and no intrinsics: the focal length follows from the points.
+no scale (pi3x: about metres, which is not relied on), and no intrinsics: they follow from the points.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from list3r.reconstruction.networks.feedforward import FeedforwardReconstructor, Network, PictureSize, numpy
-from list3r.reconstruction.networks.output import WindowOutput, focal_from_points
+from list3r.reconstruction.feedforward.network import FeedforwardReconstructor, Network, numpy
+from list3r.reconstruction.feedforward.output import WindowOutput
+from list3r.reconstruction.feedforward.pictures import PictureSize
+from list3r.reconstruction.feedforward.points import from_points
 from list3r.reconstruction.registry import ModelOptions
 
 if TYPE_CHECKING:
@@ -39,12 +41,7 @@ def read(output: dict[str, torch.Tensor]) -> WindowOutput:
 
     points = numpy(output["local_points"][0])
     confidence = numpy(torch.sigmoid(output["conf"][0, ..., 0].float()))
-    return WindowOutput(
-        T_window_cam=numpy(output["camera_poses"][0]).astype(np.float64),
-        depth=points[..., 2].astype(np.float32),
-        confidence=confidence.astype(np.float32),
-        focal=np.stack([focal_from_points(p, c) for p, c in zip(points, confidence, strict=True)]),
-    )
+    return from_points(numpy(output["camera_poses"][0]).astype(np.float64), points, confidence)
 
 
 NETWORK = Network("pi3", "pi3.models.pi3", "Pi3", PictureSize(max_pixels=PIXEL_LIMIT), answer)

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from list3r.models.upstream import load_upstream
-from list3r.reconstruction.networks.feedforward import FeedforwardReconstructor, Network, PictureSize
-from list3r.reconstruction.networks.output import WindowOutput
+from list3r.reconstruction.feedforward.network import FeedforwardReconstructor, Network
+from list3r.reconstruction.feedforward.output import WindowOutput
+from list3r.reconstruction.feedforward.pictures import PictureSize
 from list3r.reconstruction.networks.pi3 import PIXEL_LIMIT, read
 from list3r.reconstruction.registry import ModelOptions
 
@@ -58,10 +59,9 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
     if K is None:
         return read(model(imgs=pictures[None], with_prior=False))
     told = K.clone()
-    told[:2, 2] += 0.5
+    told[:, :2, 2] += 0.5
     everywhere = pictures.new_ones((1, len(pictures))).bool()
-    told = told.expand(1, len(pictures), 3, 3)
-    return read(model(imgs=pictures[None], intrinsics=told, mask_add_ray=everywhere))
+    return read(model(imgs=pictures[None], intrinsics=told[None], mask_add_ray=everywhere))
 
 
 NETWORK = Network("pi3x", "pi3.models.pi3x", "Pi3X", PictureSize(max_pixels=PIXEL_LIMIT), answer, load)

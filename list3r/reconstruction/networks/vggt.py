@@ -1,9 +1,10 @@
 """Reconstruction `vggt` (Wang et al., "VGGT: Visual Geometry Grounded Transformer", CVPR 2025).
 
-Pictures (1, n, 3, h, w) in [0, 1], the longer side 518. Out come `depth` (1, n, h, w, 1), `depth_conf` = 1 + exp(x),
-and `pose_enc` (1, n, 9): translation and quaternion (xyzw) of the camera *from* world pose with OpenCV axes, then the
-vertical and the horizontal field of view in radians. The first camera is the frame of reference; there is no scale.
-The heads for world points and for tracks are not needed.
+Pictures (1, n, 3, h, w) in [0, 1], the longer side 518, bicubic; what is taller than wide is filled up with white to
+a square, one of the two things that its loader does (the other cuts off top and bottom). Out come `depth` (1, n, h,
+w, 1), `depth_conf` = 1 + exp(x), and `pose_enc` (1, n, 9): translation and quaternion (xyzw) of the camera *from*
+world pose with OpenCV axes, then the vertical and the horizontal field of view in radians. The first camera is the
+frame of reference; there is no scale. The heads for world points and for tracks are not needed.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from list3r.models.upstream import load_upstream
-from list3r.reconstruction.networks.feedforward import (
+from list3r.reconstruction.feedforward.network import (
     FeedforwardReconstructor,
     Network,
-    PictureSize,
     inverted,
     numpy,
     sigmoid_of_expp1,
 )
-from list3r.reconstruction.networks.output import WindowOutput
+from list3r.reconstruction.feedforward.output import WindowOutput, middles
+from list3r.reconstruction.feedforward.pictures import PaddedSize
 from list3r.reconstruction.registry import ModelOptions
 
 if TYPE_CHECKING:
@@ -46,15 +47,17 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
     """See `feedforward.Answer`; the network cannot be told the intrinsics."""
     output = model(pictures[None])
     T_cam_world, focal = decode_poses(numpy(output["pose_enc"][0]), *pictures.shape[-2:])
+    depth = numpy(output["depth"][0, ..., 0]).astype(np.float32)
     return WindowOutput(
         T_window_cam=inverted(T_cam_world),
-        depth=numpy(output["depth"][0, ..., 0]).astype(np.float32),
+        depth=depth,
         confidence=sigmoid_of_expp1(numpy(output["depth_conf"][0])),
         focal=focal,
+        principal=middles(depth),
     )
 
 
-NETWORK = Network("vggt", "vggt.models.vggt", "VGGT", PictureSize(longest=518), answer, load)
+NETWORK = Network("vggt", "vggt.models.vggt", "VGGT", PaddedSize(longest=518), answer, load)
 
 
 def decode_poses(encoding: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
