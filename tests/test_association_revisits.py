@@ -222,6 +222,8 @@ def test_candidates_keep_their_distance_and_their_quota() -> None:
     assert sum(c.u == 0 for c in found) == 1
     assert sum(c.u == 1 for c in found) <= SearchSettings().per_pair
     assert all(a.cosine >= b.cosine for a, b in itertools.pairwise(found))
+    again = choose(new, stored, cosine, TRAINED, SearchSettings(), {1})
+    assert sum(c.u == 1 for c in again) == SearchSettings().per_pair_of_sessions
 
 
 def test_cosines_are_put_on_one_scale() -> None:

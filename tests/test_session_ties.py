@@ -41,6 +41,13 @@ def test_two_that_agree_do_and_release_what_was_held() -> None:
     assert out[3].reason == "measured"
 
 
+@pytest.mark.parametrize(("frames", "placed"), [((30, 45), True), ((30, 4), False), ((3, 45), False)])
+def test_two_of_the_same_chunks_count_when_their_frames_lie_apart(frames: tuple[int, int], placed: bool) -> None:
+    one, two = replace(_edge(1, 3), frames=(2, 5)), replace(_edge(1, 3, off_m=0.05), frames=frames)
+    assert _accepted([*INSIDE, one, two])[3:] == [placed, placed]
+    assert _accepted([*INSIDE, one, replace(two, S_v_u=_edge(1, 3, off_m=2.0).S_v_u)])[3:] == [False, False]
+
+
 def test_two_that_disagree_do_not() -> None:
     assert _accepted([*INSIDE, _edge(1, 3), _edge(2, 4, off_m=3.0)]) == [True] * 3 + [False] * 2
 

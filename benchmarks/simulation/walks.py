@@ -98,6 +98,30 @@ class SeenAgainWalk(WalkSettings):
         return min(self.before, len(_take(self.preset, self.seed).poses[0]))
 
 
+@dataclass(frozen=True)
+class HomeSessionWalk(WalkSettings):
+    """One of two sessions in a room of a home, between which half of what can be moved was (`moved` of `returns`).
+
+    `seed` decides the home and both ways; `path` and `walk_seed` are left aside.
+    """
+
+    second: bool = False
+    """The later session: near the same places, after the change."""
+    longest: int = 80
+    """The first session is the last so many frames of its run; the second the first so many of its own."""
+
+    def world(self) -> SimulatedWorld:
+        """The world of the home as it is in this session."""
+        take, later = film_return("moved", self.seed)
+        return later if self.second and later is not None else take.building.world
+
+    def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Seconds (F,) and T_world_cam (F, 4, 4) of the frames to be written."""
+        take = _take("moved", self.seed)
+        poses = take.poses[1][: self.longest] if self.second else take.poses[0][-self.longest :]
+        return np.arange(len(poses)) / take.path.fps, poses
+
+
 @lru_cache(maxsize=2)
 def _take(preset: str, seed: int) -> Take:
     return film_return(preset, seed)[0]

@@ -20,6 +20,7 @@ from list3r.memory.errors import ExportError, OptionError
 from list3r.pipeline.workers import OrderedPool
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
+from list3r.simulation.rendering.shading import Lighting
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.things import MovingThing
 from list3r.simulation.worlds.truth import world_truth
@@ -47,6 +48,7 @@ class WalkSettings:
     """Focal length, px; None takes the first Kinect's 525 at 640 px."""
     path: PathSettings = field(default_factory=PathSettings)
     sensor: SensorSettings = field(default_factory=SensorSettings)
+    lighting: Lighting = field(default_factory=Lighting)
     write_ids: bool = False
     """Also write `ids/`: the id of the thing in every pixel, 16 bit."""
 
@@ -133,7 +135,8 @@ class _Writer:
         self._settings, self._root = settings, root
         self._time_s, self._poses = settings.poses()
         self._movers = settings.movers()
-        self._renderer = Renderer(settings.world(), settings.camera(), [m.thing for m in self._movers])
+        things = [m.thing for m in self._movers]
+        self._renderer = Renderer(settings.world(), settings.camera(), things, settings.lighting)
         self._seed = settings.seed if settings.walk_seed is None else settings.walk_seed
 
     def write_span(self, span: tuple[int, int]) -> list[dict[int, int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -56,6 +56,8 @@ class SearchSettings:
     """Most candidates of a new chunk."""
     per_pair: int = 2
     """Most candidates between two chunks."""
+    per_pair_of_sessions: int = 6
+    """The same of chunks of two sessions: a short session has few chunks, and what places it must be found twice."""
 
 
 @dataclass(frozen=True)
@@ -132,16 +134,23 @@ def find_candidates(store: Store, chunk_id: int, settings: SearchSettings | None
     near = same_video & (np.abs(index.keys[stored, 1] - own_keys[new, 1]) <= chosen.exclude_frames)
     scale = CLASSICAL.get(own.shape[1], TRAINED)
     keep = (stored >= 0) & (cosine >= scale.relaxed) & ~near
-    return choose(own_keys[new[keep], 1], index.keys[stored[keep]], cosine[keep], scale, chosen)
+    later = {k for k in allowed_chunks if rows[k].session_id != rows[chunk_id].session_id}
+    return choose(own_keys[new[keep], 1], index.keys[stored[keep]], cosine[keep], scale, chosen, later)
 
 
 def choose(
-    frame_v: Ints, stored: Ints, cosine: Floats, scale: DescriptorScale, settings: SearchSettings
+    frame_v: Ints,
+    stored: Ints,
+    cosine: Floats,
+    scale: DescriptorScale,
+    settings: SearchSettings,
+    other_sessions: Collection[int] = (),
 ) -> list[Candidate]:
     """Return the mutual nearest neighbours between pairs of chunks, thinned out in time, with a quota for each pair of
     chunks.
 
     `frame_v` (P,) is Frame.index in the new chunk, `stored` (P, 2) chunk id and Frame.index, `cosine` (P,).
+    `other_sessions` are the chunks of other sessions than the new one's.
     """
     best_new: dict[tuple[int, int], float] = {}
     best_old: dict[tuple[int, int], float] = {}
@@ -155,9 +164,8 @@ def choose(
             continue
         same = [k for k in out if k.u == chunk]
         near = settings.suppress_frames
-        if len(same) >= settings.per_pair or any(
-            abs(k.frame_v - f) <= near and abs(k.frame_u - frame) <= near for k in same
-        ):
+        most = settings.per_pair_of_sessions if chunk in other_sessions else settings.per_pair
+        if len(same) >= most or any(abs(k.frame_v - f) <= near and abs(k.frame_u - frame) <= near for k in same):
             continue
         out.append(Candidate(chunk, frame, f, c, scale.score(c)))
         if len(out) == settings.per_chunk:

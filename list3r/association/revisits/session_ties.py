@@ -1,5 +1,7 @@
 """Decide whether a session is placed in the world of another: by two relations that agree, or by one beyond doubt.
 
+Two relations are of two pairs of chunks, or of frames far apart on both sides.
+
 Within one video neighbouring chunks share frames, and a false loop is caught by the chain. Nothing catches a false
 relation that alone ties one session to another: the whole session would land on top of the old world in a wrong place.
 Such a relation is held back, which is said in its reason, until another agrees with it or a later session connects the
@@ -31,6 +33,8 @@ class TieSettings:
     """turned by at most this,"""
     agree_scale: float = 1.15
     """and of scales in at most this ratio: what the chunks between them may have drifted."""
+    apart_frames: int = 10
+    """Relations of the same two chunks are two when their frames are so far apart on both sides."""
     sure_features: int = 60
     """One relation is beyond doubt when so many features agree on it,"""
     sure_overlap: float = 0.6
@@ -108,8 +112,16 @@ def _best(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -
 
 
 def _agreeing(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -> list[int]:
-    """Return with how many relations of other pairs of chunks each one agrees, itself counted."""
-    return [1 + len({(f.u, f.v) for f in found if _agree(e, f, blocks, unit, s)} - {(e.u, e.v)}) for e in found]
+    """Return with how many relations of other chunks, or of other frames of its own chunks, each agrees; itself too."""
+    return [1 + len({(f.u, f.v) for f in found if _other(e, f, s) and _agree(e, f, blocks, unit, s)}) for e in found]
+
+
+def _other(e: Edge, f: Edge, s: TieSettings) -> bool:
+    """Tell whether a relation is one more than another."""
+    if (e.u, e.v) != (f.u, f.v):
+        return True
+    ends = zip(e.frames or (0, 0), f.frames or (0, 0), strict=True)
+    return min(abs(a - b) for a, b in ends) >= s.apart_frames
 
 
 def _agree(e: Edge, f: Edge, blocks: _Blocks, unit: float, s: TieSettings) -> bool:

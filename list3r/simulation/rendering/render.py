@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.simulation.rendering.projection import NEAR_M, SolidScene, screen_rectangles
-from list3r.simulation.rendering.shading import ContactShadows, TextureAtlas, illumination, surface
+from list3r.simulation.rendering.shading import ContactShadows, Lighting, TextureAtlas, illumination, surface
 from list3r.simulation.worlds.things import BOX, CYLINDER, SimulatedThing, stack_solids
 from list3r.simulation.worlds.world import SimulatedWorld
 
@@ -41,8 +41,14 @@ class Renderer:
     Things in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
     """
 
-    def __init__(self, world: SimulatedWorld, camera: Camera, moving: Sequence[SimulatedThing] = ()) -> None:
-        self._world = world
+    def __init__(
+        self,
+        world: SimulatedWorld,
+        camera: Camera,
+        moving: Sequence[SimulatedThing] = (),
+        lighting: Lighting | None = None,
+    ) -> None:
+        self._world, self._lighting = world, lighting or Lighting()
         self._camera = camera
         self.scene = SolidScene(world.things, moving)
         self._solids = self.scene.solids
@@ -79,8 +85,9 @@ class Renderer:
         cosine = np.einsum("nk,nk->n", normals, toward)
         footprint = z / np.float32(self._camera.fx) / np.sqrt(np.maximum(cosine, 0.05))
         albedo = self._atlas.sample(self._solids.material[solid], u, v, footprint)
-        light = illumination(self._world, points, normals) * self._shadows.factor(points, normals[:, 2] > 0.9)
-        return np.minimum(albedo * light[:, None], 255), cosine
+        shade = self._shadows.factor(points, normals[:, 2] > 0.9)
+        light = illumination(self._world, points, normals, self._lighting) * shade[:, None]
+        return np.minimum(albedo * light, 255), cosine
 
     def _cast(self, T_world_cam: Array, nearest: Array, rects: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
         """Depth (inf where nothing is hit) and number of the nearest solid (-1 for none) of every pixel."""

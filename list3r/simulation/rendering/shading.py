@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,24 @@ from list3r.simulation.worlds.things import BOX, Solids
 from list3r.simulation.worlds.world import HEIGHT_M, SimulatedWorld
 
 Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """What lights the rooms."""
+
+    sky: float = 0.5
+    """Light from everywhere, such as by day through windows."""
+    lamp: float = 0.75
+    """Light of each lamp at its foot."""
+    aside: float = 0.0
+    """How far lamps hang from the middle of their room toward a corner, as a share of the way."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors of red, green and blue."""
+
+
+EVENING = Lighting(sky=0.16, lamp=0.85, aside=0.6, tint=(1.0, 0.86, 0.66))
+"""Dim from outside, a warm lamp near a corner."""
 
 _CELL_M = 0.02
 _MARGIN_M = 0.3
@@ -137,25 +157,25 @@ def surface(solids: Solids, solid: NDArray[np.int64], points: Floats, toward: Fl
     return world.astype(np.float32), u.astype(np.float32), v.astype(np.float32)
 
 
-def _lamps(room: Room) -> list[Floats]:
-    """One lamp in the middle of a room, several in a row where it is long."""
+def _lamps(room: Room, aside: float) -> list[Floats]:
+    """One lamp in the middle of a room or to the side of it, several in a row where it is long."""
     count = max(1, round((room.x1 - room.x0) / _LAMP_M))
-    share = (np.arange(count) + 0.5) / count
-    y, z = room.y0 + room.depth / 2, HEIGHT_M - 0.15
+    share = (np.arange(count) + 0.5 * (1 + aside)) / count
+    y, z = room.y0 + room.depth / 2 * (1 + aside), HEIGHT_M - 0.15
     return [np.array([room.x0 + s * (room.x1 - room.x0), y, z], np.float32) for s in share]
 
 
-def illumination(world: SimulatedWorld, points: Floats, normals: Floats) -> Floats:
-    """Light on surface points: sky from above, lamps under each ceiling, gloom near the skirting. Shape (N,)."""
-    light = 0.50 + 0.12 * normals[:, 2]
-    for room, lamp in [(r, each) for r in world.rooms for each in _lamps(r)]:
+def illumination(world: SimulatedWorld, points: Floats, normals: Floats, lighting: Lighting) -> Floats:
+    """Light on surface points: sky from above, lamps under each ceiling, gloom near the skirting. Shape (N, 3)."""
+    light = np.float32(lighting.sky) + np.float32(0.24 * lighting.sky) * normals[:, 2]
+    for room, lamp in [(r, each) for r in world.rooms for each in _lamps(r, lighting.aside)]:
         inside = (points[:, 0] > room.x0 - 0.06) & (points[:, 0] < room.x1 + 0.06)
         inside &= (points[:, 1] > room.y0 - 0.06) & (points[:, 1] < room.y0 + room.depth + 0.06)
         ray = lamp - points
         distance = np.linalg.norm(ray, axis=1)
         cosine = np.einsum("nk,nk->n", ray, normals) / np.maximum(distance, 1e-3)
         wrapped = np.maximum((cosine + 0.25) / 1.25, 0.0)
-        light += np.where(inside, 1.0, 0.15) * wrapped * 0.75 / (1 + (distance / 2.6) ** 2)
+        light += np.where(inside, 1.0, 0.15) * wrapped * lighting.lamp / (1 + (distance / 2.6) ** 2)
     upright = np.abs(normals[:, 2]) < 0.5
     gloom = 1 - 0.22 * np.exp(-np.maximum(points[:, 2], 0) / 0.12) * upright
-    return np.asarray(light * gloom, dtype=np.float32)
+    return np.asarray((light * gloom)[:, None] * np.array(lighting.tint), dtype=np.float32)

@@ -1,0 +1,127 @@
+"""Second sessions after heavy change: is the later session placed in the home of the earlier one?
+
+python benchmarks/changed_homes.py --seeds 401-420 --keep FOLDER --json benchmarks/results/changed-homes.json
+
+A room of a home is filmed with a sensor's depth, 320 x 240 (`HomeSessionWalk`). Then half of what stands on its floor
+or on its furniture is put elsewhere in the room, the light changes (`EVENING`), and the room is filmed again from
+near the same places. `list3r build` makes a memory of the first walk, `list3r update` adds the second. A session
+counts as placed where all its chunks lie in the world of the first and its cameras are off by at most 0.1 m and 3
+degrees (medians) when the world is laid on the truth by the cameras of the first session alone, turned by their mean
+rotation. What stands in the JSON already is not done again, and walks and memories in --keep are used as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import machine, run_list3r, write_json
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.simulation.walks import HomeSessionWalk
+from list3r.evaluation.trajectory import Trajectory, associate, read_tum
+from list3r.memory.geometry import Sim3
+from list3r.memory.store.store import Store
+from list3r.simulation.dataset import write_walk
+from list3r.simulation.rendering.shading import EVENING
+
+Array = NDArray[np.float64]
+MOST_M, MOST_DEG = 0.1, 3.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="401-420", help="first-last")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
+    words = parser.parse_args()
+    first, last = (int(n) for n in words.seeds.split("-"))
+    rows = json.loads(words.json.read_text())["homes"] if words.json and words.json.exists() else []
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed in range(first, last + 1):
+            if any(row["seed"] == seed for row in rows):
+                continue
+            rows.append({"seed": seed, **one_home((words.keep or Path(scratch)) / str(seed), seed)})
+            print(json.dumps(rows[-1]), flush=True)
+            write_json(words.json, {"homes": rows, "total": total(rows)})
+    print(machine())
+    print(json.dumps(total(rows), indent=1))
+
+
+def one_home(root: Path, seed: int) -> dict[str, Any]:
+    """Film twice, build, update, measure."""
+    walks = {
+        "first": HomeSessionWalk(seed=seed, walk_seed=seed),
+        "second": HomeSessionWalk(seed=seed, walk_seed=seed + 1000, second=True, lighting=EVENING),
+    }
+    for name, walk in walks.items():
+        if not (root / name / "truth.json").exists():
+            shutil.rmtree(root / name, ignore_errors=True)
+            write_walk(root / name, walk)
+    one, two = root / "one.l3r", root / "two.l3r"
+    common = ("--poses", "estimate", "--workers", "1")
+    usage: dict[str, dict[str, float]] = {}
+    if not one.exists():
+        _, usage["build"] = run_list3r("build", str(root / "first"), "-m", str(one), *common)
+    two.unlink(missing_ok=True)
+    shutil.copy(one, two)
+    report, usage["update"] = run_list3r("update", str(two), str(root / "second"), *common)
+    row = {"chunks": report["chunks"], "in_world": report["placed"], "ties": report["ties"], "usage": usage}
+    with Store.open(two) as store:
+        row |= {"loops": _between_sessions(store)}
+        if report["placed"] == report["chunks"]:
+            truth = [read_tum(root / name / "groundtruth.txt") for name in ("first", "second")]
+            off_m, off_deg = offset(*(_pairs(store, k + 1, t) for k, t in enumerate(truth)))
+            row |= {"off_m": round(off_m, 4), "off_deg": round(off_deg, 3)}
+    return row | {"placed": row.get("off_m", np.inf) <= MOST_M and row.get("off_deg", np.inf) <= MOST_DEG}
+
+
+def _pairs(store: Store, session: int, truth: Trajectory) -> tuple[Array, Array]:
+    """Poses of a session in the memory's world and in truth. Shapes (F, 4, 4)."""
+    poses = store.trajectory.poses(session)
+    T = np.array([Sim3(1.0, S.rotation, S.translation).as_matrix() for _, S in poses])
+    rows, at = associate(truth.time_s, np.array([f.time_s for f, _ in poses]), 0.01)
+    return T[at], truth.T_world_cam[rows]
+
+
+def offset(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[float, float]:
+    """Return the medians of metres and degrees by which cameras of the second session lie off.
+
+    Rotations of the first session lay the world on the truth: short ways with little motion leave a turn about them.
+    """
+    R = Rotation.from_matrix([t[:3, :3] @ w[:3, :3].T for w, t in zip(*first, strict=True)]).mean().as_matrix()
+    shift = np.mean([t[:3, 3] - R @ w[:3, 3] for w, t in zip(*first, strict=True)], axis=0)
+    world, truth = second
+    off_m = np.linalg.norm(world[:, :3, 3] @ R.T + shift - truth[:, :3, 3], axis=1)
+    turned = Rotation.from_matrix(R @ world[:, :3, :3]).inv() * Rotation.from_matrix(truth[:, :3, :3])
+    return float(np.median(off_m)), float(np.degrees(np.median(turned.magnitude())))
+
+
+def _between_sessions(store: Store) -> list[dict[str, Any]]:
+    """The candidate relations between the two sessions: what they stand on and what became of them."""
+    session = {c.chunk_id: c.session_id for c in store.chunks.all()}
+    found = [e for e in store.edges.all() if session[e.u] != session[e.v]]
+    return [{"accepted": e.accepted, "reason": e.reason[:160]} for e in found]
+
+
+def total(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many sessions are in their place, and how many in a wrong one."""
+    said = [r for r in rows if r["in_world"] == r["chunks"]]
+    off = [r["off_m"] for r in rows if r["placed"]]
+    return {
+        "homes": len(rows),
+        "placed": sum(r["placed"] for r in rows),
+        "wrong": sum(not r["placed"] for r in said),
+        "median_off_m": float(np.median(off)) if off else None,
+        "worst_off_m": max(off, default=None),
+    }
+
+
+if __name__ == "__main__":
+    main()
