@@ -77,6 +77,7 @@ def main() -> None:
     parser.add_argument("--discovery", default="", help="such as geometric,learned; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
     parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
+    parser.add_argument("--hard", action="store_true", help="... with wider turns, and through door frames")
     parser.add_argument("--frames", type=int, default=150, help="of each such walk")
     parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")
     parser.add_argument("--json", type=Path)

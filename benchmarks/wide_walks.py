@@ -3,20 +3,24 @@
     python benchmarks/colour.py --step 0.08 --seeds 31,32,33,34,35 --real ../shared/data/redkitchen --json FILE
 
 Each simulated walk goes to and fro between two rooms and films them from a new place each time; a frame is kept after
-each step. The real one is every eighth frame of a folder with poses. Both programs get the same pictures and focal
+each step: 8 cm or 4 degrees, whichever comes first (`--hard`: 6 degrees, and the camera touches door frames, as in
+decision 0074). The real one is every eighth frame of a folder with poses. Both programs get the same pictures and focal
 length (plain pycolmap: `benchmarks/sfm.py`). `cpu_s_a_frame` is that of all processes of the program; with two idle
-cores a frame takes half of it or little more.
+cores a frame takes half of it or little more. In `--keep` what each program made of a walk is noted, ours by its
+commit, and not made again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import machine, write_json
+from machine import STARTED_AT, machine, write_json
 from sfm import built, colour_only, plain_pycolmap, read_truth
 
 from benchmarks.simulation.wide_steps import WideStepWalk
@@ -24,6 +28,7 @@ from list3r.evaluation.trajectory import Trajectory, read_tum
 from list3r.simulation.dataset import write_walk
 
 SIZE = (540, 360)
+HARD = {"step_deg": 6.0, "clear_m": 0.0}
 REAL_EVERY = 8
 REAL_INTRINSICS = "525,525,320,240"
 """Of the colour camera of 7-Scenes."""
@@ -35,8 +40,11 @@ def compare_walks(words: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         root = words.keep or Path(scratch)
         for seed in [int(word) for word in words.seeds.split(",") if word]:
-            walk = WideStepWalk(seed=seed, frames=words.frames, size=SIZE, step_m=words.step)
-            rows.append({"walk": f"seed {seed}", **_simulated(root / f"wide-{seed}", walk, words)})
+            walk = WideStepWalk(
+                seed=seed, frames=words.frames, size=SIZE, step_m=words.step, **(HARD if words.hard else {})
+            )
+            folder = root / f"{'hard' if words.hard else 'wide'}-{seed}-{words.frames}"
+            rows.append({"walk": f"seed {seed}", **_simulated(folder, walk, words)})
             _tell(rows, words)
         if words.real is not None:
             rows.append({"walk": f"{words.real.name}, every {REAL_EVERY}th", **_real(root / "wide-real", words)})
@@ -46,7 +54,8 @@ def compare_walks(words: argparse.Namespace) -> None:
 
 def _tell(rows: list[dict[str, Any]], words: argparse.Namespace) -> None:
     print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-    write_json(words.json, {"step_m": words.step, "frames": words.frames, "size": SIZE, "walks": rows})
+    said = {"step_m": words.step, "hard": words.hard, "frames": words.frames, "size": SIZE}
+    write_json(words.json, {**said, "walks": rows})
 
 
 def _simulated(folder: Path, walk: WideStepWalk, words: argparse.Namespace) -> dict[str, Any]:
@@ -76,8 +85,8 @@ def _compared(
         memory = folder / "memory.l3r"
         folder.mkdir(parents=True, exist_ok=True)
         options = ["--force", "--workers", str(words.workers), "--intrinsics", intrinsics]
-        ours = built(pictures, memory, options, truth)
-        plain = plain_pycolmap(pictures, Path(scratch), intrinsics, truth)
+        plain = _noted(folder / "plain.json", lambda: plain_pycolmap(pictures, Path(scratch), intrinsics, truth))
+        ours = _noted(folder / f"ours-{STARTED_AT}.json", lambda: built(pictures, memory, options, truth))
     ours["cpu_s_a_frame"] = round(ours["cpu_s"] / len(names), 3)
     return {
         "path_m": round(path_m, 2),
@@ -86,3 +95,10 @@ def _compared(
         "list3r": ours,
         "pycolmap": plain,
     }
+
+
+def _noted(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what a file holds, or what is made and then written there."""
+    if not path.exists():
+        path.write_text(json.dumps(make()))
+    return dict(json.loads(path.read_text()))

@@ -5,20 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from list3r.association.overlap.camera_edge import camera_edge, in_one_frame, one_frame_edge
 from list3r.association.whole_map.drift import spread_drift
+from list3r.association.whole_map.joining import join_maps
 from list3r.association.whole_map.revisits import Revisit, find_revisits
-from list3r.association.whole_map.settings import DriftSettings, RevisitPairSettings
+from list3r.association.whole_map.settings import DriftSettings, JoiningSettings, RevisitPairSettings
 from list3r.association.whole_map.views import MapView, shared_views
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.records import FrameSamples
 from list3r.reconstruction.sfm.adjustment import adjust
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures
-from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, shared_rows
-from list3r.reconstruction.sfm.settings import AdjustmentSettings
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, shared_rows
+from list3r.reconstruction.sfm.settings import AdjustmentSettings, MappingSettings
+from list3r.reconstruction.sfm.two_view import verified_rows
 
 Array = NDArray[np.float64]
 
@@ -132,3 +135,44 @@ def test_chunks_with_equal_poses_of_shared_frames_lie_in_one_frame() -> None:
     assert one_frame_edge(u, moved, 1, 2) is None
     measured = camera_edge(u, moved, 1, 2)
     assert measured is None or not in_one_frame(measured)
+
+
+def ring_problem(poses: Array) -> tuple[MapProblem, dict[int, LocalFeatures]]:
+    """What the cameras of a ring see as features, and all pairs of them."""
+    told = [(k, *seen(T)[:2]) for k, T in enumerate(poses)]
+    keyframes = {k: KeyframeView(ids, xy.astype(np.float32)) for k, ids, xy in told}
+    features = {k: LocalFeatures(xy.astype(np.float32), LOOKS[ids], 0.85) for k, ids, xy in told}
+    pairs = {(a, b): shared_rows(keyframes[a], keyframes[b]) for a in range(COUNT) for b in range(a + 1, COUNT)}
+    return MapProblem(keyframes, {pair: rows for pair, rows in pairs.items() if len(rows) >= 20}), features
+
+
+def part_of(problem: MapProblem, keys: range, S: Sim3) -> SparseMap:
+    """A map of some cameras of the ring in a frame of reference and scale of its own."""
+    poses = {}
+    for k in keys:
+        placed = S @ Sim3.from_matrix(ring()[k])
+        poses[k] = Sim3(np.ones(()), placed.rotation, placed.translation).as_matrix()
+    held = {k: problem.views[k] for k in keys}
+    points = {n: S.apply(POINTS[n]) for view in held.values() for n in view.ids.tolist()}
+    return SparseMap(poses, points, CAMERA, seen=held)
+
+
+@pytest.mark.parametrize("first", [12, 11, 9])
+def test_maps_of_parts_are_joined_whether_or_not_they_share_keyframes(first: int) -> None:
+    problem, features = ring_problem(ring())
+    S = Sim3.exp(np.array([0.4, -0.2, 0.1, 0.3, 0.2, -0.5, 0.4]))
+    maps = [part_of(problem, range(12), Sim3.identity()), part_of(problem, range(first, COUNT), S)]
+    joined = join_maps(maps, problem, features, CAMERA, (JoiningSettings(), RevisitPairSettings()))
+    assert sorted(joined.T_map_cam) == list(range(COUNT))
+    assert error(np.stack([joined.T_map_cam[k] for k in range(COUNT)]), ring()) < 0.01
+    assert all(set(view.ids.tolist()) <= joined.points.keys() for view in joined.seen.values())
+
+
+def test_matches_that_agree_are_verified_and_others_are_not() -> None:
+    problem, _ = ring_problem(ring())
+    (a, b), rows = next(iter(problem.pairs.items()))
+    wrong = rows.copy()
+    wrong[::4, 1] = np.roll(wrong[::4, 1], 1)
+    kept = verified_rows(replace(problem, pairs={(a, b): wrong}), CAMERA, MappingSettings())[a, b]
+    right = (kept[:, None] == rows[None]).all(axis=2).any(axis=1)
+    assert len(kept) >= 0.7 * len(rows) and right.mean() > 0.95

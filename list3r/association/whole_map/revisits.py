@@ -58,7 +58,11 @@ def find_revisits(
     out, common = [], {}
     for a, b in candidate_pairs(views, camera, settings):
         rows = match_features(views[a].features, views[b].features)
-        found = relation(views[a], views[b], rows, camera, settings)
+        if len(rows) < settings.least_matches:
+            continue
+        at_a, at_b = rows.T
+        sides = views[a].points_cam[at_a], views[b].features.xy[at_b], views[b].points_cam[at_b]
+        found = relation(*sides, camera, settings)
         if found is not None and _fits(found.S_b_a, views[a], views[b], (b - a, float(way[b] - way[a])), settings):
             out.append(Revisit(a, b, found.S_b_a, found.inliers))
             common[a, b] = rows
@@ -76,16 +80,20 @@ class ViewRelation:
     tells_scale: bool
 
 
-def relation(a: MapView, b: MapView, rows: Rows, camera: Camera, settings: RevisitPairSettings) -> ViewRelation | None:
-    """Return the relation of two views from points of a and where b sees them, `rows` (M, 2) of features."""
-    rows = rows[np.isfinite(a.points_cam[rows[:, 0], 0])] if len(rows) >= settings.least_matches else rows[:0]
-    points = a.points_cam[rows[:, 0]]
-    found = pose_of(b.features.xy[rows[:, 1]], points, camera, None, settings.pose)
+def relation(
+    points_a: Array, xy_b: NDArray[np.float32], points_b: Array, camera: Camera, settings: RevisitPairSettings
+) -> ViewRelation | None:
+    """Return the relation of two views from points of a, (M, 3) in its camera coordinates, where b sees them, (M, 2),
+    and where b's map has them, (M, 3) in b's; NaN where unknown.
+    """
+    known = np.isfinite(points_a[:, 0])
+    points, xy_b, points_b = points_a[known], xy_b[known], points_b[known]
+    found = pose_of(xy_b, points, camera, None, settings.pose)
     if found is None:
         return None
     T_b_a, agree = np.asarray(np.linalg.inv(found[0]), np.float64), found[1]
     there = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    own = b.points_cam[rows[:, 1], 2]
+    own = points_b[:, 2]
     both = agree & np.isfinite(own) & (own > 0) & (there[:, 2] > 0)
     tells = bool(both.sum() >= settings.tells_scale)
     scale = float(np.exp(np.median(np.log(own[both] / there[both, 2])))) if tells else 1.0

@@ -24,6 +24,7 @@ from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, make_find
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps, shared_rows
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
+from list3r.reconstruction.sfm.two_view import verified_rows
 
 Array = NDArray[np.float64]
 
@@ -47,28 +48,27 @@ def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings:
     finder = make_finder(grays, None, None, settings.features)
     features = {key: finder(key) for key in tracks.keyframes}
     problem = video_problem(tracks, features, settings)
-    maps = build_maps(problem, camera, settings=settings.mapping)
+    verified = verified_rows(problem, camera, settings.mapping)
+    maps = build_maps(problem, camera, settings=settings.mapping, verified=verified)
     if not maps:
         return None
-    first_ids = {key: _first_id(key) for key in features}
-    joined = join_maps(maps, features, first_ids, camera, (settings.joining, settings.revisits))
+    joined = join_maps(maps, problem, features, camera, (settings.joining, settings.revisits))
     if len(joined.T_map_cam) < settings.least_posed * len(tracks.keyframes):
         return None
     found, revisits = _closed(joined, problem, features, camera, settings)
-    segments = fill_segments([found], tracks, grays, sfm.fill)
+    segments = fill_segments([found], tracks, grays, sfm.fill, adjusted=True)
     if not segments or len(segments[0].T_map_cam) < settings.least_posed * len(grays):
         return None
-    return VideoMap(_scaled(segments[0], found.T_map_cam), revisits)
+    return VideoMap(_scaled(segments[0]), revisits)
 
 
-def _scaled(segment: PosedSegment, adjusted: dict[int, Array]) -> dict[int, Array]:
-    """Poses by position, those that were `adjusted` as they are, in a scale in which the middle of all depths is where
-    chunks have it."""
+def _scaled(segment: PosedSegment) -> dict[int, Array]:
+    """Poses by position, in a scale in which the middle of all depths is where chunks have it."""
     depths = np.concatenate([segment.depths(k)[1] for k in sorted(segment.seen)])
     scale = MIDDLE_DEPTH / float(np.median(depths)) if len(depths) else 1.0
     lengths = np.ones((4, 4))
     lengths[:3, 3] = scale
-    return {k: T * lengths for k, T in sorted((segment.T_map_cam | adjusted).items())}
+    return {k: T * lengths for k, T in sorted(segment.T_map_cam.items())}
 
 
 def video_problem(tracks: CornerTracks, features: dict[int, LocalFeatures], settings: VideoMapSettings) -> MapProblem:
@@ -80,9 +80,9 @@ def video_problem(tracks: CornerTracks, features: dict[int, LocalFeatures], sett
         views[key] = KeyframeView(ids, np.concatenate([tracks.xy[key], features[key].xy]).astype(np.float32))
     corners = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     for n, a in enumerate(tracks.keyframes):
-        for step, b in enumerate(tracks.keyframes[n + 1 : n + 1 + settings.followed], start=1):
+        for b in (tracks.keyframes[n + step] for step in settings.ahead if n + step < len(tracks.keyframes)):
             rows = shared_rows(corners[a], corners[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
-            alike = match_features(features[a], features[b]) if step <= settings.ahead else _NO_ROWS
+            alike = match_features(features[a], features[b])
             if len(rows) < settings.least_matches and len(alike) >= settings.least_matches:
                 matched.add((a, b))
             alike = alike if len(alike) >= settings.least_matches else _NO_ROWS
@@ -106,12 +106,10 @@ def _closed(
     camera: Camera,
     settings: VideoMapSettings,
 ) -> tuple[SparseMap, list[tuple[int, int, int]]]:
-    """Return the map with what is seen again closed, and the revisits; as it is where nothing comes back."""
+    """Return the map adjusted, with what is seen again closed, and the revisits."""
     views = [view_of(k, found, features[k], _first_id(k)) for k in sorted(found.T_map_cam)]
     revisits, common = find_revisits(views, camera, settings.revisits)
-    if not revisits:
-        return found, []
-    T_map_cam, believed = spread_drift(views, revisits, settings.drift)
+    T_map_cam, believed = spread_drift(views, revisits, settings.drift) if revisits else (found.T_map_cam, [])
     kept = {k: problem.views[k] for k in T_map_cam}
     pairs = {p: rows for p, rows in problem.pairs.items() if p[0] in kept and p[1] in kept}
     told = {}
@@ -123,13 +121,8 @@ def _closed(
     closed = adjust(wider, camera, T_map_cam, settings.adjustment)
     if closed is None:
         return found, []
-    return _complete(closed, found), [_told(views[r.a].key, views[r.b].key, r) for r in believed]
+    return replace(closed, camera=found.camera), [_told(views[r.a].key, views[r.b].key, r) for r in believed]
 
 
 def _told(a: int, b: int, revisit: Revisit) -> tuple[int, int, int]:
     return a, b, revisit.inliers
-
-
-def _complete(closed: SparseMap, before: SparseMap) -> SparseMap:
-    """Return the adjusted map; what it left out is for the frames between to find again."""
-    return replace(closed, camera=before.camera)

@@ -36,7 +36,7 @@ def adjust(
     distortion is free, so that it does not bend the map.
     """
     gate = settings.gates_px[0] * pixel_unit(camera)
-    cache = correspondences(problem, camera, "k1", settings.mapping, _agreeing(problem, camera, T_map_cam, gate))
+    cache = correspondences(problem, camera, "k1", settings.mapping, agreeing_rows(problem, camera, T_map_cam, gate))
     if cache is None:
         return None
     mapper, made = mapper_with_poses(cache, T_map_cam)
@@ -49,12 +49,14 @@ def adjust(
     return SparseMap(kept, found.points, camera, found.k1, found.error_px, seen) if len(kept) > 2 else None
 
 
-def _agreeing(
+def agreeing_rows(
     problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], gate_px: float
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Rows of each pair that lie near the epipolar lines of the poses."""
+    """Return the rows of each pair that lie near the epipolar lines of the poses; of pairs without poses nothing."""
     out = {}
     for (a, b), rows in problem.pairs.items():
+        if a not in T_map_cam or b not in T_map_cam:
+            continue
         one, two = problem.views[a].xy[rows[:, 0]], problem.views[b].xy[rows[:, 1]]
         out[a, b] = rows[epipolar_errors(one, two, T_map_cam[a], T_map_cam[b], camera) < gate_px]
     return out

@@ -38,14 +38,22 @@ class PosedSegment:
 
 
 def fill_segments(
-    maps: Sequence[SparseMap], tracks: CornerTracks, grays: Sequence[Gray], settings: FramePoseSettings | None = None
+    maps: Sequence[SparseMap],
+    tracks: CornerTracks,
+    grays: Sequence[Gray],
+    settings: FramePoseSettings | None = None,
+    *,
+    adjusted: bool = False,
 ) -> list[PosedSegment]:
-    """Pose all frames that can be posed in one of the maps, each in the first that holds it; largest segment first."""
+    """Pose all frames that can be posed in one of the maps, each in the first that holds it; largest segment first.
+
+    Keyframes that are `adjusted` keep their poses.
+    """
     chosen = settings or FramePoseSettings()
     left = set(range(len(grays)))
     segments = []
     for found in maps:
-        segment = _fill(found, tracks, sorted(left), chosen)
+        segment = _fill(found, tracks, sorted(left), chosen, adjusted)
         _bridge(segment, grays, sorted(left), chosen)
         left -= set(segment.T_map_cam)
         segments.append(segment)
@@ -54,7 +62,7 @@ def fill_segments(
 
 
 def _fill(
-    found: SparseMap, tracks: CornerTracks, positions: Iterable[int], settings: FramePoseSettings
+    found: SparseMap, tracks: CornerTracks, positions: Iterable[int], settings: FramePoseSettings, adjusted: bool
 ) -> PosedSegment:
     numbers = np.array(sorted(found.points), np.int64)
     places = np.array([found.points[int(n)] for n in numbers]).reshape(-1, 3)
@@ -66,6 +74,9 @@ def _fill(
         points = places[np.searchsorted(numbers, tracks.ids[position][known])]
         if position in found.seen:
             xy, points = _with_features(found, position, tracks, xy, points)
+        if adjusted and position in found.T_map_cam:
+            segment.T_map_cam[position], segment.seen[position] = found.T_map_cam[position], (xy, points)
+            continue
         start = segment.T_map_cam.get(position - 1)
         if position in found.T_map_cam or start is None:
             start = found.T_map_cam[min(registered, key=lambda k: (abs(k - position), k))]

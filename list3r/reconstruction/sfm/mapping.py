@@ -83,16 +83,21 @@ def shared_rows(a: KeyframeView, b: KeyframeView) -> NDArray[np.int64]:
 
 
 def build_maps(
-    problem: MapProblem, camera: Camera, *, free_camera: str = "", settings: MappingSettings | None = None
+    problem: MapProblem,
+    camera: Camera,
+    *,
+    free_camera: str = "",
+    settings: MappingSettings | None = None,
+    verified: Matches | None = None,
 ) -> list[SparseMap]:
     """Maps of the keyframes, the largest first; several where they cannot be joined, none where nothing has depth or
     the camera only turns.
 
     `free_camera` names what of the camera is estimated as well: "" nothing, "k1" the distortion, "focal" the focal
-    length and the distortion.
+    length and the distortion. `verified` is as for `correspondences`.
     """
     chosen = settings or MappingSettings()
-    cache = correspondences(problem, camera, free_camera, chosen)
+    cache = correspondences(problem, camera, free_camera, chosen, verified)
     if cache is None:
         return []
     grown: list[list[SparseMap]] = []
@@ -209,13 +214,17 @@ def mapper_with_poses(cache: Any, T_map_cam: Mapping[int, Poses]) -> tuple[Any, 
 
 
 def triangulate(
-    problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], settings: MappingSettings | None = None
+    problem: MapProblem,
+    camera: Camera,
+    T_map_cam: Mapping[int, Poses],
+    settings: MappingSettings | None = None,
+    verified: Matches | None = None,
 ) -> SparseMap | None:
-    """Points of views whose poses are known; None when there are too few."""
+    """Points of views whose poses are known; None when there are too few. `verified` is as for `correspondences`."""
     chosen = settings or MappingSettings()
     known = {key: view for key, view in problem.views.items() if key in T_map_cam}
     pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
-    cache = correspondences(MapProblem(known, pairs, problem.matched), camera, "", chosen)
+    cache = correspondences(MapProblem(known, pairs, problem.matched), camera, "", chosen, verified)
     if cache is None:
         return None
     mapper, made = mapper_with_poses(cache, T_map_cam)
@@ -233,7 +242,7 @@ def correspondences(
     camera: Camera,
     free_camera: str,
     settings: MappingSettings,
-    verified: Mapping[tuple[int, int], Ints] | None = None,
+    verified: Matches | None = None,
 ) -> Any:
     """pycolmap's correspondence graph; None when no two views have anything in common.
 

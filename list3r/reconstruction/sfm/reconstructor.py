@@ -24,10 +24,12 @@ from list3r.reconstruction.features.learned import LearnedDetector, make_detecto
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, stereo_noise
 from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
+from list3r.reconstruction.sfm.adjustment import agreeing_rows
+from list3r.reconstruction.sfm.colmap import pixel_unit
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
 from list3r.reconstruction.sfm.keyframe_features import make_finder
 from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, step_beside, with_neighbours
-from list3r.reconstruction.sfm.mapping import MapProblem, SparseMap, build_maps, triangulate
+from list3r.reconstruction.sfm.mapping import MapProblem, Matches, SparseMap, build_maps, triangulate
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
 
@@ -102,7 +104,9 @@ class SfmReconstructor:
             raise TrackingError(f"{_span(frames)}: the map of the whole video does not hold them")
         tracks = follow_corners([_gray(f) for f in frames], self.settings.tracks)
         problem = corner_problem(tracks, self.settings.links)
-        return self._finish(frames, self._triangulated(tracks, problem, camera, known), in_place=True)
+        gate = self.settings.mapping.pose_error_px * pixel_unit(camera)
+        verified = agreeing_rows(problem, camera, known, gate)
+        return self._finish(frames, self._triangulated(tracks, problem, camera, known, verified), in_place=True)
 
     def _segments(
         self, frames: Sequence[Frame], grays: Sequence[Gray], camera: Camera, around: Around | None = None
@@ -148,9 +152,14 @@ class SfmReconstructor:
         return self._triangulated(tracks, problem, camera, {k: T[k] for k in np.flatnonzero(posed).tolist()})
 
     def _triangulated(
-        self, tracks: CornerTracks, problem: MapProblem, camera: Camera, poses: dict[int, Poses]
+        self,
+        tracks: CornerTracks,
+        problem: MapProblem,
+        camera: Camera,
+        poses: dict[int, Poses],
+        verified: Matches | None = None,
     ) -> PosedSegment:
-        found = triangulate(problem, camera, poses, self.settings.mapping)
+        found = triangulate(problem, camera, poses, self.settings.mapping, verified)
         return _with_given_poses(found or SparseMap({}, {}, camera), poses, tracks)
 
     def _finish(

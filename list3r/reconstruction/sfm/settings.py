@@ -123,6 +123,8 @@ class MappingSettings:
     30th frame) and simulated walks 99 % of the right pairs have 0.34 and more; what only chance relates 0.2 to 0.3."""
     pair_error_px: float = 2.0
     """Largest epipolar error of a match."""
+    pair_trials: int = 1000
+    """Most samples by which the geometry of a pair is sought, where it is sought by MAGSAC."""
     pose_error_px: float = 4.0
     """Largest error of a correspondence of structure and picture when a keyframe is added."""
     point_error_px: float = 2.0
