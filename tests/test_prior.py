@@ -148,5 +148,10 @@ def test_poses_that_drift_are_a_prior_unless_asked_otherwise() -> None:
 def test_a_prior_that_cannot_serve_is_refused(changes: dict[str, object], why: str) -> None:
     with pytest.raises(OptionError, match=why):
         check_buildable(info(**changes), BuildSettings(reconstruction="rgbd", poses="prior"))
-    with pytest.raises(OptionError, match="of rgbd"):
+    with pytest.raises(OptionError, match="of --reconstruction rgbd, not of sfm"):
         check_buildable(info(), BuildSettings(reconstruction="sfm", poses="prior"))
+
+
+def test_poses_of_colour_alone_are_no_prior() -> None:
+    with pytest.raises(OptionError, match="sensor depth.*has none; use --poses given"):
+        check_buildable(info(has_depth=False), BuildSettings(reconstruction="sfm", poses="prior"))

@@ -44,6 +44,8 @@ class LidarSettings:
     range_m: tuple[float, float] = (0.25, 5.0)
     sure_cosine: float = 0.3
     """Cosine of incidence under which depth is not sure; under a third of it the sensor is not sure at all."""
+    unsure_times: float = 1.0
+    """So many times larger is the error where depth is not sure."""
 
 
 @dataclass(frozen=True)
@@ -109,13 +111,14 @@ def lidar_depth(
     true = np.where(frame.depth > 0, frame.depth, settings.range_m[1] + 1).astype(np.float32)
     drawn = cv2.GaussianBlur(true, (0, 0), settings.blur_px)
     patch = cv2.GaussianBlur(rng.standard_normal(true.shape, dtype=np.float32), (0, 0), settings.patch_px)
-    depth = drawn + (settings.sigma_m + settings.sigma_per_m * drawn) * patch / patch.std()
     window = np.ones((5, 5), np.uint8)
     edge = cv2.dilate(true, window) - cv2.erode(true, window) > settings.edge_step * true + 5 * _slope(true)
-    known = (depth > settings.range_m[0]) & (depth < settings.range_m[1]) & (frame.depth > 0)
     confidence = np.full(true.shape, 2, np.uint8)
     confidence[edge | (frame.incidence < settings.sure_cosine)] = 1
     confidence[frame.incidence < settings.sure_cosine / 3] = 0
+    sigma = (settings.sigma_m + settings.sigma_per_m * drawn) * np.where(confidence < 2, settings.unsure_times, 1.0)
+    depth = (drawn + sigma * patch / patch.std()).astype(np.float32)
+    known = (depth > settings.range_m[0]) & (depth < settings.range_m[1]) & (frame.depth > 0)
     confidence[~known] = 0
     return np.where(known, depth, 0).astype(np.float32), confidence
 

@@ -306,14 +306,30 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
     if settings.poses != "estimate" and not info.has_poses:
         raise OptionError(f"{info.path} has no poses; use --poses estimate")
-    if settings.poses == "prior" and not (model.follows_prior and info.poses_metric):
-        unit = "" if info.poses_metric else f" in metres, and those of {info.path} have a unit of their own"
-        raise OptionError(f"--poses prior is of rgbd, by poses{unit}; use --poses given or estimate")
+    if settings.poses == "prior":
+        _check_prior(info, settings.reconstruction)
     check_choice(settings.discovery, settings.tracking, settings.features)
     if settings.device not in ("auto", "cpu"):  # looking for a GPU takes seconds
         from list3r.models.pretrained import pick_device
 
         pick_device(settings.device)
+
+
+def _check_prior(info: SourceInfo, reconstruction: str) -> None:
+    """Raise `OptionError` where poses that are given cannot be corrected, with the reason."""
+    otherwise = "use --poses given, which takes them as they are, or estimate, which does without them"
+    if not info.has_depth:
+        raise OptionError(
+            f"--poses prior corrects poses by sensor depth, from one frame to the next, and {info.path} has none; "
+            f"{otherwise}"
+        )
+    if not info.poses_metric:
+        raise OptionError(
+            f"--poses prior holds the poses of {info.path} against depth in metres, and they have a unit of their own; "
+            f"{otherwise}"
+        )
+    if not entry(reconstruction).follows_prior:
+        raise OptionError(f"--poses prior is of --reconstruction rgbd, not of {reconstruction}; {otherwise}")
 
 
 def check_convention(source: str | Path, options: SourceOptions) -> None:
