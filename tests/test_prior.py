@@ -153,5 +153,5 @@ def test_a_prior_that_cannot_serve_is_refused(changes: dict[str, object], why: s
 
 
 def test_poses_of_colour_alone_are_no_prior() -> None:
-    with pytest.raises(OptionError, match="sensor depth.*has none; use --poses given"):
+    with pytest.raises(OptionError, match=r"sensor depth.*has none; use --poses given"):
         check_buildable(info(has_depth=False), BuildSettings(reconstruction="sfm", poses="prior"))
