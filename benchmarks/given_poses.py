@@ -1,4 +1,5 @@
-"""A phone's walk through a simulated home, built with its poses as given, as a prior, and without them.
+"""A phone's walk through a simulated home, built with its poses as given, as a prior, without them, and with the true
+ones (which is the most that poses can give).
 
 python benchmarks/given_poses.py --seeds 1,2,3,4,5 --json benchmarks/results/given_poses.json
 
@@ -13,22 +14,25 @@ import argparse
 import json
 import statistics
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from machine import machine, run_list3r, write_json
+from scipy.spatial.transform import Rotation
 
 import list3r
 from benchmarks.simulation.phone import write_phone_walk
 from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
 from list3r.evaluation.trajectory import evaluate_trajectory, read_tum
+from list3r.frames.recordings.axes import arkit_of_pose
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.walk import PathSettings
 
 PACE = PathSettings(fps=10.0, speed_m_s=1.0, turn_deg_s=70.0)
 """A brisk walk, of which every third picture of a phone is kept."""
-MODES = ("given", "prior", "estimate")
+MODES = ("given", "prior", "estimate", "true")
 
 
 def main() -> None:
@@ -58,8 +62,20 @@ def measured(folder: Path, mode: str) -> dict[str, Any]:
     """Build one memory and hold it against the truth."""
     memory = folder / f"{mode}.l3r"
     memory.unlink(missing_ok=True)
-    options = ("--poses", mode, "--workers", "1", "--preset", "cpu", "--chunk", "40", "--overlap", "12")
-    _, usage = run_list3r("build", str(folder / "walk.r3d"), "-m", str(memory), *options)
+    source = with_true_poses(folder) if mode == "true" else folder / "walk.r3d"
+    options = (
+        "--poses",
+        "given" if mode == "true" else mode,
+        "--workers",
+        "1",
+        "--preset",
+        "cpu",
+        "--chunk",
+        "40",
+        "--overlap",
+        "12",
+    )
+    _, usage = run_list3r("build", str(source), "-m", str(memory), *options)
     with list3r.open(memory) as scene:
         scene.export("json", folder / f"{mode}.json")
         scene.export("tum", folder / f"{mode}.txt")
@@ -74,6 +90,20 @@ def measured(folder: Path, mode: str) -> dict[str, Any]:
         row |= {f"recall_{overlap}": found["recall"], f"precision_{overlap}": found["precision"]}
     row["duplicates"] = scores["instances_0.25"]["duplicates"]
     return row | {"wall_s": usage["wall_s"]}
+
+
+def with_true_poses(folder: Path) -> Path:
+    """Return the recording with the truth in place of its poses."""
+    path = folder / "true.r3d"
+    with zipfile.ZipFile(folder / "walk.r3d") as given, zipfile.ZipFile(path, "w") as out:
+        for name in given.namelist():
+            data = given.read(name)
+            if name == "metadata":
+                poses = [arkit_of_pose(T) for T in read_tum(folder / "groundtruth.txt").T_world_cam]
+                rows = [[*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]] for T in poses]
+                data = json.dumps({**json.loads(data), "poses": rows}).encode()
+            out.writestr(name, data)
+    return path
 
 
 def average(rows: list[dict[str, Any]]) -> dict[str, float]:

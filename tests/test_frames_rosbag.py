@@ -58,6 +58,15 @@ def test_topics_are_chosen_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_listing_a_recording_tells_how_far_it_is(kind: str, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    path = write_bag(tmp_path / "walk", kind)
+    source = open_source(path, listing=lambda done, total: told.append((done, total)))
+    done, total = told[-1]
+    assert source.info.frame_count == COUNT and done == total == 1 + 5 * COUNT
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_recording_that_is_cut_off_is_one_clear_line(kind: str, tmp_path: Path) -> None:
     path = write_bag(tmp_path / "walk", kind)
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix == f".{kind}")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame, SourceInfo
-from list3r.frames.options import SourceOptions
 from list3r.frames.pose_agreement import CONVENTIONS, wrong_convention
 from list3r.frames.source import open_source
 from list3r.memory.errors import SourceError
@@ -71,7 +70,7 @@ def test_a_recording_whose_cameras_are_turned_twice_is_refused(
     monkeypatch.setattr(recordings, "arkit", lambda T: right(T) @ flip)
     path = WITH_DEPTH[kind](tmp_path / "walk")
     with pytest.raises(SourceError, match="turned round"):
-        check_convention(path, SourceOptions())
+        check_convention(open_source(path))
 
 
 def test_a_world_with_y_up_is_not_taken_for_one_with_z_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

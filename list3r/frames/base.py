@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+Listing = Callable[[int, int], None]
+"""Hears how far a recording is listed: parts looked at, and in all."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from list3r.frames.base import Camera, FrameSource, SourceInfo
+from list3r.frames.base import Camera, FrameSource, Listing, SourceInfo
 from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.options import SourceOptions
@@ -59,9 +59,10 @@ _WANTED = (
 )
 
 
-def open_source(path: str | Path, options: SourceOptions | None = None) -> FrameSource:
+def open_source(path: str | Path, options: SourceOptions | None = None, listing: Listing | None = None) -> FrameSource:
     """Return the frames at `path`, which can be opened again in another process with the same arguments.
 
+    A recording that has to be read through to know its frames tells `listing` how far it is.
     Raises `SourceError` for what is not a source, `OptionError` for options that do not fit it.
     """
     options = options or SourceOptions()
@@ -74,7 +75,7 @@ def open_source(path: str | Path, options: SourceOptions | None = None) -> Frame
         if not root.exists():
             raise SourceError(f"{root} does not exist; {_WANTED}")
         if options.kind in ("auto", "rosbag") and os.access(root, os.R_OK) and rosbag.is_recording(root):
-            return rosbag.BagSource(root, options)
+            return rosbag.BagSource(root, options, listing)
         if options.kind in ("auto", "lerobot") and lerobot.is_dataset(root):
             return lerobot.LeRobotSource(root, options)
         if options.kind in ("auto", "aria") and aria.is_recording(root):

@@ -46,7 +46,7 @@ def build(
     check_address_space(BUILD_MB, "a build")
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
-    job = prepare(source, options, settings, run, memory)
+    job = prepare(source, options, settings, run, memory, watch=watch)
     watch.tell((*job.info.notes, *job.notes))
     if watch.debug_dir is not None:
         make_folder(watch.debug_dir)

@@ -219,7 +219,7 @@ def _job(
 ) -> Job:
     job = prepare(feed.folder, options, settings, run, memory)
     info: SourceInfo = replace(job.info, fingerprint=uuid.uuid4().hex, path=without_secrets(source))
-    return replace(job, info=info)
+    return replace(job, info=info, opened=None)
 
 
 def _begun(store: Store, feed: Feed, job: Job, options: SourceOptions, watch: Watch) -> LiveSession:

@@ -66,12 +66,12 @@ def precompute(
     """
     check_address_space(BUILD_MB, "a reconstruction")
     run, watch = run or RunOptions(), watch or Watch()
-    job = prepare(source, options, settings, run)
+    job = prepare(source, options, settings, run, watch=watch)
     watch.tell(job.notes)
     options, settings, info, force = job.options, job.settings, job.info, run.force
     _begin(out, settings, info, force)
     looking = watch.looking("cuts")
-    cuts = () if settings.poses == "given" else tuple(find_cuts(open_source(source, options), settings.cuts, looking))
+    cuts = () if settings.poses == "given" else tuple(find_cuts(job.frames(), settings.cuts, looking))
     spans = plan_chunks(info.frame_count, settings.chunks, cuts)
     notes: list[str] = []
     if force or not all(_file(out, span).exists() for span in spans):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import SourceInfo
+from list3r.frames.base import FrameSource, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.chunking.pace import depth_step
@@ -52,6 +52,12 @@ class Job:
     run: RunOptions
     notes: tuple[str, ...] = ()
     """What the user should know before the work begins, one sentence each."""
+    opened: FrameSource | None = None
+    """The source as it was listed; None where it may have grown since."""
+
+    def frames(self) -> FrameSource:
+        """Return the source, listed anew only where it has to be."""
+        return open_source(self.source, self.options) if self.opened is None else self.opened
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,7 @@ def prepare(
     memory: Path | None = None,
     *,
     later: bool = False,
+    watch: Watch | None = None,
 ) -> Job:
     """Open a source and make everything definite that was left open. Raises `SourceError` and `OptionError`.
 
@@ -90,7 +97,8 @@ def prepare(
     """
     options = options or SourceOptions()
     check_run(run)
-    info = open_source(source, options).info
+    opened = open_source(source, options, (watch or Watch()).looking("frames"))
+    info = opened.info
     options.check_fits(info)
     first, begun = (None, None) if memory is None else stored_sessions(memory)
     begun = begun or (None if later else first)  # a build that is done has nothing left to do
@@ -110,8 +118,8 @@ def prepare(
     chosen = resolve_settings(chosen, info)
     check_buildable(info, chosen)
     if chosen.poses != "estimate":
-        check_convention(source, options)
-    return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes))
+        check_convention(opened)
+    return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes), opened)
 
 
 def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
@@ -226,7 +234,7 @@ def settled_step(store: Store, session: int, job: Job, watch: Watch) -> int:
         known = job.settings.depth_every
         if known is None:
             begun = store.chunks.all(session)  # by a version that took all frames
-            source, length = open_source(job.source, job.options), job.settings.chunks.length
+            source, length = job.frames(), job.settings.chunks.length
             known = 1 if begun else depth_step(source, length, job.settings.pace, progress=watch.looking("pace"))
         with store.transaction():
             store.sessions.put(replace(store.sessions.get(session), depth_step=known))
@@ -248,7 +256,7 @@ def _takes_wide_steps(job: Job) -> bool:
         return False
     from list3r.association.whole_map.source import takes_wide_steps
 
-    return takes_wide_steps(open_source(job.source, job.options), s.video_map, s.pace)
+    return takes_wide_steps(job.frames(), s.video_map, s.pace)
 
 
 def _whole_map(job: Job, options: SourceOptions) -> VideoMap | None:
@@ -267,7 +275,7 @@ def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]
     if known is None:
         begun = store.chunks.all(session)  # by a version that did not look for any
         scan = watch.looking("cuts")
-        known = () if begun else tuple(find_cuts(open_source(job.source, job.options), job.settings.cuts, scan))
+        known = () if begun else tuple(find_cuts(job.frames(), job.settings.cuts, scan))
         with store.transaction():
             store.sessions.put(replace(store.sessions.get(session), cuts=known))
     return known
@@ -332,13 +340,13 @@ def _check_prior(info: SourceInfo, reconstruction: str) -> None:
         raise OptionError(f"--poses prior is of --reconstruction rgbd, not of {reconstruction}; {otherwise}")
 
 
-def check_convention(source: str | Path, options: SourceOptions) -> None:
+def check_convention(source: FrameSource) -> None:
     """Raise `SourceError` where given poses fit the depth only in another convention than they are read in."""
-    found = wrong_convention(open_source(source, options))
+    found = wrong_convention(source)
     if found is not None:
         raise SourceError(
-            f"the poses of {source} do not fit its depth as they are read, but would {found}: whoever wrote them meant "
-            "another convention; write them anew, or use --poses estimate"
+            f"the poses of {source.info.path} do not fit its depth as they are read, but would {found}: whoever wrote "
+            "them meant another convention; write them anew, or use --poses estimate"
         )
 
 

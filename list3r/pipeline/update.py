@@ -45,7 +45,7 @@ def update(
     check_address_space(BUILD_MB, "a build")
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
-    job = prepare(source, options, settings, run, memory, later=True)
+    job = prepare(source, options, settings, run, memory, later=True, watch=watch)
     watch.tell(job.notes)
     with Store.open(memory, writable=True) as store:
         session = _session(store, job)

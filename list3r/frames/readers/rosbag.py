@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint
 from list3r.frames.layout import FolderLayout, Optics
@@ -36,6 +36,8 @@ _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TF = "tf2_msgs/msg/TFMessage"
 _INFO = "sensor_msgs/msg/CameraInfo"
+_TOLD_EVERY = 200
+"""Messages after which whoever watches hears of the listing."""
 _MOST_BYTES = 2**50
 """Of a recording: it is read message by message."""
 
@@ -65,12 +67,15 @@ class Stream:
 class BagSource:
     """A `FrameSource` over one recording; nothing but its index is kept."""
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
-        """One pass over the recording. Raises `SourceError` for what cannot be read and `OptionError` for topics."""
+    def __init__(self, path: Path, options: SourceOptions, listing: Listing | None = None) -> None:
+        """One pass over the recording, of which `listing` hears: messages looked at, and in all.
+
+        Raises `SourceError` for what cannot be read and `OptionError` for topics.
+        """
         self._path, self._options = path, options
         wanted = options.topics_by_role()
         with _opened(path) as reader:
-            found = _Topics(reader, wanted, path)
+            found = _Topics(reader, wanted, path, listing)
             color = found.color()
             depth = found.depth()
             tree = found.transforms(color.frame)
@@ -218,8 +223,10 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 class _Topics:
     """What a recording holds, looked at once."""
 
-    def __init__(self, reader: AnyReader, wanted: Mapping[str, str], path: Path) -> None:
-        self._reader, self._wanted, self._path = reader, wanted, path
+    def __init__(
+        self, reader: AnyReader, wanted: Mapping[str, str], path: Path, listing: Listing | None = None
+    ) -> None:
+        self._reader, self._wanted, self._path, self._listing = reader, wanted, path, listing
         self._of = {c.topic: c for c in reader.connections}
         for role, topic in wanted.items():
             if topic not in self._of:
@@ -290,8 +297,12 @@ class _Topics:
         units: dict[str, float] = {}
         tree = TransformTree()
         pose_topic = self._wanted.get("pose") or self._only_pose_topic()
-        for connection, received, raw in self._reader.messages():
+        looked_at = [c for c in self._reader.connections if self._tells(c.topic, c.msgtype, pose_topic)]
+        count = sum(c.msgcount for c in looked_at)
+        for number, (connection, received, raw) in enumerate(self._reader.messages(looked_at), start=1):
             topic, kind = connection.topic, connection.msgtype
+            if self._listing is not None and (number % _TOLD_EVERY == 0 or number == count):
+                self._listing(number, count)
             if kind in _IMAGES:
                 if topic not in first:
                     first[topic] = self._reader.deserialize(raw, kind)
@@ -317,6 +328,11 @@ class _Topics:
             streams[topic] = Stream(topic, times, received_ns, frame, first[topic])
         by_topic = {t: u for t in streams for sensor, u in units.items() if t.startswith(sensor) and u > 0}
         return streams, tree, infos, by_topic
+
+    @staticmethod
+    def _tells(topic: str, kind: str, pose_topic: str | None) -> bool:
+        """Whether messages say something of pictures, cameras or poses; clouds and the like are not read."""
+        return kind in (*_IMAGES, _INFO, _TF) or topic == pose_topic or topic.endswith("/option/Depth_Units/value")
 
     def _only_pose_topic(self) -> str | None:
         """The only topic of poses where `/tf` does not move anything."""
