@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from hostile import lying
 from kills import build_command, kill_builds, kill_commands, kill_edits, kill_updates, kill_writes, update_command
-from machine import machine, write_json
+from machine import end_with_parent, machine, write_json
 
 from list3r.exporters.scene_json import scene_dict
 from list3r.memory.errors import List3rError, MemoryFileError
@@ -73,6 +73,7 @@ def write_and_read(memory: Path, seconds: float, readers: int = 8) -> Result:
 
 def _worker(work: Callable[..., Any], memory: str, seconds: float, k: int, queue: Any, ready: Any) -> None:
     """Run one process and report what it met; all begin together."""
+    end_with_parent()
     problems: list[str] = []
     count = 0
     name = "transactions" if work is _write else "snapshots"
@@ -182,6 +183,7 @@ def flip(memory: Path, folder: Path, count: int, seed: int = 0) -> Result:
 
 
 def _flip_batch(memory: str, folder: str, numbers: range, seed: int, queue: Any) -> None:
+    end_with_parent()
     original = Path(memory).read_bytes()
     with Store.open(memory) as store:
         wanted = answers(store)

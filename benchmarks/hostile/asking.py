@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from machine import end_with_parent
 from PIL import Image
 
 from list3r.cli.app import run
@@ -26,7 +27,7 @@ from list3r.exporters.plan import picture
 from list3r.exporters.plan.layout import PlanSettings
 from list3r.exporters.registry import FORMATS
 from list3r.exporters.simready import thumbnail
-from list3r.memory.store import read_checks
+from list3r.memory.store import read_checks, store
 from list3r.memory.store.read_checks import ReadChecks
 from list3r.memory.store.store import Store
 
@@ -35,7 +36,7 @@ LONGEST_S = 10.0
 WAITING_S = 120.0
 SERVING_S = 10.0
 COSTLY = ("simready", "prompt", "report", "plan", "usd")
-"""Formats that take longer than all other commands about a small memory together; each lie goes through one in turn."""
+"""Formats that take longer than all other commands about a small memory together."""
 MOST_MB = 1024
 READS = (
     "list --structure",
@@ -167,16 +168,18 @@ def checked_once() -> Iterator[None]:
         if failure is not None:
             raise failure
 
-    def drawn(store: Store, component: Component, how: PlanSettings | None = None) -> Image.Image:
+    def drawn(memory: Store, component: Component, how: PlanSettings | None = None) -> Image.Image:
         if component.name not in plans:
-            plans[component.name] = draw(store, component, how)
+            plans[component.name] = draw(memory, component, how)
         return plans[component.name]
 
-    read_checks.damage_of, picture.plan_image = remembered, drawn
+    read_checks.damage_of = store.damage_of = remembered
+    picture.plan_image = drawn
     try:
         yield
     finally:
-        read_checks.damage_of, picture.plan_image = look, draw
+        read_checks.damage_of = store.damage_of = look
+        picture.plan_image = draw
 
 
 @contextlib.contextmanager
@@ -246,6 +249,7 @@ def _words(command: str) -> list[str]:
 
 
 def be_nice() -> None:
-    """Let others go first."""
+    """Let others go first, and end with the parent."""
+    end_with_parent()
     with contextlib.suppress(OSError):
         os.nice(15)

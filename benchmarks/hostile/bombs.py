@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from hostile.lies import sign
+from hostile.packed import jpeg, mp4, png, zipped
 from hostile.subject import write_source, write_subject
 from list3r.memory.store.rows.codec import pack
 
@@ -70,70 +70,6 @@ def _met(words: list[str]) -> dict[str, Any]:
     }
 
 
-def png(width: int, height: int, bits: int = 8, colors: int = 1) -> bytes:
-    """Return a black PNG: a thousand times smaller than what it shows."""
-    packer, row = zlib.compressobj(9), bytes(1 + width * colors * bits // 8)
-    data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    kind = 2 if colors == 3 else 0
-    head = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in ((b"IHDR", head), (b"IDAT", data), (b"IEND", b"")))
-
-
-def _chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-
-def jpeg(width: int, height: int) -> bytes:
-    """Return a small JPEG that says it is larger."""
-    out = io.BytesIO()
-    Image.new("RGB", (16, 16)).save(out, "JPEG")
-    data = bytearray(out.getvalue())
-    at = data.index(b"\xff\xc0")
-    data[at + 5 : at + 9] = struct.pack(">HH", height, width)
-    return bytes(data)
-
-
-def mp4(frames: int, size: tuple[int, int] = (640, 480), *, fragments: bool = False) -> bytes:
-    """Return a video of a kilobyte whose index claims so many frames."""
-    unit = struct.pack(">9I", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
-    width, height = size
-    times = struct.pack(">4I", 0, 0, 1000, 1000)
-    movie = _full(b"mvhd", 0, times, struct.pack(">IH", 0x10000, 0x100), bytes(10), unit, bytes(24), b"\0\0\0\2")
-    shown = struct.pack(">2I", width << 16, height << 16)
-    track = _full(b"tkhd", 3, struct.pack(">5I", 0, 0, 1, 0, 1000), bytes(16), unit, shown)
-    clock = _full(b"mdhd", 0, struct.pack(">4I2H", 0, 0, 30, frames, 0x55C4, 0))
-    kind = _full(b"hdlr", 0, bytes(4), b"vide", bytes(13))
-    sides = struct.pack(">2H3IH", width, height, 0x480000, 0x480000, 0, 1)
-    entry = _box(b"mp4v", bytes(6), b"\0\1", bytes(16), sides, bytes(32), struct.pack(">Hh", 24, -1))
-    n = 0 if fragments else frames
-    rows = 1 if n else 0
-    tables = (
-        _full(b"stsd", 0, struct.pack(">I", 1), entry),
-        _full(b"stts", 0, struct.pack(">I", rows), struct.pack(">2I", n, 1) * rows),
-        _full(b"stsc", 0, struct.pack(">I", rows), struct.pack(">3I", 1, n, 1) * rows),
-        _full(b"stsz", 0, struct.pack(">2I", rows, n)),
-        _full(b"stco", 0, struct.pack(">I", rows), struct.pack(">I", 48) * rows),
-    )
-    here = _box(b"dinf", _full(b"dref", 0, struct.pack(">I", 1), _full(b"url ", 1)))
-    media = _box(b"mdia", clock, kind, _box(b"minf", _full(b"vmhd", 1, bytes(8)), here, _box(b"stbl", *tables)))
-    more = _box(b"mvex", _full(b"trex", 0, struct.pack(">5I", 1, 1, 1, 1, 0))) if fragments else b""
-    head = _box(b"ftyp", b"isom\0\0\2\0isomiso2mp41") + _box(b"mdat", bytes(100))
-    out = head + _box(b"moov", movie, _box(b"trak", track, media), more)
-    if not fragments:
-        return out
-    run = _full(b"tfhd", 0x020000, struct.pack(">I", 1)) + _full(b"trun", 0, struct.pack(">I", frames))
-    return out + _box(b"moof", _full(b"mfhd", 0, struct.pack(">I", 1)), _box(b"traf", run)) + _box(b"mdat", bytes(100))
-
-
-def _box(name: bytes, *parts: bytes) -> bytes:
-    body = b"".join(parts)
-    return struct.pack(">I", 8 + len(body)) + name + body
-
-
-def _full(name: bytes, flags: int, *parts: bytes) -> bytes:
-    return _box(name, struct.pack(">I", flags), *parts)
-
-
 # ------------------------------------------------------------------------------------------- sources
 
 
@@ -151,21 +87,8 @@ def _file(here: Path, name: str, data: bytes, command: str = "inspect", *more: s
     return [command, str(here / name), *more]
 
 
-def _zipped(*members: tuple[str, bytes | int], packing: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """An archive; a number stands for so many zeros."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", packing) as archive:
-        for name, data in members:
-            with archive.open(name, "w", force_zip64=True) as member:
-                left = data if isinstance(data, int) else 0
-                member.write(b"" if isinstance(data, int) else data)
-                while left > 0:
-                    left -= member.write(bytes(min(left, 2**22)))
-    return out.getvalue()
-
-
 def _r3d(here: Path, metadata: bytes | int, packing: int = zipfile.ZIP_DEFLATED) -> list[str]:
-    data = _zipped(("rgbd/0.jpg", jpeg(16, 16)), ("metadata", metadata), packing=packing)
+    data = zipped(("rgbd/0.jpg", jpeg(16, 16)), ("metadata", metadata), packing=packing)
     return _file(here, "walk.r3d", data)
 
 
@@ -180,7 +103,7 @@ def _r3d_depth(here: Path) -> list[str]:
     return _file(
         here,
         "walk.r3d",
-        _zipped(
+        zipped(
             ("metadata", json.dumps(camera).encode()),
             *((f"rgbd/{k}.jpg", jpeg(16, 16)) for k in range(2)),
             *((f"rgbd/{k}.depth", block * 12 + b"bvx$") for k in range(2)),
@@ -252,7 +175,7 @@ def _precomputed(here: Path) -> list[str]:
     )
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": (2**31,)})
-    data = _zipped(("frames.npy", _npy(np.arange(4))), ("depth.npy", 2**31), ("confidence.npy", head.getvalue()))
+    data = zipped(("frames.npy", _npy(np.arange(4))), ("depth.npy", 2**31), ("confidence.npy", head.getvalue()))
     (here / "made" / "chunk_000.npz").write_bytes(data)
     how = str(here / "made")
     return ["build", str(here / "walk"), "-m", str(here / "m.l3r"), "--reconstruction", "precomputed", "--weights", how]
@@ -289,7 +212,7 @@ def _memory(here: Path, *statements: tuple[str, tuple[Any, ...]], command: str =
 
 def _track(here: Path) -> list[str]:
     """A mask track whose arrays unpack to two gigabytes."""
-    blob = _zipped(*((f"{k}.npy", 2**27) for k in range(16)))
+    blob = zipped(*((f"{k}.npy", 2**27) for k in range(16)))
     return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="query seen", more="2")
 
 
