@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame, SourceInfo
-from list3r.frames.pose_agreement import CONVENTIONS, wrong_convention
+from list3r.frames.pose_agreement import CONVENTIONS, depth_factor, wrong_convention
 from list3r.frames.source import open_source
 from list3r.memory.errors import SourceError
 from list3r.pipeline.session import check_convention
@@ -89,3 +89,10 @@ def test_a_camera_of_another_size_is_doubted(tmp_path: Path) -> None:
     assert not any("another size" in note for note in whole.info.notes)
     wrong = open_source(recordings.write_nerfstudio(tmp_path / "b", cx=39.5, cy=29.5))
     assert any("another size" in note for note in wrong.info.notes)
+
+
+@pytest.mark.parametrize("times", [0.2, 1.0, 1.3, 5.0])
+def test_depth_in_another_unit_than_its_poses_is_told(times: float, frames: list[Frame]) -> None:
+    told = [replace(f, depth=np.float32(times) * f.depth) for f in frames if f.depth is not None]
+    found = depth_factor(Walk(told))  # type: ignore[arg-type]
+    assert found is None if 0.7 < times < 1.5 else found == pytest.approx(1 / times, rel=0.1)

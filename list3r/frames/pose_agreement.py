@@ -1,7 +1,8 @@
 """Whether given poses fit the depth of the frames: depth of one frame, seen from another, must meet its depth.
 
 Recorders differ in the axes of a camera and in which way a pose leads; a wrong guess still runs, and makes a world of
-nonsense. What fits far better in another convention is told apart here from poses that merely drift.
+nonsense. What fits far better in another convention is told apart here from poses that merely drift. So is depth in
+another unit: where the camera moves by known metres, what it sees moves by as many pixels as it is far.
 """
 
 from __future__ import annotations
@@ -33,6 +34,18 @@ class AgreementSettings:
     tolerance: float = 0.05
     """Depth that differs by less than this share agrees."""
     least_points: int = 100
+    features: int = 800
+    """Corners of a picture that are followed to the other of a pair."""
+    epipolar_px: float = 2.0
+    """What moved is as far from where its pose lets it be, whatever its depth; matches beyond are false."""
+    parallax_px: float = 5.0
+    """What moved by less, as against something far away, tells nothing of its depth."""
+    least_matches: int = 15
+    """Of all pairs together."""
+    factor: float = 1.6
+    """Depth that is as many times off is told; a wrong focal length alone makes less."""
+    spread: float = 0.25
+    """Six of ten matches must agree on one factor within this share."""
     good: float = 0.75
     """Another convention is meant where at least this share agrees in it,"""
     gain: float = 0.2
@@ -69,6 +82,76 @@ def wrong_convention(source: FrameSource, settings: AgreementSettings | None = N
     middle = {name: float(np.median(found)) for name, found in shares.items()}
     stated, best = next(iter(middle.values())), max(middle, key=lambda name: middle[name])
     return best if middle[best] >= max(s.good, stated + s.gain) else None
+
+
+def depth_factor(source: FrameSource, settings: AgreementSettings | None = None) -> float | None:
+    """Return what depth must be multiplied by for pixels to move as the given poses say, where that is far from 1.
+
+    None where it is near, or where it cannot be told: without depth, metric poses or motion, or where matches disagree.
+    """
+    s, info = settings or AgreementSettings(), source.info
+    if not (info.has_depth and info.has_poses and info.camera is not None and info.poses_metric):
+        return None
+    starts = np.linspace(0, max(0, info.frame_count - 2), s.pairs).astype(int).tolist()
+    pairs = [pair for start in starts if (pair := _pair(source, start, s)) is not None]
+    factors = np.concatenate([np.zeros(0), *(_factors(*pair, info.camera, s) for pair in pairs)])
+    if len(factors) < s.least_matches:
+        return None
+    middle = float(np.median(factors))
+    agree = middle > 0 and float((np.abs(factors / middle - 1) < s.spread).mean()) > 0.6
+    return middle if agree and max(middle, 1 / middle) >= s.factor else None
+
+
+def _factors(a: Frame, b: Frame, camera: Camera, s: AgreementSettings) -> NDArray[np.float64]:
+    """Return for each match of two frames what a's depth must be multiplied by for it to fall on b's. Shape (M,).
+
+    Of a ray r with depth z and the ray q of its match, k z R r + t is parallel to q: q x (R r) k z = -q x t.
+    """
+    assert a.depth is not None and a.T_source_cam is not None and b.T_source_cam is not None
+    xy_a, xy_b = _matches(a, b, s)
+    column, row = np.rint(xy_a).astype(int).T
+    z = a.depth[row, column].astype(np.float64)
+    r, q = (_rays(xy, camera) for xy in (xy_a, xy_b))
+    T_b_a = np.linalg.inv(b.T_source_cam) @ a.T_source_cam
+    turned, t = r @ T_b_a[:3, :3].T, T_b_a[:3, 3]
+    line = np.cross(t, turned)
+    off = np.abs((q * line).sum(axis=1)) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
+    moved = q[:, :2] - turned[:, :2] / np.maximum(turned[:, 2:], 1e-6)
+    told = (off * camera.fx < s.epipolar_px) & (np.linalg.norm(moved, axis=1) * camera.fx > s.parallax_px) & (z > 0)
+    across = np.cross(q[told], turned[told])
+    return -(across * np.cross(q[told], t)).sum(axis=1) / (z[told] * (across**2).sum(axis=1))
+
+
+def _matches(a: Frame, b: Frame, s: AgreementSettings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mutual nearest neighbours of two pictures' corners, px. Shapes (M, 2)."""
+    import cv2
+
+    corners = cv2.ORB.create(s.features)
+    found = [corners.detectAndCompute(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), None) for f in (a, b)]
+    (points_a, words_a), (points_b, words_b) = found
+    if words_a is None or words_b is None:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(words_a, words_b)
+    xy = [(points_a[m.queryIdx].pt, points_b[m.trainIdx].pt) for m in pairs]
+    both = np.array(xy, np.float64).reshape(-1, 2, 2)
+    return both[:, 0], both[:, 1]
+
+
+def _rays(xy: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Return rays of z 1 through pixels. Shape (N, 3)."""
+    flat = (xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    return np.column_stack([flat, np.ones(len(flat))])
+
+
+def scale_doubts(source: FrameSource, settings: AgreementSettings | None = None) -> tuple[str, ...]:
+    """Return what to say of depth in another unit than its poses, nothing where they agree or it cannot be told."""
+    factor = depth_factor(source, settings)
+    if factor is None:
+        return ()
+    how = f"{factor:.2g} times as far away" if factor > 1 else f"{1 / factor:.2g} times as near"
+    units = source.info.depth_scale
+    fix = "" if units is None else f": --depth-scale {float(f'{units / factor:.2g}'):g} would fit, it is {units:g}"
+    return (f"between the given poses the motion of what is seen is that of things {how} as depth says{fix}",)
 
 
 def _pair(source: FrameSource, start: int, s: AgreementSettings) -> tuple[Frame, Frame] | None:

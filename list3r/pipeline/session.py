@@ -14,7 +14,7 @@ from list3r.frames.base import FrameSource, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.chunking.pace import depth_step
-from list3r.frames.pose_agreement import wrong_convention
+from list3r.frames.pose_agreement import scale_doubts, wrong_convention
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
 from list3r.memory.errors import OptionError, SourceError
@@ -119,6 +119,7 @@ def prepare(
     check_buildable(info, chosen)
     if chosen.poses != "estimate":
         check_convention(opened)
+        notes += scale_doubts(opened)
     return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes), opened)
 
 

@@ -44,7 +44,8 @@ def own_file_named_new(place: Place) -> str:
 
 
 def reading_an_older_memory_writes(place: Place) -> str:
-    memory = place.older("old/m.l3r") if (place.folder / "old").mkdir() else place.older("old/m.l3r")
+    (place.folder / "old").mkdir()
+    memory = place.older("old/m.l3r")
     before = {p.name: p.read_bytes() for p in memory.parent.iterdir()}
     for words in (("info", memory), ("list", memory), ("verify", memory), ("show", memory, 2)):
         place.ask(*words)

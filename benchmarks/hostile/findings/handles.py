@@ -6,7 +6,6 @@ import contextlib
 import gc
 import importlib
 import os
-import resource
 import signal
 import subprocess
 import sys

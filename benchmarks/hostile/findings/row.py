@@ -1,4 +1,4 @@
-"""Look for findings in the checkout that this process was started for: `python -m hostile.findings.row FOLDER [KEY ...]`.
+"""Look for findings in one checkout, that of `list3r`: `python -m hostile.findings.row FOLDER [KEY ...]`.
 
 Prints a line of JSON for each: its key and what was found, nothing where it holds.
 """

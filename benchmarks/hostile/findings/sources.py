@@ -7,7 +7,6 @@ import json
 import os
 import resource
 import shutil
-import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -199,7 +198,7 @@ def repair_of_a_hole(place: Place) -> str:
     os.truncate(memory, 2**33)
     most = 300 * 2**20
     ended = place.ask("repair", memory, longest_s=60, limit={resource.RLIMIT_FSIZE: most})
-    left = [p for p in memory.parent.iterdir() if p != memory and ".repair" in p.name or "-repair-" in p.name]
+    left = [p for p in memory.parent.iterdir() if (p != memory and ".repair" in p.name) or "-repair-" in p.name]
     size = sum(p.stat().st_blocks * 512 for p in left) // 2**20
     return first(f"leaves {left[0].name[:24]} of {size} MB" if left else "", ended.beyond(10, 1000))
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import os
 import signal
-import sqlite3
 import struct
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -195,8 +192,8 @@ def _json(text: str) -> Callable[[Place], str]:
 
 
 _EDGE = (
-    "INSERT INTO edges (u, v, kind, frame_u, frame_v, S_v_u, confidence, weight, inliers, residual_m, accepted, reason, "
-    "scores) SELECT 1, 1, 'loop', 0, 3, S_world_chunk, 0.5, 0, 9, 0.0, 0, 'so', '{\"s_det\": {}}' FROM placements"
+    "INSERT INTO edges (u, v, kind, frame_u, frame_v, S_v_u, confidence, weight, inliers, residual_m, accepted, "
+    "reason, scores) SELECT 1, 1, 'loop', 0, 3, S_world_chunk, 0.5, 0, 9, 0.0, 0, 'so', '{\"s_det\": {}}' FROM placements"
 )
 _NAN = "zeroblob(48) || x'000000000000f87f' || substr(S_world_chunk, 57)"
 _LIES = {
