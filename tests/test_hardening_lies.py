@@ -82,6 +82,8 @@ SOME = {
     "instances 3: confidence": "UPDATE instances SET confidence = 7 WHERE id = 3",
     "instances 3: geometry": "UPDATE instances SET geometry = zeroblob(192) WHERE id = 3",
     "instances 3: label": "UPDATE instances SET label = CAST(x'ff41' AS TEXT) WHERE id = 3",
+    "instances 5: label": "UPDATE instances SET label = CAST(zeroblob(2097152) AS TEXT) WHERE id = 5",
+    "instances 5: component": "UPDATE instances SET component = -1 WHERE id = 5",
     "placements 1: S_world_chunk": "UPDATE placements SET S_world_chunk = zeroblob(104)",
     "frames 1:3: T_chunk_cam": "UPDATE frames SET T_chunk_cam = zeroblob(128) WHERE frame_index = 3",
     "relations: object 77 is not in instances": "UPDATE relations SET object = 77 WHERE subject = 3",

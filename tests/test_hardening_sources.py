@@ -22,7 +22,7 @@ import pytest
 from list3r.cli.app import run
 from list3r.frames.decoding.decode import read_color, read_raw_depth
 from list3r.frames.files import too_many_pixels
-from list3r.frames.recordings import bag_chunks
+from list3r.frames.recordings import bag_chunks, stored
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import FrameError, OptionError, SourceError
 from list3r.memory.unpacking import open_archive, parse_json
@@ -267,6 +267,20 @@ def test_chunks_of_recordings_unpack_within_bounds(monkeypatch: pytest.MonkeyPat
     for data in (bz2.compress(bytes(2000)), bz2.compress(bytes(9))[:-4], b"no chunk at all"):
         with pytest.raises(ValueError, match="chunk"):
             unpack(data)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_depth_of_lzfse_unpacks_within_bounds(hidden: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    lzfse = pytest.importorskip("lzfse")
+    if hidden:
+        monkeypatch.setattr(stored, "_filling", lambda library: None)
+    depth = np.random.default_rng(0).normal(2.0, 0.01, 192 * 256).astype("<f4").tobytes()
+    packed = lzfse.compress(depth)
+    assert stored._unpacked(packed, len(depth), "lzfse") == depth
+    blocks = lzfse.compress(bytes(2_000_000))[:-4] * 40 + b"bvx$"
+    for data in (packed[:-100], b"no blocks", b"", blocks):
+        raw = stored._unpacked(data, len(depth), "lzfse")
+        assert raw is None if hidden or data is not blocks else raw is not None and len(raw) == len(depth) + 1
 
 
 def test_bombs_take_no_memory(tmp_path: Path) -> None:

@@ -119,7 +119,8 @@ def _factors(a: Frame, b: Frame, camera: Camera, s: AgreementSettings) -> NDArra
     moved = q[:, :2] - turned[:, :2] / np.maximum(turned[:, 2:], 1e-6)
     told = (off * camera.fx < s.epipolar_px) & (np.linalg.norm(moved, axis=1) * camera.fx > s.parallax_px) & (z > 0)
     across = np.cross(q[told], turned[told])
-    return -(across * np.cross(q[told], t)).sum(axis=1) / (z[told] * (across**2).sum(axis=1))
+    factors: NDArray[np.float64] = -(across * np.cross(q[told], t)).sum(axis=1) / (z[told] * (across**2).sum(axis=1))
+    return factors
 
 
 def _matches(a: Frame, b: Frame, s: AgreementSettings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -86,7 +86,8 @@ def _signed(statement: str) -> Callable[[Place], str]:
 
 _RESTED_ON = {
     "supports": "UPDATE supports SET points = zeroblob(length(points)) WHERE local_id IN (1, 3)",
-    "placements": "UPDATE placements SET S_world_chunk = zeroblob(104)",
+    "placements": "UPDATE placements SET S_world_chunk = CAST(substr(S_world_chunk, 1, 96) || x'0000000000000840' "
+    "AS BLOB)",
     "frames": "UPDATE frames SET T_chunk_cam = zeroblob(128) WHERE frame_index = 3",
 }
 
@@ -109,7 +110,7 @@ def _rested(table: str) -> Callable[[Place], str]:
 def update_of_a_damaged_memory(place: Place) -> str:
     """A later session, which writes rows beside the damaged one."""
     memory, walk = place.folder / "b.l3r", place.walk(frames=12, size=(160, 120))
-    words = ("--poses", "given", "--workers", 0)
+    words = ("--poses", "given", "--workers", 1)
     built = place.ask("build", walk, "-m", memory, *words, longest_s=120)
     assert built.status == 0, built.told
     place.ask("label", memory, 1, "thing")
@@ -124,7 +125,7 @@ def refused_build_removes_replaced(place: Place) -> str:
     memory, walk = place.memory(), place.walk(frames=2)
     own = place.memory("m.l3r.replaced")
     for more in ([], ["--force"]):
-        ended = place.ask("build", walk, "-m", memory, "--poses", "given", "--workers", 0, *more)
+        ended = place.ask("build", walk, "-m", memory, "--poses", "given", "--workers", 1, *more)
         if not own.exists():
             return f"{own.name} is gone after `build {' '.join(more)}` (status {ended.status})"
     return ""

@@ -120,7 +120,7 @@ def _waited(name: str, command: str, device: str | None = None) -> Callable[[Pla
             os.mkfifo(root / name)
         else:
             (root / name).symlink_to(device)
-        more = ("-m", place.folder / "m.l3r", "--workers", 0) if command == "build" else ()
+        more = ("-m", place.folder / "m.l3r", "--workers", 1) if command == "build" else ()
         return place.ask(command, root, *more, longest_s=60).beyond(10, 1000)
 
     return look
@@ -155,7 +155,7 @@ def _precomputed(place: Place) -> Path:
 
 
 def _build_precomputed(place: Place, made: Path):  # type: ignore[no-untyped-def]
-    how = ("--reconstruction", "precomputed", "--weights", made, "--workers", 0)
+    how = ("--reconstruction", "precomputed", "--weights", made, "--workers", 1)
     return place.ask("build", place.walk(), "-m", place.folder / "m.l3r", *how, longest_s=30)
 
 

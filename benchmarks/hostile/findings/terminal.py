@@ -148,7 +148,7 @@ def _output(redirected: str, fine: tuple[int, ...]) -> Callable[[Place], str]:
 
 def build_without_errors(place: Place) -> str:
     place.walk(frames=12, size=(160, 120))
-    ended = place.shell("list3r build walk -m b.l3r --poses given --workers 0 2>&-", 200)
+    ended = place.shell("list3r build walk -m b.l3r --poses given --workers 1 2>&-", 200)
     return first(
         ended.bad, "" if ended.status == 0 else f"fails without a word, status {ended.status}: {ended.out[-80:]}"
     )
@@ -193,7 +193,8 @@ def _json(text: str) -> Callable[[Place], str]:
 
 _EDGE = (
     "INSERT INTO edges (u, v, kind, frame_u, frame_v, S_v_u, confidence, weight, inliers, residual_m, accepted, "
-    "reason, scores) SELECT 1, 1, 'loop', 0, 3, S_world_chunk, 0.5, 0, 9, 0.0, 0, 'so', '{\"s_det\": {}}' FROM placements"
+    "reason, scores) SELECT 1, 1, 'loop', 0, 3, S_world_chunk, 0.5, 0, 9, 0.0, 0, 'so', '{\"s_det\": {}}' "
+    "FROM placements"
 )
 _NAN = "zeroblob(48) || x'000000000000f87f' || substr(S_world_chunk, 57)"
 _LIES = {

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,21 +164,39 @@ def _inflated(data: bytes, count: int, bits: int = 0) -> bytes | None:
 
 
 def _lzfse(data: bytes, count: int) -> bytes | None:
-    """The bytes; None where they are damaged, or come in more blocks than so many bytes do.
+    """At most one byte more than what is expected; None where it is damaged.
 
-    A block begins with 40,000 bytes that are new or 10,000 that repeat, and unpacks to 24 MB at most, whatever it
-    claims: there is no other bound.
+    What the package offers to Python unpacks all there is, so the function in its library is called that fills a
+    buffer. Where the library hides it, the blocks are counted: each begins with 40,000 bytes that are new or 10,000
+    that repeat, and unpacks to 24 MB at most, whatever it claims.
     """
-    if sum(data.count(magic) for magic in (b"bvx1", b"bvx2", b"bvxn", b"bvx-")) > 4 + count // 40_000:
-        return None
     try:
         import lzfse
     except ImportError:
         raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
+    fill = _filling(str(lzfse.__file__))
+    if fill is not None:
+        out = ctypes.create_string_buffer(count + 1)
+        written = int(fill(out, count + 1, data, len(data), None))
+        return out.raw[:written] if written else None
+    if sum(data.count(magic) for magic in (b"bvx1", b"bvx2", b"bvxn", b"bvx-")) > 4 + count // 40_000:
+        return None
     try:
         return bytes(lzfse.decompress(data))
     except (lzfse.error, MemoryError):
         return None
+
+
+@lru_cache(maxsize=1)
+def _filling(library: str) -> Callable[..., int] | None:
+    """Return `lzfse_decode_buffer(out, size, data, size, scratch)` of a library; 0 is damage."""
+    try:
+        fill: Any = ctypes.CDLL(library).lzfse_decode_buffer
+    except (OSError, AttributeError):
+        return None
+    fill.argtypes = (ctypes.c_char_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_void_p)
+    fill.restype = ctypes.c_size_t
+    return cast(Callable[..., int], fill)
 
 
 def stored_size(stored: Stored | CodedArray) -> int:

@@ -48,8 +48,10 @@ def _integer(low: int, high: int = _ID) -> Rule:
 
 
 def _text(most: int = _MOST_TEXT) -> Rule:
+    """Return the rule of a text; what SQLite calls its length ends at the first NUL, so its bytes are counted too."""
+    bytes_most = f"length(CAST({{}} AS BLOB)) <= {4 * most}"
     return Rule(
-        f"typeof({{}}) = 'text' AND length({{}}) <= {most} AND list3r_text(CAST({{}} AS BLOB))",
+        f"typeof({{}}) = 'text' AND length({{}}) <= {most} AND {bytes_most} AND list3r_text(CAST({{}} AS BLOB))",
         f"a text of at most {most} characters",
     )
 
@@ -60,7 +62,7 @@ def _one_of(*words: str) -> Rule:
 
 
 def _checked(function: str, words: str, kind: str = "blob") -> Rule:
-    return Rule(f"typeof({{}}) = '{kind}' AND length({{}}) <= {_MOST_CELL} AND {function}({{}})", words)
+    return Rule(f"typeof({{}}) = '{kind}' AND length(CAST({{}} AS BLOB)) <= {_MOST_CELL} AND {function}({{}})", words)
 
 
 def _maybe(rule: Rule) -> Rule:
@@ -176,7 +178,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "structure": _maybe(_text(60)),
         "color_rgb": _integer(0, 2**24 - 1),
         "color_name": _text(60),
-        "component": _integer(-1),
+        "component": _integer(0),
         "view_session": _maybe(_integer(1)),
         "view_frame": Rule("view_session IS NULL OR (typeof({}) = 'integer' AND {} >= 0)", "a frame"),
         "view_box": Rule("view_session IS NULL OR (typeof({}) = 'blob' AND list3r_box({}))", "a box in a picture"),
