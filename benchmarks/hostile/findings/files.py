@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import shutil
@@ -115,7 +116,8 @@ def update_of_a_damaged_memory(place: Place) -> str:
     assert built.status == 0, built.told
     place.ask("label", memory, 1, "thing")
     spoil(memory, "UPDATE merges SET reason = 'so'")
-    ended = place.ask("update", memory, walk, *words, longest_s=120)
+    later = place.walk("later", frames=10, size=(160, 120))
+    ended = place.ask("update", memory, later, *words, longest_s=120)
     if place.ask("verify", memory).status == 0:
         return f"`verify` says sound after `update` (status {ended.status})"
     return ended.bad
@@ -136,18 +138,13 @@ def _left_in_the_log(place: Place) -> Path:
     opened = importlib.import_module("list3r").open
     memory = place.memory("log/m.l3r")
     writer = opened(memory, writable=True)
-    with sqlite3.connect(memory, isolation_level=None) as reader:
+    reader = sqlite3.connect(f"file:{memory}?mode=ro", uri=True, isolation_level=None)
+    with contextlib.closing(reader):
         reader.execute("BEGIN")
         reader.execute("SELECT count(*) FROM instances").fetchall()
-        writer.label(2, "mine") if hasattr(writer, "label") else _label(writer.store)
+        importlib.import_module("list3r.memory.maintenance.edits").label(writer.store, 2, "mine")
         writer.close()
-        reader.execute("ROLLBACK")
-    reader.close()
     return memory
-
-
-def _label(store: object) -> None:
-    importlib.import_module("list3r.memory.maintenance.edits").label(store, 2, "mine")
 
 
 def log_left_is_not_told(place: Place) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib
 import os
 import signal
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from hostile.findings.place import Ended, Place, first, lie
 
@@ -107,23 +107,20 @@ def exports(place: Place) -> str:
 
 
 def path_that_is_no_text(place: Place) -> str:
-    memory = place.memory(os.fsdecode(b"r\xffom.l3r"))
-    commands = (("list", memory), ("label", memory, 2, "mug"), ("show", memory, 77), ("verify", memory))
-    found = first(*(place.ask(*w).bad for w in commands))
-    return first(found, place.ask("list", place.folder / os.fsdecode(b"n\xff")).bad)
+    place.memory(os.fsdecode(b"r\xffom.l3r"))
+    (place.folder / os.fsdecode(b"w\xffalk")).mkdir()
+    name, walk = "$'r\\xffom.l3r'", "$'w\\xffalk'"
+    commands = (f"list {name}", f"label {name} 2 mug", f"show {name} 77", f"verify {name}", f"inspect {walk}")
+    return first(*(place.shell(f"list3r {words}").bad for words in commands))
 
 
 def large_photo(place: Place) -> str:
-    """A JPEG that says it is of 200 megapixels, with the camera's notes."""
-    root, size = place.folder / "photos", struct.pack(">HH", 12_500, 16_000)
+    root = place.folder / "photos"
     root.mkdir()
-    note = b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"
-    app = b"\xff\xe1" + struct.pack(">H", 2 + len(note)) + note
-    frame = b"\xff\xc0\x00\x11\x08" + size + b"\x03\x01\x11\x00\x02\x11\x00\x03\x11\x00"
-    for k in range(3):
-        (root / f"{k}.jpg").write_bytes(b"\xff\xd8" + app + frame + b"\xff\xda\x00\x02" + bytes(64) + b"\xff\xd9")
-    ended = place.ask("inspect", root)
-    return first(ended.bad, "" if ended.status == 2 else f"status {ended.status}")
+    Image.new("L", (16_000, 12_500)).save(root / "0.jpg", quality=10)
+    for k in range(1, 3):
+        os.link(root / "0.jpg", root / f"{k}.jpg")
+    return place.ask("inspect", root).bad
 
 
 def ascii_output(place: Place) -> str:

@@ -1,0 +1,90 @@
+"""The list of what the attack on version 0.1 found, before it was mended and now: by a script in both checkouts."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from machine import STARTED_AT, machine, write_json
+
+HERE = Path(__file__).resolve().parents[2]
+BEFORE = "2aa1804fb2"
+"""The commit before the first that mended any of it."""
+
+
+def run_list(path: Path | None) -> dict[str, Any]:
+    """Return every finding with what was found before and now; goes on with what the file holds already."""
+    held = json.loads(path.read_text(encoding="utf-8")) if path is not None and path.exists() else {}
+    if held and held["machine"] != machine():
+        raise SystemExit(f"{path} was measured on another machine; name another file")
+    rows: dict[str, dict[str, str]] = held.get("findings", {})
+    told: dict[str, Any] = {}
+    with _worktree(BEFORE) as before:
+        for when, checkout, commit in (("before", before, BEFORE), ("after", HERE, STARTED_AT)):
+            fresh = held.get(when) == commit
+            left = [k for k in keys() if not fresh or when not in rows.get(k, {})]
+            for key, found in _looked_for(checkout, left):
+                rows.setdefault(key, {})[when] = found
+                told = {"before": BEFORE, "after": STARTED_AT, "findings": {k: rows[k] for k in keys() if k in rows}}
+                write_json(path, told)
+                print(f"{when:<7}{key:<60}{found or 'holds'}", flush=True)
+            held[when] = commit
+    return told or held
+
+
+def keys() -> list[str]:
+    """Return the names of all findings, in the order of the list."""
+    from hostile.findings.row import ROWS
+
+    return sorted(ROWS, key=lambda key: int(key.split()[0]))
+
+
+def table(told: dict[str, Any]) -> str:
+    """Return the list as a table in Markdown."""
+    lines = [f"| finding | before, {told['before']} | after, {told['after']} |", "|---|---|---|"]
+    for key, found in told["findings"].items():
+        lines.append("| " + " | ".join((key, *(found.get(w) or "holds" for w in ("before", "after")))) + " |")
+    return "\n".join(lines)
+
+
+def open_rows(told: dict[str, Any]) -> list[str]:
+    """Return the findings that are not mended."""
+    return [key for key, found in told["findings"].items() if found.get("after", "not looked for")]
+
+
+@contextlib.contextmanager
+def _worktree(commit: str) -> Iterator[Path]:
+    """A checkout of a commit beside this one, as long as it is needed."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "before"
+        git = ["git", "-C", str(HERE), "worktree"]
+        subprocess.run([*git, "add", "--detach", str(place), commit], check=True, capture_output=True)
+        try:
+            yield place
+        finally:
+            subprocess.run([*git, "remove", "--force", str(place)], check=False, capture_output=True)
+
+
+def _looked_for(checkout: Path, names: list[str]) -> Iterator[tuple[str, str]]:
+    """Look for findings in one process, started in the checkout so that its `list3r` is the one that is imported."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(checkout), str(HERE / "benchmarks")))}
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hostile.findings.row", folder, *names],
+            cwd=checkout,
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        for line in process.stdout:
+            key, found = json.loads(line)
+            yield key, found
+        process.wait()
