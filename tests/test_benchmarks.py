@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.test_workers import alive, until
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 PROGRAMS = sorted(p.stem for p in FOLDER.glob("*.py") if "def main(" in p.read_text(encoding="utf-8"))
@@ -33,3 +36,23 @@ def test_it_says_how_it_is_used(name: str, monkeypatch: pytest.MonkeyPatch, caps
 
 def test_there_are_benchmarks() -> None:
     assert {"safety", "scale", "association", "pose_graph"} <= set(PROGRAMS)
+
+
+def test_processes_of_a_benchmark_end_with_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import sys, time\nsys.path[:0] = [{str(FOLDER)!r}, {str(FOLDER.parent)!r}]\n"
+        "from concurrent.futures import ProcessPoolExecutor\nimport multiprocessing, os\n"
+        "from machine import end_with_parent\n"
+        "if __name__ == '__main__':\n"
+        "    spawn = multiprocessing.get_context('spawn')\n"
+        "    with ProcessPoolExecutor(1, mp_context=spawn, initializer=end_with_parent) as pool:\n"
+        "        print(pool.submit(os.getpid).result(), flush=True)\n"
+        "        pool.submit(time.sleep, 60).result()\n"
+    )
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    worker = int(process.stdout.readline())
+    process.terminate()
+    process.communicate(timeout=60)
+    assert until(lambda: not alive(worker))

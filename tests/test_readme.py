@@ -1,7 +1,8 @@
-"""README.md: its tables show the committed results."""
+"""README.md: its tables show the committed results. The threat model: the tests it names are there."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,3 +25,15 @@ def test_a_figure_that_differs_is_found(tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text(readme.replace("| 1.5 |", "| 0.1 |", 1), encoding="utf-8")
     said = subprocess.run([sys.executable, str(tmp_path / "scripts/readme_tables.py"), "--check"], capture_output=True)
     assert said.returncode == 1
+
+
+def test_every_promise_of_the_threat_model_names_tests_that_are_there() -> None:
+    page = (SCRIPT.parents[1] / "docs/threat-model.md").read_text(encoding="utf-8")
+    promises = [line for line in page.splitlines() if line.startswith("| ") and line != "| promise | test |"]
+    assert len(promises) > 25
+    for line in promises:
+        source = ""
+        for name, test in re.findall(r"`(test_\w+\.py)?(?:::(test_\w+))?`", line.rpartition(" | ")[2]):
+            source = (Path(__file__).parent / name).read_text(encoding="utf-8") if name else source
+            assert source and f"def {test}" in source, (name, test)
+        assert source, line

@@ -19,7 +19,7 @@ _DAMAGES = {
 }
 _QUESTIONS: dict[str, Callable[[Any], object]] = {
     "instances": lambda scene: scene.instances(),
-    "find": lambda scene: scene.find("white box"),
+    "find": lambda scene: scene.find("mug"),
     "nearest": lambda scene: scene.nearest((0.0, 0.0, 0.0)),
     "support": lambda scene: scene.support(2),
     "seen": lambda scene: scene.seen(2),
@@ -55,15 +55,26 @@ def _asked(question: str, damage: str) -> Callable[[Place], str]:
     return lambda place: _wrong(place, question, damage)
 
 
+_MASKS = {
+    "masks of zeros": _DAMAGES["masks"],
+    "a changed byte of masks": "UPDATE local_instances SET track = CAST(substr(track, 1, 99) || x'ff' || "
+    "substr(track, 101) AS BLOB)",
+    "masks of another": "UPDATE local_instances SET track = (SELECT track FROM local_instances WHERE local_id = 4)",
+    "the ends of masks": "UPDATE local_instances SET track = CAST(substr(track, 1, 400) || zeroblob(200) AS BLOB)",
+}
+
+
 def _swallowed(*words: object) -> Callable[[Place], str]:
     def look(place: Place) -> str:
         sound = place.ask("query", words[0], place.memory(), *words[1:])
         assert sound.status == 0, sound
-        memory = place.memory()
-        spoil(memory, _DAMAGES["masks"])
-        ended = place.ask("query", words[0], memory, *words[1:])
-        wrong = ended.status == 0 and ended.out != sound.out
-        return first(ended.bad, "another answer, status 0" if wrong else "")
+        for damage, statement in _MASKS.items():
+            memory = place.memory()
+            spoil(memory, statement)
+            ended = place.ask("query", words[0], memory, *words[1:])
+            if ended.bad or (ended.status == 0 and ended.out != sound.out):
+                return first(ended.bad, f"another answer, status 0 ({damage})")
+        return ""
 
     return look
 
@@ -81,7 +92,7 @@ def large_files(place: Place) -> str:
 def an_error_of_the_callers_own(place: Place) -> str:
     opened = importlib.import_module("list3r").open
     try:
-        with opened(place.memory(), at=1) as scene:
+        with opened(place.two_sessions(), at=1) as scene:
             scene.instances()
             raise KeyError("mine")
     except Exception as error:
@@ -89,14 +100,14 @@ def an_error_of_the_callers_own(place: Place) -> str:
 
 
 def verify_of_the_past(place: Place) -> str:
-    with importlib.import_module("list3r").open(place.memory(), at=1) as scene:
+    with importlib.import_module("list3r").open(place.two_sessions(), at=1) as scene:
         found = scene.store.verify()
     return f"lists {len(found)} damages of a sound file" if found else ""
 
 
 def past_and_present_mixed(place: Place) -> str:
     """Another process deletes a thing while the past is read: it is there in all tables or in none."""
-    memory = place.memory()
+    memory = place.two_sessions()
     with importlib.import_module("list3r").open(memory, at=1) as scene:
         scene.instances()
         place.ask("delete", memory, 4)

@@ -91,6 +91,14 @@ class Place:
         path.write_bytes(self._room)
         return path
 
+    def two_sessions(self) -> Path:
+        """Return the memory with a second session, in which nothing was seen."""
+        path = self.memory()
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            names = [row[1] for row in database.execute("PRAGMA table_info(sessions)") if row[1] != "session_id"]
+        rest = ", ".join(names)
+        return lie(path, f"INSERT INTO sessions (session_id, {rest}) SELECT 2, {rest} FROM sessions")
+
     def older(self, name: str = "m.l3r") -> Path:
         """Return a memory of an older schema."""
         return Path(shutil.copy(self.checkout / "tests/fixtures/schema6.l3r", self.folder / name))
