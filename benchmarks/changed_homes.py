@@ -68,7 +68,9 @@ def one_home(root: Path, seed: int) -> dict[str, Any]:
     common = ("--poses", "estimate", "--workers", "1")
     usage: dict[str, dict[str, float]] = {}
     if not one.exists():
-        _, usage["build"] = run_list3r("build", str(root / "first"), "-m", str(one), *common)
+        part = root / "part.l3r"
+        _, usage["build"] = run_list3r("build", str(root / "first"), "-m", str(part), "--force", *common)
+        part.rename(one)
     two.unlink(missing_ok=True)
     shutil.copy(one, two)
     report, usage["update"] = run_list3r("update", str(two), str(root / "second"), *common)

@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from list3r.association.revisits.second_looks import SecondLookSettings, seeing_the_same
 from list3r.association.revisits.session_ties import hold_back
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.records import Edge, FrameSamples
 
 CHUNKS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 3, 6: 3}
 """Session of each chunk; chunk k stands at x = k metres."""
@@ -46,6 +48,25 @@ def test_two_of_the_same_chunks_count_when_their_frames_lie_apart(frames: tuple[
     one, two = replace(_edge(1, 3), frames=(2, 5)), replace(_edge(1, 3, off_m=0.05), frames=frames)
     assert _accepted([*INSIDE, one, two])[3:] == [placed, placed]
     assert _accepted([*INSIDE, one, replace(two, S_v_u=_edge(1, 3, off_m=2.0).S_v_u)])[3:] == [False, False]
+
+
+def test_a_relation_says_which_other_keyframes_see_the_same() -> None:
+    """Cameras that turn on the spot, two chunks in gauges of their own; a frame of v looks where that of u does."""
+    frames = np.arange(0, 60, 5)
+    T = np.tile(np.eye(4), (len(frames), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("y", 6.0 * frames[:, None], degrees=True).as_matrix()
+    S = Sim3(2.0, Rotation.from_euler("x", 40, degrees=True).as_matrix(), np.array([1.0, -2.0, 0.5]))
+    moved = T.copy()
+    moved[:, :3, :3], moved[:, :3, 3] = S.rotation @ T[:, :3, :3], S.apply(T[:, :3, 3])
+    empty = FrameSamples.empty()
+    u, v = (replace(empty, camera_frames=frames, T_chunk_cam=poses) for poses in (T, moved))
+    edge = replace(_edge(1, 3), S_v_u=S, frames=(10, 10))
+    found = seeing_the_same(edge, (u, v), (frames.tolist(), frames.tolist()), SecondLookSettings(most=8))
+    assert len(found) == 8 and {a - b for a, b in found} == {0}
+    assert min(abs(a - 10) for a, _ in found) == 10
+    near = SecondLookSettings(most=99, turn_deg=31.0)
+    apart = seeing_the_same(edge, (u, v), (frames.tolist(), frames.tolist()), near)
+    assert {abs(a - b) for a, b in apart} == {0, 5, 55}
 
 
 def test_two_that_disagree_do_not() -> None:

@@ -9,7 +9,7 @@ scores and the reason. How the weights were chosen: docs/decisions/0045.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -37,6 +37,7 @@ from list3r.association.revisits.joint_window import (
     no_edge,
 )
 from list3r.association.revisits.scaled_verification import verify_scaled
+from list3r.association.revisits.second_looks import SecondLookSettings, seeing_the_same
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
@@ -83,6 +84,8 @@ class RevisitSettings:
     chain: ChainSettings = field(default_factory=ChainSettings)
     things: ThingSearchSettings = field(default_factory=ThingSearchSettings)
     """Where frames that look alike do not suffice."""
+    second_looks: SecondLookSettings = field(default_factory=SecondLookSettings)
+    """Where a single relation ties a session to another."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,8 @@ def _by_frames(
             edge = look.verified(scored, joint, accepted)
             tried += 1
         edges.append(_with_scores(edge, scored))
+    if chosen.verified and (alone := look.alone(edges)) is not None:
+        edges += look.second_looks(alone, {e.frames for e in edges if e.u == alone.u})
     return look.unambiguous(edges) if chosen.verified else edges
 
 
@@ -255,6 +260,31 @@ class _Lookout:
     def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
         """Tell whether a chunk that nothing tied to the new one before hangs on a single pair of frames so far."""
         return self._apart(u) and len(accepted) == 1
+
+    def alone(self, edges: Sequence[Edge]) -> Edge | None:
+        """Return the one accepted edge that ties the new chunk to another session, None where there is no such one."""
+        accepted = [e for e in edges if e.accepted]
+        if len(accepted) != 1 or accepted[0].frames is None:
+            return None
+        u = accepted[0].u
+        other = self._rows[u].session_id != self._rows[self._id].session_id
+        return accepted[0] if other and self._apart(u) else None
+
+    def second_looks(self, edge: Edge, known: Container[tuple[int, int] | None]) -> list[Edge]:
+        """Return relations of further keyframes of two chunks, until one more is accepted (docs/decisions/0056).
+
+        The edge only says which keyframes are worth it: each pair is compared as if nothing were known.
+        """
+        sides = self._side(edge.u).samples, self._side(self._id).samples
+        u, v = (self._store.keyframes.descriptors([k])[0][:, 1].tolist() for k in (edge.u, self._id))
+        out: list[Edge] = []
+        for frame_u, frame_v in seeing_the_same(edge, sides, (u, v), self._settings.second_looks):
+            scored = _Scored(Candidate(edge.u, frame_u, frame_v, 0.0, 0.0), NO_CUES, 0.0)
+            if (frame_u, frame_v) not in known and all(map(_tells, self._keyframes(scored.candidate))):
+                out.append(self.verified(scored, None, ()))
+            if out and out[-1].accepted:
+                break
+        return out
 
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
         """Return the edges without those that join what was apart in more than one way.

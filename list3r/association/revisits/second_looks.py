@@ -1,0 +1,70 @@
+"""Which further keyframes of two chunks are worth a comparison, where a single relation ties a session to another.
+
+A short session has few chunks, and frames of a changed room in another light propose few pairs. One relation alone does
+not place a session; but it says which other keyframes should see the same (docs/decisions/0056).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.memory.geometry import Sim3
+from list3r.memory.records import Edge, FrameSamples
+
+
+@dataclass(frozen=True)
+class SecondLookSettings:
+    """Which keyframes are compared once more."""
+
+    most: int = 6
+    """Pairs of keyframes."""
+    apart_frames: int = 10
+    """They lie so many frames from those of the relation, on both sides,"""
+    turn_deg: float = 50.0
+    """their axes enclose at most this,"""
+    depths: float = 1.0
+    """and a way between them of one median depth of the chunk counts as much as all of that turn."""
+
+
+def seeing_the_same(
+    edge: Edge,
+    samples: tuple[FrameSamples, FrameSamples],
+    keyframes: tuple[Sequence[int], Sequence[int]],
+    settings: SecondLookSettings,
+) -> list[tuple[int, int]]:
+    """Return pairs of keyframes (Frame.index) that an edge puts beside each other, the nearest ones first.
+
+    `samples` and `keyframes` are those of chunks u and v.
+    """
+    assert edge.frames is not None
+    u = _views(samples[0], keyframes[0], edge.frames[0], edge.S_v_u, settings)
+    v = _views(samples[1], keyframes[1], edge.frames[1], Sim3.identity(), settings)
+    reach = settings.depths * _reach(samples[1])
+    found = []
+    for frame_u, (at_u, axis_u) in u.items():
+        for frame_v, (at_v, axis_v) in v.items():
+            turn = float(np.degrees(np.arccos(np.clip(axis_u @ axis_v, -1.0, 1.0)))) / settings.turn_deg
+            if turn <= 1.0:
+                found.append((turn + float(np.linalg.norm(at_u - at_v)) / reach, frame_u, frame_v))
+    return [(frame_u, frame_v) for _, frame_u, frame_v in sorted(found)][: settings.most]
+
+
+def _views(
+    samples: FrameSamples, keyframes: Sequence[int], frame: int, S: Sim3, settings: SecondLookSettings
+) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return where the keyframes far from a frame stand and look, moved by a similarity."""
+    poses = dict(zip(samples.camera_frames.tolist(), samples.T_chunk_cam, strict=True))
+    far = [k for k in keyframes if k in poses and abs(k - frame) >= settings.apart_frames]
+    return {k: (S.apply(poses[k][:3, 3]), S.rotation @ poses[k][:3, 2]) for k in far}
+
+
+def _reach(samples: FrameSamples) -> float:
+    """Return the median distance of a chunk's points from its cameras' middle, chunk units."""
+    if not len(samples.points) or not len(samples.T_chunk_cam):
+        return 1.0
+    middle = samples.T_chunk_cam[:, :3, 3].mean(axis=0)
+    return max(float(np.median(np.linalg.norm(samples.points - middle, axis=1))), 1e-6)
