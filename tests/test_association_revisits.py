@@ -39,11 +39,14 @@ class Chunks:
         self.chunks = SimpleNamespace(
             all=self._all,
             checksums=lambda: {k: id(ks) for k, ks in enumerate(done)},
+            checksum=lambda chunk_id: id(self.done[chunk_id]),
             samples=lambda chunk_id: FrameSamples.empty(),
             feature_space=lambda chunk_id: "test@1/4",
         )
         self.keyframes = SimpleNamespace(get=self._keyframe, descriptors=self._descriptors)
-        self.local_instances = SimpleNamespace(nodes=lambda chunk_ids: [], signature=lambda chunk_id: (0,))
+        self.local_instances = SimpleNamespace(
+            nodes=lambda chunk_ids: [], signature=lambda chunk_id: (0,), dynamic=lambda chunk_id: []
+        )
         self.edges = SimpleNamespace(all=lambda: list(known))
 
     def _all(self, session_id: int | None = None) -> list[ChunkRow]:
