@@ -22,7 +22,7 @@ from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import BuildReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Job, Plan, add_chunks, lost_reasons, plan_session, prepare
+from list3r.pipeline.session import Before, Job, Plan, add_chunks, lost_reasons, plan_session, prepare
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import make_folder, open_target
 from list3r.reconstruction.registry import entry
@@ -46,7 +46,7 @@ def build(
     check_address_space(BUILD_MB, "a build")
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
-    job = prepare(source, options, settings, run, memory, watch=watch)
+    job = prepare(source, options, settings, run, Before(memory), watch)
     watch.tell((*job.info.notes, *job.notes))
     if watch.debug_dir is not None:
         make_folder(watch.debug_dir)

@@ -33,7 +33,7 @@ from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.reports import BuildReport, LiveReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Job, Plan, note_lost, prepare, settled_step
+from list3r.pipeline.session import Before, Job, Plan, note_lost, prepare, settled_step
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import Target, open_target
 from list3r.pipeline.workers import OrderedPool
@@ -217,7 +217,7 @@ def _job(
     memory: Path,
     source: str,
 ) -> Job:
-    job = prepare(feed.folder, options, settings, run, memory)
+    job = prepare(feed.folder, options, settings, run, Before(memory))
     info: SourceInfo = replace(job.info, fingerprint=uuid.uuid4().hex, path=without_secrets(source))
     return replace(job, info=info, opened=None)
 

@@ -80,27 +80,35 @@ class Plan:
         return max(0, fresh - shared)
 
 
+@dataclass(frozen=True)
+class Before:
+    """The memory of a session, as it may be there before it."""
+
+    memory: Path
+    update: bool = False
+    """The session is a later one of it."""
+
+
 def prepare(
     source: str | Path,
     options: SourceOptions | None,
     settings: BuildSettings | BuildRequest | None,
     run: RunOptions,
-    memory: Path | None = None,
-    *,
-    later: bool = False,
+    before: Before | None = None,
     watch: Watch | None = None,
 ) -> Job:
     """Open a source and make everything definite that was left open. Raises `SourceError` and `OptionError`.
 
-    A resumed session of the `memory` goes on with its own settings. A `later` session of it takes the settings of its
-    first one, but for what is asked for.
+    A resumed session of a memory goes on with its own settings. An update of it takes the settings of its first
+    session, but for what is asked for.
     """
     options = options or SourceOptions()
     check_run(run)
     opened = open_source(source, options, (watch or Watch()).looking("frames"))
     info = opened.info
     options.check_fits(info)
-    first, begun = (None, None) if memory is None else stored_sessions(memory)
+    later = before is not None and before.update
+    first, begun = (None, None) if before is None else stored_sessions(before.memory)
     begun = begun or (None if later else first)  # a build that is done has nothing left to do
     first, begun = first if later else None, begun if run.resume else None
     notes: list[str] = []

@@ -22,7 +22,7 @@ from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import UpdateReport, update_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Job, Plan, add_chunks, lost_reasons, plan_session, prepare, take_back
+from list3r.pipeline.session import Before, Job, Plan, add_chunks, lost_reasons, plan_session, prepare, take_back
 from list3r.pipeline.settings import BuildSettings
 
 
@@ -45,7 +45,7 @@ def update(
     check_address_space(BUILD_MB, "a build")
     started = time.monotonic()
     run, watch, memory = run or RunOptions(), watch or Watch(), Path(memory)
-    job = prepare(source, options, settings, run, memory, later=True, watch=watch)
+    job = prepare(source, options, settings, run, Before(memory, update=True), watch)
     watch.tell(job.notes)
     with Store.open(memory, writable=True) as store:
         session = _session(store, job)

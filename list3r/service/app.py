@@ -71,7 +71,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Region:
+class Bounds:
     """A box (`lower`, `upper`) or a sphere (`center`, `radius`); numbers of a corner one by one."""
 
     lower: Corner = None
@@ -165,10 +165,10 @@ class _Questions:
         found = self._catalog.nearest(name, point=point, instance_id=id, k=k, filters=which.filters())
         return self._paged(found, page, found.notes)
 
-    def within(self, name: str, page: Paged, which: Filtered, region: Annotated[Region, Depends()]) -> dict[str, Any]:
+    def within(self, name: str, page: Paged, which: Filtered, bounds: Annotated[Bounds, Depends()]) -> dict[str, Any]:
         """Things in a box or a sphere."""
-        bounds: dict[str, Any] = asdict(region)
-        found = self._catalog.within(name, **bounds, filters=which.filters())
+        sides: dict[str, Any] = asdict(bounds)
+        found = self._catalog.within(name, **sides, filters=which.filters())
         return self._paged(found, page, found.notes, total=len(found))
 
     def similar(

@@ -10,7 +10,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.build.asked import Asked
+from list3r.cli.build.build_options import BuildOptions
 from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
 from list3r.cli.common import JsonOption, spread
 from list3r.cli.terminal import say
@@ -88,7 +88,7 @@ def build(
     more: src.MoreArgument = None,
     *,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
-    asked: Asked,
+    asked: BuildOptions,
     debug: Annotated[
         Path | None, typer.Option("--debug", metavar="DIR", help="Write overlays of masks and tracks there.")
     ] = None,

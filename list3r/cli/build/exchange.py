@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +24,20 @@ def register(app: typer.Typer) -> None:
     app.command("import")(import_map)
 
 
+@dataclass(frozen=True)
+class PredictionWords:
+    """What is known of the predictions of a network, as options."""
+
+    frame_size: Annotated[
+        str | None,
+        typer.Option("--frame-size", metavar="WxH", help="Of predictions: size of the video's frames, where cut."),
+    ] = None
+    masks: Annotated[
+        Path | None,
+        typer.Option("--masks", metavar="DIR", help="Of predictions: things, as EntitySAM saves them."),
+    ] = None
+
+
 @spread
 def convert(
     source: src.SourceArgument,
@@ -34,14 +49,7 @@ def convert(
             "--to", metavar="LAYOUT", help="tum, transforms, colmap, replica, r3d; of predictions: precomputed."
         ),
     ],
-    frame_size: Annotated[
-        str | None,
-        typer.Option("--frame-size", metavar="WxH", help="Of predictions: size of the video's frames, where cut."),
-    ] = None,
-    masks: Annotated[
-        Path | None,
-        typer.Option("--masks", metavar="DIR", help="Of predictions: things, as EntitySAM saves them."),
-    ] = None,
+    predictions: PredictionWords,
     words: src.SourceWords,
     json: JsonOption = False,
 ) -> None:
@@ -52,7 +60,8 @@ def convert(
     if to == "precomputed":
         from list3r.reconstruction.outputs.base import OutputOptions
 
-        options = OutputOptions(words.every, None if frame_size is None else read_size(frame_size), masks)
+        size = predictions.frame_size
+        options = OutputOptions(words.every, None if size is None else read_size(size), predictions.masks)
         _convert_predictions(Path(source), folder, options, json)
         return
     from list3r.frames.convert import convert as write

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from list3r.cli.build import source_options as src
-from list3r.cli.build.asked import Asked
+from list3r.cli.build.build_options import BuildOptions
 from list3r.cli.build.progress import say_result, watching
 from list3r.cli.common import JsonOption, MemoryArgument, spread
 
@@ -27,7 +27,7 @@ def update(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
-    asked: Asked,
+    asked: BuildOptions,
     json: JsonOption = False,
 ) -> None:
     """Add one more video to a memory: it is placed against what is stored, and what has changed is written down.

@@ -9,7 +9,7 @@ from list3r.pipeline.request import BuildRequest, RunOptions
 
 
 @dataclass(frozen=True)
-class Asked:
+class BuildOptions:
     """How a video is read and reconstructed, and how the work runs, as options."""
 
     request: BuildRequest
