@@ -10,7 +10,6 @@ text made for each question (of every tenth of them), whose ids it names.
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import tempfile
 from collections import Counter
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from machine import write_json
 
 import list3r
 from list3r.api import SceneMemory
@@ -28,7 +28,7 @@ from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store.store import Store
 
-BUDGETS = (300, 1000, 4000, 16000)
+BUDGETS = (300, 1000, 4000)
 KINDS = ("nearest", "held", "count", "far", "direction")
 _NAMES = [
     f"{color} {shape}" for color in ("red", "blue", "white", "tan") for shape in ("mug", "box", "chair", "lamp", "book")
@@ -179,7 +179,7 @@ def measure(memory: SceneMemory, count: int) -> list[dict[str, Any]]:
         special = [Reader(memory.prompt(tokens, q.text).text, memory.units).answers(q) for q in few]
         by_kind = {k: [r for r, q in zip(right, asked, strict=True) if q.kind == k] for k in KINDS}
         row = {
-            "memory": memory.path.name, "instances": prompt.instances, "budget": tokens, "tokens": prompt.tokens,
+            "memory": memory.path.stem, "instances": prompt.instances, "budget": tokens, "tokens": prompt.tokens,
             "listed": len(prompt.listed), "questions": len(asked), "general": float(np.mean(right)),
             "asked": float(np.mean(special)), **{k: float(np.mean(v)) for k, v in by_kind.items() if v},
         }  # fmt: skip
@@ -204,8 +204,7 @@ def main() -> None:
         for path in paths:
             with list3r.open(path) as memory:
                 rows += measure(memory, options.questions)
-    if options.out:
-        options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            write_json(options.out, {"rows": rows})  # None writes nothing
 
 
 if __name__ == "__main__":

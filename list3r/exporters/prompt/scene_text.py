@@ -93,7 +93,8 @@ def ranked_instances(memory: SceneMemory, things: Sequence[Instance], question: 
     if not question:
         return usual
     named = {m.instance.id: m.score for m in memory.nearest(question, k=200)}
-    named |= {i.id: 2.0 for i in things if re.search(rf"#{i.id}\b", question)}
+    written = {int(n) for n in re.findall(r"#(\d+)\b", question)}
+    named |= {i.id: 2.0 for i in things if i.id in written}
     if not named:
         return usual
     anchors = np.array([i.center for i in things if i.id in named])
@@ -159,8 +160,12 @@ class _SceneWriter:
 
     def rows(self, budget: Budget, ranked: Sequence[Instance]) -> list[Instance]:
         """Add a row for each instance as long as there is room; those that have one."""
-        lines = [(i, self.row(i)) for i in ranked]
-        whole = sum(_cost(line) for _, line in lines)
+        lines, whole = [], 0
+        for i in ranked:
+            lines.append((i, self.row(i)))
+            whole += _cost(lines[-1][1])
+            if whole > budget.left:
+                break
         keep = 0 if whole <= budget.left else int((1.0 - self.settings.share_of_rows) * budget.tokens)
         out = []
         for i, line in lines:
