@@ -1,9 +1,9 @@
-"""Print the tables of README.md from the committed results, or check that README.md shows them.
+"""Print the tables of README.md and docs from the committed results, or check that they show them.
 
-    python scripts/readme_tables.py            # write the tables between their marks in README.md
-    python scripts/readme_tables.py --check    # exit status 1 where README.md differs
+    python scripts/readme_tables.py            # write the tables between their marks
+    python scripts/readme_tables.py --check    # exit status 1 where a page differs
 
-Each table is read from JSON files under benchmarks/results, which the command named below the table in README.md wrote.
+Each table is read from JSON files under benchmarks/results, which the command named beside the table wrote.
 """
 
 from __future__ import annotations
@@ -226,6 +226,35 @@ def relations() -> str:
     return _table(["relations with true masks", *names.values()], [["precision, recall", *cells]])
 
 
+def pack() -> str:
+    """Return which share of questions the text for a language model answers, by memory and budget."""
+    rows = _read("prompt_pack")["rows"]
+    budgets = sorted({r["budget"] for r in rows})
+    found = {(r["memory"], r["instances"]): {} for r in rows}
+    for r in rows:
+        found[r["memory"], r["instances"]][r["budget"]] = f"{100 * r['general']:.0f} / {100 * r['asked']:.0f} %"
+    head = ["memory", "instances", *(f"{b:,} tokens" for b in budgets)]
+    return _table(
+        head, [[m.split("-")[0], f"{n:,}", *(row.get(b, "") for b in budgets)] for (m, n), row in found.items()]
+    )
+
+
+def exports() -> str:
+    """Return what every export takes, by format and number of instances."""
+    rows = _read("exporters")["rows"]
+    counts = sorted({r["instances"] for r in rows})
+    formats = dict.fromkeys(r["format"] for r in rows)
+    found = {(r["format"], r["instances"]): r for r in rows}
+
+    def cell(name: str, count: int) -> str:
+        r = found.get((name, count))
+        if r is None:
+            return "not measured"
+        return f"{r['cpu_s']:.1f} s, {r['peak_mb']} MB, {r['mb']:.1f} MB" if r["done"] else "not done"
+
+    return _table(["format", *(f"{n:,}" for n in counts)], [[n, *(cell(n, c) for c in counts)] for n in formats])
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "kitchen": kitchen,
     "walks": walks,
@@ -237,16 +266,20 @@ TABLES: dict[str, Callable[[], str]] = {
     "alignment": alignment,
     "changes": changes,
     "relations": relations,
+    "pack": pack,
+    "exports": exports,
 }
+PAGES = ("README.md", "docs/prompt.md", "docs/commands.md")
+"""The pages with tables."""
 
 
 def filled(text: str) -> str:
-    """Return README's text with every marked table written anew. Raises `SystemExit` for a mark without a table."""
+    """Return a page with every marked table written anew. Raises `SystemExit` for a mark without a table."""
 
     def fill(mark: re.Match[str]) -> str:
         name = mark.group(1)
         if name not in TABLES:
-            raise SystemExit(f"README.md asks for the table {name}; there are {', '.join(TABLES)}")
+            raise SystemExit(f"a page asks for the table {name}; there are {', '.join(TABLES)}")
         return f"<!-- table {name} -->\n{TABLES[name]()}\n<!-- end of table -->"
 
     return re.sub(r"<!-- table (\w+) -->\n.*?<!-- end of table -->", fill, text, flags=re.DOTALL)
@@ -254,16 +287,16 @@ def filled(text: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 where README.md differs")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 where a page differs")
     check = parser.parse_args().check
-    readme = ROOT / "README.md"
-    before = readme.read_text(encoding="utf-8")
-    after = filled(before)
-    if check and before != after:
-        print("README.md shows other figures than benchmarks/results: run scripts/readme_tables.py", file=sys.stderr)
-        raise SystemExit(1)
-    if not check:
-        readme.write_text(after, encoding="utf-8")
+    for page in PAGES:
+        before = (ROOT / page).read_text(encoding="utf-8")
+        after = filled(before)
+        if check and before != after:
+            print(f"{page} shows other figures than benchmarks/results: run scripts/readme_tables.py", file=sys.stderr)
+            raise SystemExit(1)
+        if not check:
+            (ROOT / page).write_text(after, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -75,7 +77,7 @@ def test_the_readme_names_every_command() -> None:
 def test_the_page_of_commands_names_every_command_and_option_and_no_other() -> None:
     page = (Path(__file__).resolve().parents[1] / "docs/commands.md").read_text(encoding="utf-8")
     told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", " ".join(re.findall(r"`[^`]*`", page))))
-    assert told == options_of(commands()) | {"-h", "--help", "--version"}
+    assert told == options_of(commands()) | {"-h", "--help", "--version", "--install-completion", "--show-completion"}
     assert [c for c in COMMANDS if not re.search(rf"`[^`]*\b{c.split('.')[-1]}\b", page)] == []
 
 
@@ -188,3 +190,23 @@ def test_the_face_for_python(room: Path) -> None:
 
 def test_the_version_is_the_package_s() -> None:
     assert as_user("--version").stdout.strip() == f"list3r {list3r.__version__}"
+
+
+COMPLETING = """
+eval "$(list3r --show-completion)"
+complete_words() {
+    COMP_WORDS=(list3r "$@"); COMP_CWORD=$#; COMPREPLY=(); _list3r_completion list3r; echo "${COMPREPLY[@]}"
+}
+complete_words query ne
+complete_words export a.l3r --to no
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None or os.name != "posix", reason="there is no bash")
+def test_bash_completes_commands_and_formats(tmp_path: Path) -> None:
+    program = tmp_path / "list3r"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m list3r "$@"\n')
+    program.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    bash = subprocess.run(["bash"], input=COMPLETING, env=environment, capture_output=True, text=True)
+    assert bash.stdout.split("\n") == ["nearest", "node-link", ""], bash.stderr

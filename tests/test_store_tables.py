@@ -7,13 +7,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from list3r.memory.change.ledger import read_ledger
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.rules import WORLD
 from list3r.memory.records import DetectedLabel, SessionCamera, Votes
 from list3r.memory.store.facts import Fact
+from list3r.memory.store.rows.json_values import array_scalar, typed
 from list3r.memory.store.store import Store
 
 Make = Callable[..., Path]
@@ -127,3 +130,10 @@ def test_a_value_that_is_none_of_its_column_names_the_row(
         store.connection.forget()
         with pytest.raises(MemoryFileError, match=where):
             ask(store)
+
+
+def test_arrays_are_known_by_their_type_in_every_numpy() -> None:
+    assert array_scalar(NDArray[np.float32]) is np.float32
+    assert array_scalar(np.ndarray[tuple[int], np.dtype[np.int8]]) is np.int8
+    assert [array_scalar(kind) for kind in (int, list[int], tuple[int, ...])] == [None] * 3
+    assert typed(NDArray[np.float32], [1, 2]).dtype == np.float32

@@ -103,7 +103,6 @@ def commands(asked: str | None = None) -> Any:
         cls=GroupedCommands,
         help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example.",
         no_args_is_help=True,
-        add_completion=False,
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},

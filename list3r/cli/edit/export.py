@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory
 
 
+_FORMAT_OPTION = typer.Option(
+    "--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.", autocompletion=lambda: list(FORMATS)
+)
+
+
 def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command("export")(export)
@@ -43,7 +48,7 @@ class ExportWords:
 @spread
 def export(
     memory: MemoryArgument,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")],
+    to: Annotated[str, _FORMAT_OPTION],
     out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for a pipe.")],
     *,
     words: ExportWords,

@@ -22,7 +22,7 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import Shape
 from list3r.memory.store.rows.codec import pack, pack_sim3, raw_array, to_json, unpack, unpack_sim3
-from list3r.memory.store.rows.json_values import plain, typed
+from list3r.memory.store.rows.json_values import array_scalar, plain, typed
 from list3r.memory.unpacking import parse_json
 
 R = TypeVar("R")
@@ -189,8 +189,8 @@ def _kind(hint: Any) -> tuple[Encode, Decode]:
         return _KINDS[hint]
     shape = next((n.sizes for n in getattr(hint, "__metadata__", ()) if isinstance(n, Shape)), None)
     if shape is not None:
-        return _numbers(get_args(inner[0])[1], shape)
-    if is_dataclass(hint) and all(get_origin(h) is np.ndarray for h in get_type_hints(hint).values()):
+        return _numbers(array_scalar(inner[0]), shape)
+    if is_dataclass(hint) and all(array_scalar(h) is not None for h in get_type_hints(hint).values()):
         return arrays(hint)  # type: ignore[arg-type]
     return (lambda v: to_json(plain(v))), (lambda v: typed(hint, parse_json(v)))
 
@@ -204,9 +204,9 @@ def _exactly(kind: Any) -> Decode:
     return decode
 
 
-def _numbers(dtype: Any, shape: tuple[int, ...]) -> tuple[Encode, Decode]:
+def _numbers(scalar: Any, shape: tuple[int, ...]) -> tuple[Encode, Decode]:
     """A blob of numbers of a known shape, of which one length may be open (-1)."""
-    little = np.dtype(get_args(dtype)[0]).newbyteorder("<")
+    little = np.dtype(scalar).newbyteorder("<")
 
     def decode(blob: Any) -> Any:
         flat = np.frombuffer(_exactly(bytes)(blob), little)
@@ -217,7 +217,7 @@ def _numbers(dtype: Any, shape: tuple[int, ...]) -> tuple[Encode, Decode]:
 
 def arrays(record: type[Any], **missing: Callable[[dict[str, NDArray[Any]]], Any]) -> tuple[Encode, Decode]:
     """A record of arrays as one compressed blob; `missing` make what older ones do not hold."""
-    types_of = {n: get_args(get_args(h)[1])[0] for n, h in get_type_hints(record).items()}
+    types_of = {n: array_scalar(h) for n, h in get_type_hints(record).items()}
 
     def encode(value: Any) -> bytes:
         return pack({n: np.asarray(getattr(value, n)).astype(t, copy=False) for n, t in types_of.items()})

@@ -9,8 +9,20 @@ from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
+
+
+def array_scalar(hint: Any) -> Any:
+    """Return the type of the numbers of an array type; None for any other type.
+
+    `NDArray[np.float32]` is `ndarray[..., dtype[float32]]`, from NumPy 2.5 on an alias with one argument.
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is np.ndarray:
+        return get_args(inner[1])[0]
+    return inner[0] if inner and origin is NDArray else None
 
 
 def plain(value: object) -> object:
@@ -36,6 +48,8 @@ def typed(hint: Any, value: object, *, lenient: bool = False) -> Any:
     origin, inner = get_origin(hint), get_args(hint)
     if hint in (Any, object):
         return value
+    if (scalar := array_scalar(hint)) is not None:
+        return np.array(value, scalar)
     if origin in (Union, types.UnionType):
         one = next(h for h in inner if h is not type(None))
         return None if value is None and type(None) in inner else typed(one, value, lenient=lenient)
@@ -51,8 +65,6 @@ def _plain(hint: Any, value: object, lenient: bool) -> Any:
 
 
 def _generic(origin: Any, inner: tuple[Any, ...], value: object, lenient: bool) -> Any:
-    if origin is np.ndarray:
-        return np.array(value, get_args(inner[1])[0])
     if origin in (dict, Mapping):
         return {_key(inner[0], k): typed(inner[1], v, lenient=lenient) for k, v in _checked(dict, value).items()}
     values = _checked((list, tuple), value)
