@@ -66,9 +66,10 @@ class Ways:
         """Return the chunks that some way leads to, and the chunk itself."""
         out, queue = {chunk_id}, [chunk_id]
         while queue:
-            fresh = {k for k, _ in self._near.get(queue.pop(), [])} - out
-            out |= fresh
-            queue += sorted(fresh)
+            for k, _ in self._near.get(queue.pop(), ()):
+                if k not in out:
+                    out.add(k)
+                    queue.append(k)
         return out
 
     def predict(self, u: int, v: int, more: Sequence[Edge] = ()) -> Prediction | None:

@@ -73,7 +73,8 @@ class Region:
         self.summaries = summaries
         self.settled = store.library.settled.all()
         """The settled chunks by id."""
-        self.rows = {k: r for k, r in self.settled.items() if k not in store.library.redundant.chunks()}
+        redundant = store.library.redundant.chunks()
+        self.rows = {k: r for k, r in self.settled.items() if k not in redundant}
         """Those of them that are not redundant."""
         self._extents: Array | None = None
         self._T_world_graph = store.facts.S_world_graph

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.association.revisits.cross_check import Side
 from list3r.memory.geometry import upright_box
+from list3r.memory.records import FrameSamples
 from list3r.memory.store.tables.local_instances import LocalNode
 
 Array = NDArray[np.float64]
@@ -59,7 +60,7 @@ def make_constellation(
 ) -> Constellation:
     """Return the constellation of a chunk from its local instances and its samples."""
     s = settings or ConstellationSettings()
-    unit = typical_depth(side)
+    unit = typical_depth(side.samples)
     R = upright(nodes, side.samples.T_chunk_cam, s)
     usable = [n for n in nodes if not n.structure and not n.dynamic and len(n.support.points) >= s.least_points]
     usable = [n for n in usable if np.isfinite(n.support.points).all() and np.isfinite(n.feature).all()]
@@ -108,9 +109,8 @@ def upright(nodes: Sequence[LocalNode], T_chunk_cam: Array, settings: Constellat
     return np.stack([x, np.cross(up, x), up])
 
 
-def typical_depth(side: Side) -> float:
+def typical_depth(s: FrameSamples) -> float:
     """Return the median distance of samples from the cameras that saw them, 1 where there are none."""
-    s = side.samples
     good = np.flatnonzero((s.confidence > 0) & np.isfinite(s.points).all(axis=1))[::7]
     if not len(good):
         return 1.0

@@ -130,10 +130,10 @@ class ThingSearch:
         state = self._checksums.get(chunk_id)
         held = self._known.middles.get(chunk_id)
         if held is None or held[0] != state:
-            side = self._side(chunk_id)
-            points = side.samples.points[np.isfinite(side.samples.points).all(axis=1)]
+            samples = self._store.chunks.samples(chunk_id)
+            points = samples.points[np.isfinite(samples.points).all(axis=1)]
             middle = np.median(points, axis=0).astype(np.float64) if len(points) else np.zeros(3)
-            held = self._known.middles[chunk_id] = state, middle, typical_depth(side)
+            held = self._known.middles[chunk_id] = state, middle, typical_depth(samples)
         return S_world_chunk.apply(held[1][None])[0], float(S_world_chunk.scale) * held[2]
 
     def _metric(self, u: int) -> bool:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Sim3
+from list3r.memory.store.rows.npz import read_members, write_npz
 from list3r.memory.unpacking import open_archive
 
 MAX_BLOB_BYTES = 256 * 2**20
@@ -34,9 +35,7 @@ def checksum(*blobs: bytes) -> int:
 
 def pack(arrays: Mapping[str, ArrayLike]) -> bytes:
     """Named arrays as a compressed `.npz`; the same arrays give the same bytes."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-    return buffer.getvalue()
+    return write_npz({k: np.asarray(v) for k, v in arrays.items()})
 
 
 def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
@@ -45,6 +44,9 @@ def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
     Only numbers and booleans are read, and an array takes no more memory than the bytes that are really there.
     """
     try:
+        members = read_members(blob, MAX_BLOB_BYTES, MAX_ARRAYS)
+        if members is not None:
+            return {name.removesuffix(".npy"): _read_npy(data) for name, data in members.items()}
         with open_archive(io.BytesIO(blob)) as archive:
             entries = archive.infolist()
             if sum(entry.file_size for entry in entries) > MAX_BLOB_BYTES or len(entries) > MAX_ARRAYS:

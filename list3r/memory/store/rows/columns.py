@@ -33,7 +33,7 @@ Encode = Callable[[Any], Value]
 Decode = Callable[[Any], Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Column:
     """Columns of a table that hold fields of a record; both ways take many rows at once, which is much faster."""
 

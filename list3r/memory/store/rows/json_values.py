@@ -40,6 +40,9 @@ def plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
+_NUMBERS = frozenset((int, float))
+
+
 def typed(hint: Any, value: object, *, lenient: bool = False) -> Any:
     """Return what `plain` made of a value of that type; a field that is not there keeps its default.
 
@@ -66,6 +69,8 @@ def _plain(hint: Any, value: object, lenient: bool) -> Any:
 
 def _generic(origin: Any, inner: tuple[Any, ...], value: object, lenient: bool) -> Any:
     if origin in (dict, Mapping):
+        if inner == (str, float) and isinstance(value, dict) and _NUMBERS.issuperset(map(type, value.values())):
+            return value
         return {_key(inner[0], k): typed(inner[1], v, lenient=lenient) for k, v in _checked(dict, value).items()}
     values = _checked((list, tuple), value)
     if origin is not tuple:
