@@ -76,6 +76,9 @@ class Region:
         redundant = store.library.redundant.chunks()
         self.rows = {k: r for k, r in self.settled.items() if k not in redundant}
         """Those of them that are not redundant."""
+        if self.settled and not self.rows:
+            file = store.path
+            raise MemoryFileError(f"every chunk of {file} is said to be redundant; `list3r repair {file}` mends that")
         self._extents: Array | None = None
         self._T_world_graph = store.facts.S_world_graph
         self._carving = FreeSpaceCarving(store, settings.changes.visibility)

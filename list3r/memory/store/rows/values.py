@@ -235,6 +235,23 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
     "overlaps": {"scores": _ARCHIVE},
     "members": {"first_chunk": _CHUNK, "first_local": _LOCAL, "shown": _FLAG},
     "anchors": {"instance": _integer(1), "chunk_id": _CHUNK, "S_exact_settled": _SIM3},
+    "redundant": {
+        "chunk_id": _CHUNK,
+        "local_id": _LOCAL,
+        "like_chunk": _CHUNK,
+        "like_local": _LOCAL,
+        "frames": _bytes(4, "numbers"),
+    },
+    "looks": {
+        "instance": _integer(1),
+        "shape": _text(60),
+        "resting": _FLAG,
+        "swatches": Rule(
+            f"typeof({{}}) = 'blob' AND length({{}}) BETWEEN 56 AND {_MOST_CELL} AND length({{}}) % 56 = 0"
+            " AND list3r_colors({})",
+            "seven finite numbers a colour",
+        ),
+    },
     "bends": {
         "chunk_id": _CHUNK,
         "frames": _bytes(8, "numbers"),
@@ -277,6 +294,8 @@ REFERENCES = (
     ("observations", "chunk_id, local_id", "local_instances", "chunk_id, local_id"),
     ("supports", "chunk_id, local_id", "local_instances", "chunk_id, local_id"),
     ("anchors", "instance", "instances", "id"),
+    ("looks", "instance", "instances", "id"),
+    ("redundant", "chunk_id", "chunks", "chunk_id"),
     ("votes", "chunk_id", "chunks", "chunk_id"),
     ("detected_labels", "instance", "instances", "id"),
     ("events", "instance", "instances", "id"),
@@ -290,11 +309,11 @@ def bad_values(database: sqlite3.Connection, name: str, where: str = "1", argume
     rules = RULES.get(name, {})
     if not rules:
         return
-    for function, check in _FUNCTIONS.items():
-        database.create_function(function, check.__code__.co_argcount, _never_raising(check), deterministic=True)
     keys = summed_tables()[name].key
     conditions = {column: f"coalesce({rule.condition.replace('{}', column)}, 0)" for column, rule in rules.items()}
     bad = " AND ".join(conditions.values())
+    for function, check in ((f, c) for f, c in _FUNCTIONS.items() if f in bad):
+        database.create_function(function, check.__code__.co_argcount, _never_raising(check), deterministic=True)
     query = f"SELECT {', '.join(keys)} FROM {name} WHERE {where} AND NOT ({bad})"
     for key in database.execute(query, arguments).fetchall():
         here = " AND ".join(f"{k} IS ?" for k in keys)
@@ -397,6 +416,10 @@ def _is_rotation(matrix: Any) -> bool:
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3 and np.linalg.det(matrix) > 0)
 
 
+def _are_colors(blob: bytes) -> bool:
+    return len(_floats(blob, len(blob) // 8, 256.0)) > 0
+
+
 def _is_sim3(blob: bytes) -> bool:
     values = _floats(blob, 13, _MOST_LENGTH)
     return 1e-9 < values[0] < 1e9 and _is_rotation(values[1:10].reshape(3, 3))
@@ -482,4 +505,5 @@ _FUNCTIONS: Mapping[str, Callable[..., bool]] = {
     "list3r_box": _is_box,
     "list3r_vector": _is_vector,
     "list3r_value": _is_value,
+    "list3r_colors": _are_colors,
 }

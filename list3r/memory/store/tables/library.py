@@ -208,10 +208,11 @@ class Redundant:
         connection.on_forget(self.forget)
 
     def chunks(self) -> Set[int]:
-        """Return the ids of all redundant chunks; not to be changed."""
+        """Return the ids of all redundant chunks, none of which is in a group; not to be changed."""
         version = self._connection.data_version
         if self._known is None or version != self._version:
-            rows = self._connection.rows("SELECT DISTINCT chunk_id FROM redundant")
+            grouped = "SELECT 1 FROM members m WHERE m.chunk_id = r.chunk_id"
+            rows = self._connection.rows(f"SELECT DISTINCT chunk_id FROM redundant r WHERE NOT EXISTS ({grouped})")
             self._known, self._version = {k for (k,) in rows}, version
         return self._known
 
