@@ -17,6 +17,7 @@ import argparse
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -88,14 +89,15 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="say what would be done, and do nothing")
     parser.add_argument("--keep", type=Path, help="folder in which memories are kept")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("build", nargs="*", help="words for `list3r build`, after --")
-    words = parser.parse_args()
+    said = sys.argv[1:]
+    cut = said.index("--") if "--" in said else len(said)
+    words, build = parser.parse_args(said[:cut]), said[cut + 1 :]
     chosen = DATA_SETS[words.data]
     found = find_scenes(words.root, words.scene or chosen.scenes)
     rows = json.loads(words.json.read_text())["scenes"] if words.json and words.json.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
         for name, folder in found:
-            options = [*chosen.options, *(["--frames", words.frames] if words.frames else []), *words.build]
+            options = [*chosen.options, *(["--frames", words.frames] if words.frames else []), *build]
             if words.list:
                 print(f"{name}: list3r build {folder} {' '.join(options)}")
             elif all(row["scene"] != name for row in rows):
