@@ -8,25 +8,31 @@ near the same places. `list3r build` makes a memory of the first walk, `list3r u
 counts as placed where all its chunks lie in the world of the first and its cameras are off by at most 0.1 m and 3
 degrees (medians) when the world is laid on the truth by the cameras of the first session alone, turned by their mean
 rotation. What stands in the JSON already is not done again, and walks and memories in --keep are used as they are.
+With --strangers the keyframes of every home's first session are compared with those of the other homes' second ones,
+which must never be believed.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import machine, run_list3r, write_json
+from machine import STARTED_AT, machine, run_list3r, write_json
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.simulation.walks import HomeSessionWalk
+from list3r.association.revisits.verification import verify
 from list3r.evaluation.trajectory import Trajectory, associate, read_tum
 from list3r.memory.geometry import Sim3
+from list3r.memory.records import Keyframe
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import write_walk
 from list3r.simulation.rendering.shading import EVENING
@@ -40,14 +46,20 @@ def main() -> None:
     parser.add_argument("--seeds", default="401-420", help="first-last")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
+    parser.add_argument("--strangers", action="store_true", help="compare keyframes of different homes in --keep")
     words = parser.parse_args()
     first, last = (int(n) for n in words.seeds.split("-"))
+    if words.strangers:
+        print(json.dumps(strangers([words.keep / str(seed) / "two.l3r" for seed in range(first, last + 1)])))
+        return
     rows = json.loads(words.json.read_text())["homes"] if words.json and words.json.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(first, last + 1):
             if any(row["seed"] == seed for row in rows):
                 continue
-            rows.append({"seed": seed, **one_home((words.keep or Path(scratch)) / str(seed), seed)})
+            rows.append(
+                {"seed": seed, "commit": STARTED_AT, **one_home((words.keep or Path(scratch)) / str(seed), seed)}
+            )
             print(json.dumps(rows[-1]), flush=True)
             write_json(words.json, {"homes": rows, "total": total(rows)})
     print(machine())
@@ -103,6 +115,28 @@ def offset(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[flo
     off_m = np.linalg.norm(world[:, :3, 3] @ R.T + shift - truth[:, :3, 3], axis=1)
     turned = Rotation.from_matrix(R @ world[:, :3, :3]).inv() * Rotation.from_matrix(truth[:, :3, :3])
     return float(np.median(off_m)), float(np.degrees(np.median(turned.magnitude())))
+
+
+def strangers(memories: Sequence[Path]) -> dict[str, int]:
+    """How many pairs of keyframes of different homes are believed to show one place, of how many; the same at home."""
+    keyframes = [_keyframes(path) for path in memories if path.exists()]
+    counts = {"pairs": 0, "believed": 0, "pairs_at_home": 0, "believed_at_home": 0}
+    for (a, (first, _)), (b, (_, second)) in itertools.product(enumerate(keyframes), repeat=2):
+        edges = [verify(u, v, 0, 1) for u in first for v in second]
+        where = "_at_home" if a == b else ""
+        counts[f"pairs{where}"] += len(edges)
+        counts[f"believed{where}"] += sum(e.accepted for e in edges)
+    return counts
+
+
+def _keyframes(path: Path) -> tuple[list[Keyframe], list[Keyframe]]:
+    """The keyframes of both sessions of a memory that can be compared."""
+    out: tuple[list[Keyframe], list[Keyframe]] = ([], [])
+    with Store.open(path) as store:
+        for chunk in store.chunks.all():
+            found = store.keyframes.of(chunk.chunk_id)
+            out[chunk.session_id - 1].extend(k for k in found if k.depth_small.size and len(k.keypoints_xy))
+    return out
 
 
 def _between_sessions(store: Store) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ not place a session; but it says which other keyframes should see the same (docs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,28 @@ from list3r.memory.records import Edge, FrameSamples
 
 
 @dataclass(frozen=True)
+class FramesApart:
+    """When two pairs of frames are two views rather than one."""
+
+    each: int = 4
+    """Least frames between them on either side, and"""
+    both: int = 20
+    """on both sides together."""
+
+    def of(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
+        """Tell whether two pairs of Frame.index are two."""
+        gaps = [abs(a - b) for a, b in zip(one, other, strict=True)]
+        return min(gaps) >= self.each and sum(gaps) >= self.both
+
+
+@dataclass(frozen=True)
 class SecondLookSettings:
     """Which keyframes are compared once more."""
 
-    most: int = 6
+    most: int = 16
     """Pairs of keyframes."""
-    apart_frames: int = 10
-    """They lie so many frames from those of the relation, on both sides,"""
+    apart: FramesApart = field(default_factory=FramesApart)
+    """Their frames lie apart from those of the relation,"""
     turn_deg: float = 50.0
     """their axes enclose at most this,"""
     depths: float = 1.0
@@ -41,25 +56,23 @@ def seeing_the_same(
     `samples` and `keyframes` are those of chunks u and v.
     """
     assert edge.frames is not None
-    u = _views(samples[0], keyframes[0], edge.frames[0], edge.S_v_u, settings)
-    v = _views(samples[1], keyframes[1], edge.frames[1], Sim3.identity(), settings)
+    u, v = _views(samples[0], keyframes[0], edge.S_v_u), _views(samples[1], keyframes[1], Sim3.identity())
     reach = settings.depths * _reach(samples[1])
     found = []
     for frame_u, (at_u, axis_u) in u.items():
         for frame_v, (at_v, axis_v) in v.items():
             turn = float(np.degrees(np.arccos(np.clip(axis_u @ axis_v, -1.0, 1.0)))) / settings.turn_deg
-            if turn <= 1.0:
+            if turn <= 1.0 and settings.apart.of(edge.frames, (frame_u, frame_v)):
                 found.append((turn + float(np.linalg.norm(at_u - at_v)) / reach, frame_u, frame_v))
     return [(frame_u, frame_v) for _, frame_u, frame_v in sorted(found)][: settings.most]
 
 
 def _views(
-    samples: FrameSamples, keyframes: Sequence[int], frame: int, S: Sim3, settings: SecondLookSettings
+    samples: FrameSamples, keyframes: Sequence[int], S: Sim3
 ) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return where the keyframes far from a frame stand and look, moved by a similarity."""
+    """Return where the keyframes of a chunk stand and look, moved by a similarity."""
     poses = dict(zip(samples.camera_frames.tolist(), samples.T_chunk_cam, strict=True))
-    far = [k for k in keyframes if k in poses and abs(k - frame) >= settings.apart_frames]
-    return {k: (S.apply(poses[k][:3, 3]), S.rotation @ poses[k][:3, 2]) for k in far}
+    return {k: (S.apply(poses[k][:3, 3]), S.rotation @ poses[k][:3, 2]) for k in keyframes if k in poses}
 
 
 def _reach(samples: FrameSamples) -> float:

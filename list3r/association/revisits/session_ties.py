@@ -11,11 +11,12 @@ two (docs/decisions/0049).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from list3r.association.graph.pose_graph import across, chain_poses
+from list3r.association.revisits.second_looks import FramesApart
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -33,8 +34,8 @@ class TieSettings:
     """turned by at most this,"""
     agree_scale: float = 1.15
     """and of scales in at most this ratio: what the chunks between them may have drifted."""
-    apart_frames: int = 10
-    """Relations of the same two chunks are two when their frames are so far apart on both sides."""
+    apart: FramesApart = field(default_factory=FramesApart)
+    """When relations of the same two chunks are two."""
     sure_features: int = 60
     """One relation is beyond doubt when so many features agree on it,"""
     sure_overlap: float = 0.6
@@ -120,8 +121,7 @@ def _other(e: Edge, f: Edge, s: TieSettings) -> bool:
     """Tell whether a relation is one more than another."""
     if (e.u, e.v) != (f.u, f.v):
         return True
-    ends = zip(e.frames or (0, 0), f.frames or (0, 0), strict=True)
-    return min(abs(a - b) for a, b in ends) >= s.apart_frames
+    return e.frames is not None and f.frames is not None and s.apart.of(e.frames, f.frames)
 
 
 def _agree(e: Edge, f: Edge, blocks: _Blocks, unit: float, s: TieSettings) -> bool:
