@@ -1,0 +1,114 @@
+"""The viewer on millions of points: frames while the camera is turned, search, a click, errors of the page.
+
+PYTHONPATH=. python benchmarks/viewer.py --points 5000000 --json FILE --picture FILE
+
+The memory is made up (`exporters.py`). The page is Chromium without a screen and without a graphics card: what draws is
+its software renderer, so a frame is told in processor seconds of all its processes as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from machine import descendants, write_json
+from PIL import Image
+
+import exporters
+import list3r
+from list3r.viewer.app import Viewer, ViewerSettings
+from tests.browser import Browser
+
+TURNED_S = 20.0
+COUNT_FRAMES = "window.drawn = []; (function next(at) { window.drawn.push(at); requestAnimationFrame(next) })(0)"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=5_000_000)
+    parser.add_argument("--things", type=int, default=2_000)
+    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    parser.add_argument("--picture", type=Path, help="file for a picture of the page")
+    words = parser.parse_args()
+    exporters.POINTS = words.points // words.things
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "made.l3r"
+        exporters.write_memory(path, words.things)
+        told = {"points": words.points, "instances": words.things, "file_mb": round(path.stat().st_size / 1e6, 1)}
+        with list3r.open(path) as memory:
+            began = time.process_time()
+            viewer = Viewer(memory, ViewerSettings(0))
+            told["start_cpu_s"] = round(time.process_time() - began, 1)
+            page = Browser(Path(folder) / "profile")
+            try:
+                told |= measure(page, viewer, words.picture)
+            finally:
+                page.close()
+                viewer.stop()
+    print(told)
+    write_json(words.json, told)
+
+
+def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, Any]:
+    """What the page takes to load, to turn and to search."""
+    began = time.monotonic()
+    page.open(viewer.address)
+    page.wait(lambda: "Click a thing, or search for one." in page.text(), 300)
+    page.wait(viewer.server.get_clients, 300)
+    loaded = time.monotonic() - began
+    time.sleep(20.0)  # the points come after the page
+    told = {"load_s": round(loaded, 1), "overview_points": len(viewer._layers.shown.points), **turn(page)}
+    began = time.monotonic()
+    page.fill("Find", "Stuhl")
+    page.press("Search")
+    page.wait(lambda: viewer.state.selected is not None, 300)
+    told["search_s"] = round(time.monotonic() - began, 2)
+    time.sleep(5.0)
+    if picture is not None:
+        Image.fromarray(page.picture()).save(picture)
+    return {**told, "console_errors": page.errors}
+
+
+def turn(page: Browser) -> dict[str, float]:
+    """Turn the camera with the mouse; frames a second, the longest wait for one and what a frame costs."""
+    page.run(COUNT_FRAMES)
+    used, began, step = cpu_seconds(page), time.monotonic(), 0
+    page.call("Input.dispatchMouseEvent", type="mousePressed", x=400, y=400, button="left", clickCount=1)
+    while time.monotonic() - began < TURNED_S:
+        step += 1
+        page.call(
+            "Input.dispatchMouseEvent", type="mouseMoved", x=400 + 5 * (step % 40), y=400, button="left", buttons=1
+        )
+        time.sleep(0.05)
+    page.call("Input.dispatchMouseEvent", type="mouseReleased", x=400, y=400, button="left", clickCount=1)
+    drawn = [float(at) for at in page.run("window.drawn") if at]
+    gaps = [b - a for a, b in itertools.pairwise(drawn)]
+    count = max(len(gaps), 1)
+    return {
+        "frames_per_s": round(count / TURNED_S, 2),
+        "median_frame_ms": round(sorted(gaps)[len(gaps) // 2]) if gaps else float("nan"),
+        "longest_frame_ms": round(max(gaps, default=float("nan"))),
+        "cpu_s_a_frame": round((cpu_seconds(page) - used) / count, 3),
+        "load_average": round(os.getloadavg()[0], 1),
+    }
+
+
+def cpu_seconds(page: Browser) -> float:
+    """Processor seconds of all processes of the browser."""
+    ticks = 0
+    for pid in [page._program.pid, *descendants(page._program.pid)]:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    main()
