@@ -14,15 +14,17 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from machine import descendants, write_json
 from PIL import Image
 
 import exporters
 import list3r
-from list3r.viewer.app import Viewer, ViewerSettings
-from tests.browser import Browser
+
+if TYPE_CHECKING:
+    from list3r.viewer.app import Viewer
+    from tests.browser import Browser
 
 TURNED_S = 20.0
 COUNT_FRAMES = "window.drawn = []; (function next(at) { window.drawn.push(at); requestAnimationFrame(next) })(0)"
@@ -35,6 +37,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     parser.add_argument("--picture", type=Path, help="file for a picture of the page")
     words = parser.parse_args()
+    from list3r.viewer.app import Viewer, ViewerSettings
+    from tests.browser import Browser
+
     exporters.POINTS = words.points // words.things
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.l3r"
