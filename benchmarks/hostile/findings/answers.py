@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from hostile.findings.place import Place, first, spoil
+from hostile.findings.place import Place, spoil
 
 _DAMAGES = {
     "instances": "UPDATE instances SET confidence = 0.123 WHERE id = 3",
@@ -55,26 +55,24 @@ def _asked(question: str, damage: str) -> Callable[[Place], str]:
     return lambda place: _wrong(place, question, damage)
 
 
-_MASKS = {
-    "masks of zeros": _DAMAGES["masks"],
-    "a changed byte of masks": "UPDATE local_instances SET track = CAST(substr(track, 1, 99) || x'ff' || "
-    "substr(track, 101) AS BLOB)",
-    "masks of another": "UPDATE local_instances SET track = (SELECT track FROM local_instances WHERE local_id = 4)",
-    "the ends of masks": "UPDATE local_instances SET track = CAST(substr(track, 1, 400) || zeroblob(200) AS BLOB)",
-}
+_PAGE = 4096
 
 
 def _swallowed(*words: object) -> Callable[[Place], str]:
+    """Each fourth page of the file is zeros: the answer must be that of the sound file, or none."""
+
     def look(place: Place) -> str:
-        sound = place.ask("query", words[0], place.memory(), *words[1:])
+        data, memory = place.memory().read_bytes(), place.folder / "m.l3r"
+        sound = place.ask("query", words[0], memory, *words[1:])
         assert sound.status == 0, sound
-        for damage, statement in _MASKS.items():
-            memory = place.memory()
-            spoil(memory, statement)
+        wrong, tried = 0, range(1, len(data) // _PAGE, 4)
+        for page in tried:
+            memory.write_bytes(data[: page * _PAGE] + bytes(_PAGE) + data[(page + 1) * _PAGE :])
             ended = place.ask("query", words[0], memory, *words[1:])
-            if ended.bad or (ended.status == 0 and ended.out != sound.out):
-                return first(ended.bad, f"another answer, status 0 ({damage})")
-        return ""
+            if ended.bad:
+                return ended.bad
+            wrong += ended.status == 0 and ended.out != sound.out
+        return f"another answer, status 0, of {wrong} of {len(tried)} damaged files" if wrong else ""
 
     return look
 
@@ -121,9 +119,8 @@ ROWS: dict[str, Callable[[Place], str]] = {
     "5 a damaged row is asked for again: instances": _asked("instances", "instances"),
     "5 a damaged row is asked for again: find": _asked("find", "instances"),
     "5 a damaged row is asked for again: support": _asked("support", "surfaces"),
-    "6 query seen --view of damaged masks": _swallowed("seen", "--view", 3),
-    "6 query seen --time of damaged masks": _swallowed("seen", "--time", 0.1),
-    "6 query within --view of damaged masks": _swallowed("within", "--view", 3),
+    "6 query seen --view of a file with a page of zeros": _swallowed("seen", "--view", 3),
+    "6 query within --view of a file with a page of zeros": _swallowed("within", "--view", 3),
     "6 files above 128 MiB: 42 questions about damage": large_files,
     "7 an error of the caller's own inside open(at=)": an_error_of_the_callers_own,
     "7 verify() inside open(at=) of a sound file": verify_of_the_past,

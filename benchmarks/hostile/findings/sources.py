@@ -7,6 +7,7 @@ import json
 import os
 import resource
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from hostile.findings.place import Place, first, lie
-from hostile.packed import png, zipped
+from hostile.packed import png
 
 # ------------------------------------------------------------------------------------------- 9: no word about it
 
@@ -54,6 +55,16 @@ def _noted(place: Place, root: Path, word: str, *more: object) -> str:
 
 def _depth(value: int, word: str) -> Callable[[Place], str]:
     return lambda place: _noted(place, _seven_scenes(place, value), word)
+
+
+def _small_depth(value: int) -> Callable[[Place], str]:
+    def look(place: Place) -> str:
+        root = place.walk()
+        for path in (root / "depth").iterdir():
+            Image.fromarray(np.full((48, 64), value, np.uint16)).save(path)
+        return _noted(place, root, "hardly indoors")
+
+    return look
 
 
 def wrong_distortion(place: Place) -> str:
@@ -121,7 +132,7 @@ def _waited(name: str, command: str, device: str | None = None) -> Callable[[Pla
         else:
             (root / name).symlink_to(device)
         more = ("-m", place.folder / "m.l3r", "--workers", 1) if command == "build" else ()
-        return place.ask(command, root, *more, longest_s=60).beyond(10, 1000)
+        return place.ask(command, root, *more, longest_s=40).beyond(10, 1000)
 
     return look
 
@@ -160,11 +171,15 @@ def _build_precomputed(place: Place, made: Path):  # type: ignore[no-untyped-def
 
 
 def archive(place: Place) -> str:
-    made, frames = _precomputed(place), io.BytesIO()
-    np.save(frames, np.arange(4))
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": (4, 16384, 16384)})
-    (made / "chunk_000.npz").write_bytes(zipped(("frames.npy", frames.getvalue()), ("depth.npy", 2**31)))
+    made, head = _precomputed(place), io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": (4, 11585, 11585)})
+    with zipfile.ZipFile(made / "chunk_000.npz", "w", zipfile.ZIP_DEFLATED) as packed:
+        with packed.open("frames.npy", "w") as member:
+            np.save(member, np.arange(4))
+        with packed.open("depth.npy", "w", force_zip64=True) as member:
+            member.write(head.getvalue())
+            for _ in range(2**11):
+                member.write(bytes(2**20))
     return _build_precomputed(place, made).beyond(10, 1000)
 
 
@@ -189,7 +204,8 @@ def chained_aliases(place: Place) -> str:
 
 def long_label(place: Place) -> str:
     memory = lie(place.memory(), f"UPDATE instances SET label = '{'x' * 20_000_000}' WHERE id = 2")
-    return first(*(place.ask(*w).beyond(10, 1000) for w in (("list", memory), ("show", memory, 2))))
+    words = (("list", memory), ("show", memory, 2), ("query", "find", memory, "mug"), ("info", memory))
+    return first(*(place.ask(*w).beyond(10, 500) for w in words))
 
 
 def repair_of_a_hole(place: Place) -> str:
@@ -211,23 +227,23 @@ ROWS: dict[str, Callable[[Place], str]] = {
     "9 distortion of 1e10": wrong_distortion,
     "9 depth all 0": _depth(0, "unknown everywhere"),
     "9 depth all 65535": _depth(65535, "unknown everywhere"),
-    "9 depth of 1 mm": _depth(1, "hardly indoors"),
-    "9 depth of 5 mm": _depth(5, "hardly indoors"),
+    "9 depth of 0.2 mm": _small_depth(1),
+    "9 depth of 5 mm, in 1/5000 m": _small_depth(25),
     "9 --depth-scale 5 times off, of a layout with units": scale_of_another_layout,
     "9 --depth-scale 5 times too large, against motion": _scale_against_motion(5.0),
     "9 --depth-scale 5 times too small, against motion": _scale_against_motion(0.2),
     "9 all time stamps equal": equal_times,
     "9 half of the source unreadable": half_unreadable,
-    "12 rgb.txt is a pipe; inspect": _waited("rgb.txt", "inspect"),
-    "12 rgb.txt is a pipe; build": _waited("rgb.txt", "build"),
+    "12 a picture of rgb.txt is a pipe; inspect": _waited("rgb/0.png", "inspect"),
+    "12 a picture of rgb.txt is a pipe; build": _waited("rgb/0.png", "build"),
     "12 depth.txt is a pipe; inspect": _waited("depth.txt", "inspect"),
-    "12 rgb.txt is /dev/zero; inspect": _waited("rgb.txt", "inspect", "/dev/zero"),
+    "12 a picture is /dev/zero; inspect": _waited("rgb/0.png", "inspect", "/dev/zero"),
     "12 a chunk of --reconstruction precomputed is a pipe": pipe_as_archive,
     "12 MEMORY-journal is a pipe; six commands": pipe_as_journal,
-    "13 npz of 2 MB that unpacks to 2 GB": archive,
+    "13 npz of 2 MB that unpacks to 2 GB; build": archive,
     "13 PNG of 20,000 x 20,000; inspect": _picture("rgb", 20_000, 8),
     "13 depth PNG of 30,000 x 30,000; inspect": _picture("depth", 30_000, 16),
     "13 100,000 chained aliases": chained_aliases,
-    "13 a label of 20 MB": long_label,
+    "13 a label of 20 MB; four commands": long_label,
     "13 repair of a file with a hole": repair_of_a_hole,
 }
