@@ -64,14 +64,14 @@ def fill_segments(
 def _fill(
     found: SparseMap, tracks: CornerTracks, positions: Iterable[int], settings: FramePoseSettings, adjusted: bool
 ) -> PosedSegment:
-    numbers = np.array(sorted(found.points), np.int64)
-    places = np.array([found.points[int(n)] for n in numbers]).reshape(-1, 3)
+    numbers = np.array([*sorted(found.points), np.iinfo(np.int64).max], np.int64)
+    places = np.array([found.points[int(n)] for n in numbers[:-1]]).reshape(-1, 3)
     segment = PosedSegment(found, {}, {})
     registered = sorted(found.T_map_cam)
     for position in positions:
-        known = np.isin(tracks.ids[position], numbers)
-        xy = tracks.xy[position][known]
-        points = places[np.searchsorted(numbers, tracks.ids[position][known])]
+        row = np.minimum(np.searchsorted(numbers, tracks.ids[position]), len(numbers) - 1)
+        known = numbers[row] == tracks.ids[position]
+        xy, points = tracks.xy[position][known], places[row[known]]
         if position in found.seen:
             xy, points = _with_features(found, position, tracks, xy, points)
         if adjusted and position in found.T_map_cam:
