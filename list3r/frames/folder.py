@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -317,11 +317,14 @@ def reduced_note(rig: Rig) -> str:
     return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side says otherwise (0: never)"
 
 
-def fingerprint(kind: str, listing: list[tuple[str, int]], options: SourceOptions) -> str:
+def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOptions) -> str:
     """Hash of the files' names and sizes and of every option that shapes frames. 32 hexadecimal digits."""
     said = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
-    text = repr((kind, listing, sorted(said.items())))
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    found = hashlib.sha256(f"({kind!r}, [".encode())  # as the text of a tuple that is never whole in memory
+    for number, row in enumerate(listing):
+        found.update((", " if number else "").encode() + repr(row).encode())
+    found.update(f"], {sorted(said.items())!r})".encode())
+    return found.hexdigest()[:32]
 
 
 def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
@@ -337,12 +340,11 @@ def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
     return [files[k] for k in sorted(range(len(files)), key=lambda k: sizes[k] != usual)]
 
 
-def _listing(files: tuple[FrameFile, ...], root: Path) -> list[tuple[str, int]]:
-    above, out = f"{root}{os.sep}", []
+def _listing(files: tuple[FrameFile, ...], root: Path) -> Iterator[tuple[str, int]]:
+    above = f"{root}{os.sep}"
     for stored in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
         name = str(stored).removeprefix(above).replace(os.sep, "/") if isinstance(stored, Path) else stored.name
-        out.append((name, stored_size(stored)))
-    return out
+        yield name, stored_size(stored)
 
 
 def _median_known(raw: NDArray[Any]) -> float:

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ _MOST_LINES, _LONGEST_LINE, _MOST_NUMBERS = 2**21, 2**22, 2**23
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FrameFile:
     """The files of one frame."""
 
@@ -180,9 +181,16 @@ def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
 def inside(root: Path, name: str, stated_in: Path) -> Path:
     """Return the path of a name within a folder. Raises `SourceError` for one that leads out of it."""
     path = root / name
-    if not path.resolve().is_relative_to(root.resolve()):
+    led = path.name == ".." or path.is_symlink()
+    if not (path.resolve().is_relative_to(root.resolve()) if led else _lies_in(path.parent, root)):
         raise SourceError(f"{stated_in} names {name}, which lies outside of {root}; copy it there or mend the name")
     return path
+
+
+@lru_cache(maxsize=64)
+def _lies_in(folder: Path, root: Path) -> bool:
+    """Return whether a folder lies in another; lists of a million names have few folders."""
+    return folder.resolve().is_relative_to(root.resolve())
 
 
 def read_json(path: Path) -> object:

@@ -175,7 +175,7 @@ def add_chunks(
         return
     first, session, count = plan.tasks[0], plan.session, job.info.frame_count
     bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
-    watch.show(len(store.frames.all(session)), count)
+    watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
     asked = job.run.workers

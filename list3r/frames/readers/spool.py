@@ -17,7 +17,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if not path.is_file():
         return None
     whole, _, _ = read_text(path).rpartition("\n")
-    files = []
+    files: list[FrameFile] = []
     for number, line in enumerate(whole.splitlines(), start=1):
         words = line.split()
         try:

@@ -93,6 +93,11 @@ class Frames:
         query = "SELECT count(*) FROM (SELECT 1 FROM frames WHERE state = 'posed' LIMIT ?)"
         return int(self._connection.rows(query, (most,))[0][0])
 
+    def count(self, session_id: int) -> int:
+        """Return how many frames of a session were seen."""
+        query = "SELECT count(*) FROM frames WHERE session_id = ?"
+        return int(self._connection.rows(query, (session_id,))[0][0])
+
     def bad(self) -> list[FrameRow]:
         """Return the frames that could not be decoded, each with the reason as its note."""
         return self._rows.all("state = 'bad'")
