@@ -38,7 +38,7 @@ FLAT = 0.85
 class LearnedSettings:
     """What is listed, and where agglomeration stops."""
 
-    least_confidence: float = 0.4
+    least_confidence: float = 0.6
     """Things that are less probably one whole are scraps and not proposed; chosen on left-out worlds, where recall and
     precision meet near it."""
     least_name: float = 0.5
