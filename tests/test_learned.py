@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from list3r.frames.base import SourceInfo
 from list3r.instances.geometric.cloud import Cloud, pack
 from list3r.instances.geometric.planes import find_planes
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.cut import CloudCut
+from list3r.instances.learned.cut import CloudCut, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph
 from list3r.instances.learned.network import Judgement, judge
@@ -21,6 +22,8 @@ from list3r.instances.learned.weights import SHIPPED, load_weights, write_weight
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.memory.errors import OptionError
+from list3r.pipeline.choice import settings_asked
+from list3r.pipeline.request import BuildRequest
 from tests.test_instances_library import SCENE, render, walk
 
 
@@ -130,6 +133,28 @@ def test_verdicts_on_things_are_probabilities_whatever_the_order_of_things() -> 
 def test_it_is_asked_for_by_name() -> None:
     found = make_discoverer("learned", "geometric", (), "cpu", InstanceSettings())
     assert isinstance(found, LearnedDiscoverer)
+
+
+def test_it_is_taken_where_a_sensor_measures_depth_and_its_weights_are_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
+    assert settings_asked(BuildRequest(), depth, "any")[0].discovery == "learned"
+    assert settings_asked(BuildRequest(discovery="geometric"), depth, "any")[0].discovery == "geometric"
+    assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "geometric"
+    load_weights.cache_clear()
+    monkeypatch.setattr("list3r.instances.learned.weights.SHIPPED", tmp_path / "weights.npz")
+    settings, (line,) = settings_asked(BuildRequest(), depth, "any")
+    assert settings.discovery == "geometric" and "weights.npz" in line and "\n" not in line
+    load_weights.cache_clear()
+
+
+def test_points_of_none_go_to_what_a_way_without_a_gap_leads_to() -> None:
+    x = np.array([0.0, 0.03, 0.06, 0.09, 0.5, 0.53, 0.8])
+    labels = np.array([7, -1, -1, -1, 3, -1, -1], np.int32)
+    spread = spread_labels(np.column_stack([x, 0 * x, 0 * x]), labels, 0.05)
+    assert spread.tolist() == [7, 7, 7, 7, 3, 3, -1]
+    assert labels.tolist() == [7, -1, -1, -1, 3, -1, -1]
 
 
 def test_it_finds_what_stands_on_a_table() -> None:

@@ -45,14 +45,14 @@ def test_every_field_that_can_be_asked_is_an_option_of_the_command(command: str)
 
 def test_what_is_left_out_is_what_was_before() -> None:
     settings, notes = settings_asked(BuildRequest(), INFO, "research")
-    assert settings == BuildSettings(poses="auto") and notes == []
+    assert settings == BuildSettings(poses="auto", discovery="learned") and notes == []
 
 
 def test_a_resumed_session_goes_on_with_its_own_settings() -> None:
     assert settings_resumed(BuildRequest(), BEGUN, INFO, "research") == (BEGUN, [])
     assert settings_resumed(BuildRequest(chunk=50), BEGUN, INFO, "research")[0].chunks == ChunkSettings(50, 15)
     named, notes = settings_resumed(BuildRequest(preset="cpu", poses="estimate"), BEGUN, INFO, "research")
-    assert named == replace(BEGUN, reconstruction="auto", poses="estimate") and notes
+    assert named == replace(BEGUN, reconstruction="auto", poses="estimate", discovery="learned") and notes
 
 
 def test_a_later_session_takes_the_stages_of_the_first_and_what_is_asked_for() -> None:

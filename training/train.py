@@ -30,7 +30,7 @@ from training.worlds.catalogue import LABELS
 FIRST_SEED, FIRST_FITTED_SEED, FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 1000, 2000, 5000, 5500
 """Seeds count up from here: worlds for training, those with what is built in, and left-out worlds of both kinds."""
 
-OTHER_THRESHOLDS = (0.5, 2.0)
+OTHER_THRESHOLDS = (0.5, 3.5)
 """Where agglomeration of fine pieces stops besides, so that the second network sees parts of other sizes too."""
 
 

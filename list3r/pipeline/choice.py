@@ -161,6 +161,8 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
     if request.preset is not None:
         gpu = find_gpu(request.device) if request.preset == "auto" else None
         chosen = select(request.preset, has_depth=info.has_depth, profile=licence, gpu=gpu)
+    if request.discovery is None and chosen.discovery == "geometric" and info.has_depth:
+        chosen = _with_learned(chosen)
     given = {k: getattr(request, k) for k in ("reconstruction", "discovery", "tracking", "features")}
     named = {k: str(v) for k, v in given.items() if v is not None}
     if "discovery" in named and "features" not in named:
@@ -172,6 +174,17 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
     if named and chosen.why:
         named["why"] = f"{chosen.why}; {', '.join(f'--{k} {v}' for k, v in named.items())} as asked"
     return replace(chosen, **named)
+
+
+def _with_learned(chosen: ModelSelection) -> ModelSelection:
+    """Return a selection with the learned discoverer; with the rules, and one line, where its weights are no good."""
+    from list3r.instances.learned.weights import load_weights
+
+    try:
+        load_weights()
+    except OptionError as error:
+        return replace(chosen, why="; ".join(filter(None, [chosen.why, f"{error}, which is done now"])))
+    return replace(chosen, discovery="learned")
 
 
 def _reads_files(name: str) -> bool:

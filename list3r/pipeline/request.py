@@ -54,7 +54,10 @@ class BuildRequest:
     )
     discovery: str | None = field(
         default=None,
-        metadata=option("What finds things: geometric, learned, eomt, mask2former, sam2, sam3 or precomputed."),
+        metadata=option(
+            "What finds things: geometric, learned, eomt, mask2former, sam2, sam3 or precomputed; when left out, "
+            "learned with a sensor's depth, else geometric."
+        ),
     )
     tracking: str | None = field(
         default=None, metadata=option("What follows things from frame to frame: reprojection, sam2, sam3 or edgetam.")

@@ -21,7 +21,7 @@ from list3r.instances.learned.things import ThingVerdicts, judge_things
 class CutSettings:
     """Where agglomeration stops. Both were chosen on worlds for training (see training/)."""
 
-    sure: float = 3.0
+    sure: float = 2.0
     """Mean log odds above which fine pieces become parts."""
     enough: float = 1.5
     """Mean log odds above which parts become things."""
