@@ -142,6 +142,7 @@ def test_it_is_taken_where_a_sensor_measures_depth_and_its_weights_are_whole(
     assert settings_asked(BuildRequest(), depth, "any")[0].discovery == "learned"
     assert settings_asked(BuildRequest(discovery="geometric"), depth, "any")[0].discovery == "geometric"
     assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "geometric"
+    assert settings_asked(BuildRequest(reconstruction="sfm"), depth, "any")[0].discovery == "geometric"
     load_weights.cache_clear()
     monkeypatch.setattr("list3r.instances.learned.weights.SHIPPED", tmp_path / "weights.npz")
     settings, (line,) = settings_asked(BuildRequest(), depth, "any")

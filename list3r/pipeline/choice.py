@@ -41,6 +41,8 @@ MODEL_CHOICES = (
 """Fields of `BuildSettings` that say which models run."""
 _NAMING = ("reconstruction", "preset", "discovery", "tracking", "features", "device", "weights", "local_features")
 """Fields of `BuildRequest` that choose them."""
+SENSED = ("auto", "rgbd")
+"""Reconstructions that take depth as the sensor measured it, where there is any."""
 
 
 def settings_asked(request: BuildRequest, info: SourceInfo, licence: str) -> tuple[BuildSettings, list[str]]:
@@ -161,7 +163,8 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
     if request.preset is not None:
         gpu = find_gpu(request.device) if request.preset == "auto" else None
         chosen = select(request.preset, has_depth=info.has_depth, profile=licence, gpu=gpu)
-    if request.discovery is None and chosen.discovery == "geometric" and info.has_depth:
+    sensed = info.has_depth and (request.reconstruction or chosen.reconstruction) in SENSED
+    if request.discovery is None and chosen.discovery == "geometric" and sensed:
         chosen = _with_learned(chosen)
     given = {k: getattr(request, k) for k in ("reconstruction", "discovery", "tracking", "features")}
     named = {k: str(v) for k, v in given.items() if v is not None}
