@@ -16,7 +16,7 @@ from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
 from list3r.queries.finding.words import STRUCTURE, not_borne
 from list3r.queries.match import Match, Matches, checked_count, checked_instance
 from list3r.queries.relations import Place, viewer_from
-from list3r.queries.views.gather import gather
+from list3r.queries.views.gather import Gathered, gather, is_large
 
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
@@ -58,7 +58,10 @@ def find(
     text without sense and `UnknownIdError` for a number that was never an id.
     """
     k = checked_count(k)
-    found, search = meant(store, parse(text), viewpoint, encoder)
+    phrase = parse(text)
+    if viewpoint is None and (of_words := _by_words_alone(store, phrase, k)) is not None:
+        return of_words
+    found, search = meant(store, phrase, viewpoint, encoder)
     matches = [
         Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "any instance") for c in found[:k]
     ]
@@ -67,6 +70,29 @@ def find(
         equal = sum(c.score > found[0].score - _EQUAL for c in found)
         out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
     return out
+
+
+def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
+    """Return what words alone name in a large memory, of which only the answers are read; None for all other
+    questions, and where nothing bears the words.
+    """
+    words, more = phrase.words, (phrase.where, phrase.size, phrase.superlative)
+    if not words or any(more) or phrase.instance_id is not None or not is_large(store):
+        return None
+    gathered = Gathered(store)
+    total = dict(gathered.named(words))
+    ranks = {n: r for n, r in store.instances.ranks(list(total)).items() if r[1] != "removed"}
+    if STRUCTURE.isdisjoint(words) and any(structure is None for _, _, structure in ranks.values()):
+        ranks = {n: r for n, r in ranks.items() if r[2] is None}
+    if not ranks:
+        return None
+    order = sorted(ranks, key=lambda n: (-total[n], -ranks[n][0], n))
+    named = f"named {' '.join(words)}"
+    scores = {n: total[n] / (100 * len(words)) for n in order}
+    matches = [Match(i, round(scores[i.id], 4), None, None, named) for i in store.instances.of(order[:k])]
+    equal = sum(score > scores[order[0]] - _EQUAL for score in scores.values())
+    told = [f"{equal} instances match equally well; add words to tell them apart"] if equal > 1 and k > 1 else []
+    return Found(matches, (*gathered.notes, *told), (), len(order))
 
 
 # ---------------------------------------------------------------------------------------------- phrases

@@ -39,7 +39,7 @@ class Gathered:
     ids: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     """What was left out."""
-    _bearing: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
+    _bearing: dict[tuple[str, ...], list[tuple[int, int]]] = field(default_factory=dict)
 
     @cached_property
     def sample(self) -> list[int]:
@@ -48,6 +48,16 @@ class Gathered:
 
     def bearing(self, words: tuple[str, ...]) -> list[int]:
         """Return ids that bear all of some words, the best first."""
+        return [n for n, _ in self._named(words)]
+
+    def named(self, words: tuple[str, ...]) -> list[tuple[int, int]]:
+        """Return the ids that are looked at of those that bear all of some words, with how well these name them."""
+        found = self._named(words)
+        if len(found) > _MOST:
+            self.notes.append(f"{len(found)} instances match {' '.join(words)!r}; {_MOST} of them were considered")
+        return found[:_MOST]
+
+    def _named(self, words: tuple[str, ...]) -> list[tuple[int, int]]:
         if words not in self._bearing:
             found = self.store.words.bearing(words, _MOST_BEARING + 1)
             if len(found) > _MOST_BEARING:

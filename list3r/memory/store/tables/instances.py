@@ -113,6 +113,14 @@ class Instances:
         if alias_of is not None:
             self._ids.add_aliases({instance_id: alias_of})
 
+    def ranks(self, ids: Sequence[int]) -> dict[int, tuple[float, str, str | None]]:
+        """Return confidence, state and structure of some instances, by id: what answers are ordered by, before those
+        are read that are given.
+        """
+        query = "SELECT id, confidence, state, structure FROM instances WHERE id IN ({})"
+        rows = (row for part, marks in batches(ids) for row in self._connection.rows(query.format(marks), part))
+        return {n: (float(confidence), state, structure) for n, confidence, state, structure in rows}
+
     def states(self) -> dict[int, tuple[str, int]]:
         """Return state and component of every instance, by id."""
         rows = self._connection.rows("SELECT id, state, component FROM instances")

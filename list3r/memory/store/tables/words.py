@@ -21,8 +21,10 @@ class Words:
             return wanted & {word for word, _, _ in self._expected()}
         return {word for word in wanted if self._connection.rows("SELECT 1 FROM words WHERE word = ? LIMIT 1", (word,))}
 
-    def bearing(self, words: Sequence[str], limit: int) -> list[int]:
-        """Ids of the instances that bear all of some words, those that they name best first, at most `limit`."""
+    def bearing(self, words: Sequence[str], limit: int) -> list[tuple[int, int]]:
+        """Ids of the instances that bear all of some words, with how well those name them together, in hundredths; the
+        best first, at most `limit`.
+        """
         wanted = sorted(set(words) - {""})
         if not wanted or wanted != sorted(set(words)):
             return []
@@ -34,9 +36,10 @@ class Words:
         )
         weight = "".join(f" + w{n}.weight" for n in range(len(others)))
         query = (
-            f"SELECT w.instance FROM words w{joins} WHERE w.word = ? ORDER BY w.weight{weight} DESC, w.instance LIMIT ?"
+            f"SELECT w.instance, w.weight{weight} AS total FROM words w{joins} WHERE w.word = ?"
+            " ORDER BY total DESC, w.instance LIMIT ?"
         )
-        return [int(row[0]) for row in self._connection.rows(query, (*others, first, limit))]
+        return [(n, total) for n, total in self._connection.rows(query, (*others, first, limit))]
 
     def bearing_most(self, words: Sequence[str], limit: int) -> list[list[int]]:
         """Ids of the instances that bear some words or, of three letters on, words that begin so: those that bear the
@@ -62,10 +65,10 @@ class Words:
         query = "SELECT count(*) FROM (SELECT 1 FROM words WHERE word = ? LIMIT ?)"
         return int(self._connection.rows(query, (word, most))[0][0])
 
-    def _bearing_without_index(self, words: Sequence[str]) -> list[int]:
+    def _bearing_without_index(self, words: Sequence[str]) -> list[tuple[int, int]]:
         held: dict[int, dict[str, int]] = {}
         for word, instance, weight in self._expected():
             if word in words:
                 held.setdefault(instance, {})[word] = weight
         found = [(-sum(weights.values()), n) for n, weights in held.items() if len(weights) == len(words)]
-        return [n for _, n in sorted(found)]
+        return [(n, -total) for total, n in sorted(found)]
