@@ -1,0 +1,1 @@
+"""A small convolutional network per fused view: what its outputs add to the graph of pieces."""
