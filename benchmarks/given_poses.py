@@ -23,7 +23,7 @@ from machine import machine, run_list3r, write_json
 from scipy.spatial.transform import Rotation
 
 import list3r
-from benchmarks.simulation.phone import write_phone_walk
+from benchmarks.simulation.phone import LidarSettings, write_phone_walk
 from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
 from list3r.evaluation.trajectory import evaluate_trajectory, read_tum
 from list3r.frames.recordings.axes import arkit_of_pose
@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2,3,4,5")
     parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--frames", type=int, default=64, help="pictures of each walk; the whole round has about 115")
+    parser.add_argument("--unsure", type=float, default=1.0, help="so many times larger errors where depth is not sure")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     words = parser.parse_args()
@@ -48,7 +49,8 @@ def main() -> None:
         for seed in map(int, words.seeds.split(",")):
             folder = (words.keep or Path(scratch)) / f"seed-{seed}"
             if not (folder / "truth.json").exists():
-                write_phone_walk(folder, WalkSettings(seed=seed, frames=words.frames, path=PACE))
+                walk = WalkSettings(seed=seed, frames=words.frames, path=PACE)
+                write_phone_walk(folder, walk, LidarSettings(unsure_times=words.unsure))
             for mode in words.modes.split(","):
                 rows.append({"seed": seed, "poses": mode, **measured(folder, mode)})
                 print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
