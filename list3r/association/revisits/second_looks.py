@@ -35,7 +35,7 @@ class FramesApart:
 class SecondLookSettings:
     """Which keyframes are compared once more."""
 
-    most: int = 16
+    most: int = 64
     """Pairs of keyframes."""
     apart: FramesApart = field(default_factory=FramesApart)
     """Their frames lie apart from those of the relation,"""
