@@ -38,19 +38,8 @@ _PACKAGES = (
     ("rerun-sdk", "export --to rerun"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
-_OPTIONAL = {
-    "viser",
-    "mcp",
-    "pyarrow",
-    "rerun-sdk",
-    "torch",
-    "pycolmap",
-    "transformers",
-    "huggingface_hub",
-    "safetensors",
-    "ncnn",
-    "open3d-cpu|open3d",
-}
+_NEEDED = {"numpy", "scipy", "networkx", "faiss-cpu", "typer"}
+"""What asking a memory takes; the others come with extras, which a command that lacks one names."""
 _LIBRARIES = (
     ("GL", "Open3D only (apt-get install libgl1 libegl1)"),
     ("gomp", "threads of torch and faiss, where their packages bring none (apt-get install libgomp1)"),
@@ -123,7 +112,7 @@ def _package(name: str, use: str) -> tuple[str, str, str]:
         except metadata.PackageNotFoundError:
             continue
     first = name.split("|")[0]
-    return first, "absent" if name in _OPTIONAL else f"MISSING: pip install {first}", use
+    return first, f"MISSING: pip install {first}" if name in _NEEDED else "absent", use
 
 
 def _sqlite() -> tuple[str, str, str]:
