@@ -88,14 +88,14 @@ def put(path: Path, data: bytes | str) -> None:
     path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
-def write_record3d(root: Path, *, unsure: bool = False, **changes: object) -> Path:
-    """An .r3d file; with `unsure` the left half of depth has a confidence of 1."""
+def write_record3d(root: Path, *, left: int = 2, **changes: object) -> Path:
+    """An .r3d file; the left half of depth has the confidence `left`."""
     import lzfse
 
     poses = []
     members: dict[str, bytes] = {}
     confidence = np.full((DEPTH_HEIGHT, DEPTH_WIDTH), 2, np.uint8)
-    confidence[:, : DEPTH_WIDTH // 2] = 1 if unsure else 2
+    confidence[:, : DEPTH_WIDTH // 2] = left
     for k, shot in enumerate(shots()):
         T = arkit(shot.T_world_cam)
         poses.append([*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]])

@@ -77,7 +77,7 @@ def test_a_recording_opens_again_alike_and_tells_its_poses(kind: str, tmp_path: 
 
 def test_what_the_sensor_is_not_sure_of_is_unknown(tmp_path: Path) -> None:
     sure = frames_of(write_record3d(tmp_path / "a"))[0].depth
-    half = frames_of(write_record3d(tmp_path / "b", unsure=True))[0].depth
+    half = frames_of(write_record3d(tmp_path / "b", left=1))[0].depth
     assert sure is not None and half is not None
     width = sure.shape[1]
     assert (half[:, : width // 2 - 2] == 0).all() and (half[:, width // 2 + 3 :] > 0).mean() > 0.9

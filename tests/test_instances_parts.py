@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -10,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 from list3r.instances.geometric.cloud import neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import mean_feature, object_feature
 from list3r.instances.geometric.rules.sheets import merge_regions
+from list3r.instances.geometric.segments import _plane_of
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings
 from list3r.instances.tracking.reprojection import encode_labels
@@ -98,3 +102,11 @@ def test_anchors_laid_on_one_another_undo_drift() -> None:
     before = np.linalg.norm(given[-1][:3, 3] - given[0][:3, 3])
     after = np.linalg.norm((np.linalg.inv(found[0]) @ found[-1])[:3, 3])
     assert after < 0.5 * before
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_sheet_of_few_voxels_has_a_plane(count: int) -> None:
+    points = np.array([[0.1, 0.2, 1.0], [0.3, 0.2, 1.0], [0.1, 0.5, 1.0], [0.3, 0.5, 1.0], [0.2, 0.3, 1.0]], np.float32)
+    scene = SimpleNamespace(cloud=SimpleNamespace(points=points))
+    plane = _plane_of(scene, np.arange(5) < count, np.array([0.0, 0.0, 1.0]))  # type: ignore[arg-type]
+    assert np.allclose(plane, [0.0, 0.0, 1.0, -1.0], atol=1e-6)

@@ -109,9 +109,13 @@ def _describe(scene: Scene, surfaces: list[Surface], labels: Labels, sheets: dic
 
 
 def _plane_of(scene: Scene, mine: NDArray[np.bool_], toward: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least-squares plane through the voxels of a flat thing, its normal on the side of `toward`. Shape (4,)."""
+    """Least-squares plane through the voxels of a flat thing, its normal on the side of `toward`. Shape (4,).
+
+    Fewer than three voxels, which the sheets around have left over, face as `toward` does.
+    """
     points = scene.cloud.points[mine].astype(np.float64)
-    mean = points.mean(axis=0)
-    n = np.linalg.eigh(np.cov((points - mean).T))[1][:, 0]
-    n = n if n @ toward > 0 else -n
+    mean, n = points.mean(axis=0), np.asarray(toward, np.float64)
+    if len(points) >= 3:
+        n = np.linalg.eigh(np.cov((points - mean).T))[1][:, 0]
+        n = n if n @ toward > 0 else -n
     return np.append(n, -n @ mean)
