@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.simulation.wide_steps import WideStepWalk
 from list3r.association.overlap.camera_edge import camera_edge, in_one_frame, one_frame_edge
 from list3r.association.whole_map.drift import spread_drift
 from list3r.association.whole_map.joining import join_maps
@@ -176,3 +178,10 @@ def test_matches_that_agree_are_verified_and_others_are_not() -> None:
     kept = verified_rows(replace(problem, pairs={(a, b): wrong}), CAMERA, MappingSettings())[a, b]
     right = (kept[:, None] == rows[None]).all(axis=2).any(axis=1)
     assert len(kept) >= 0.7 * len(rows) and right.mean() > 0.95
+
+
+def test_a_walk_of_wide_steps_neither_moves_nor_turns_farther_than_its_steps() -> None:
+    T = WideStepWalk(seed=311, frames=40).poses()[1]
+    moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turned = np.degrees([np.linalg.norm(Sim3.from_matrix(np.linalg.inv(a) @ b).log()[3:6]) for a, b in pairwise(T)])
+    assert moved.max() < 0.09 and turned.max() < 4.6 and np.median(np.maximum(moved / 0.08, turned / 4.0)) > 0.9
