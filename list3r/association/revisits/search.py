@@ -240,11 +240,12 @@ class _Lookout:
         c = scored.candidate
         u, v = self._rows[c.u], self._rows[self._id]
         way = None if self._apart(c.u) else self._ways.predict(c.u, self._id, found)
-        objection = partial(self._objection, scored.cues, way)
+        metric = u.scale_kind == v.scale_kind == "metric"
+        known = metric and u.session_id != v.session_id  # its scale, and things may have been moved in between
+        objection = partial(self._objection, NO_CUES if known else scored.cues, way)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
         if _tells(keyframe_u) and _tells(keyframe_v):
-            metric = u.scale_kind == v.scale_kind == "metric"
             check = verify if metric else verify_scaled
             edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification)
             edge = _objected(edge, objection) if self._settings.verified else edge
