@@ -142,12 +142,11 @@ def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:
 
 
 def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support: Support) -> Sdf.Path:
-    group = UsdGeom.Xform.Define(stage, scope.AppendChild("Structure" if instance.structure else "Instances"))
-    path = group.GetPath().AppendChild(f"instance_{instance.id}")
+    group = _group(stage, scope.AppendChild("Structure" if instance.structure else "Instances"))
+    path = group.AppendChild(f"instance_{instance.id}")
     xform = UsdGeom.Xform.Define(stage, path)
     prim = xform.GetPrim()
     Usd.ModelAPI(prim).SetKind("component")
-    Usd.ModelAPI(group.GetPrim()).SetKind("group")
     prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'thing'} #{instance.id}")
     set_labels(prim, instance)
     prim.SetDocumentation(instance.description or class_token(instance))
@@ -162,6 +161,13 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
         _add_box(stage, path, instance)
     if len(support.points):
         _add_points(stage, path, T_world_object.inverse().apply(support.points), support.rgb)
+    return path
+
+
+def _group(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
+    """Return the path of a group, made at its first instance: a kind that is set again composes all below it anew."""
+    if not stage.GetPrimAtPath(path):
+        Usd.ModelAPI(UsdGeom.Xform.Define(stage, path).GetPrim()).SetKind("group")
     return path
 
 
