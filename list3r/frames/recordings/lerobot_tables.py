@@ -89,17 +89,25 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
         try:
             check_ordinary(path.stat(), path, MAX_TEXT_BYTES)
             with pq.ParquetFile(path) as file:
-                if file.metadata.num_rows + len(found) > _MOST_EPISODES:
-                    raise SourceError(f"{path} has over {_MOST_EPISODES:,} episodes; is it what it says?")
+                _check_count(path, file.metadata.num_rows + len(found))
                 rows = file.read(columns=columns, use_threads=False).to_pylist()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             said = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise SourceError(f"{path} is no table that can be read ({said[:160]}); copy it again") from None
-        for row in rows:
-            values = [row.get(name) for name in columns]
-            if not all(isinstance(v, int | float) and np.isfinite(v) and v >= 0 for v in values):
-                raise SourceError(f"{path}: an episode lacks its number, length or place in a video; copy it again")
-            found[int(row["episode_index"])] = row
+        found |= {int(row["episode_index"]): row for row in (_sound(path, row, columns) for row in rows)}
     if not found:
         raise SourceError(f"{root} has no episodes in meta/episodes; was the copy finished?")
     return found
+
+
+def _check_count(path: Path, count: int) -> None:
+    if count > _MOST_EPISODES:
+        raise SourceError(f"{path} has over {_MOST_EPISODES:,} episodes; is it what it says?")
+
+
+def _sound(path: Path, row: dict[str, float], columns: list[str]) -> dict[str, float]:
+    """Return the row of an episode. Raises `SourceError` for one that lacks a number."""
+    values = [row.get(name) for name in columns]
+    if not all(isinstance(v, int | float) and np.isfinite(v) and v >= 0 for v in values):
+        raise SourceError(f"{path}: an episode lacks its number, length or place in a video; copy it again")
+    return row

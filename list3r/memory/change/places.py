@@ -23,7 +23,7 @@ _SPREAD = 0.02
 
 
 @dataclass(frozen=True)
-class Looks:
+class GroupLooks:
     """What a group looks like, over the members of some sessions."""
 
     extent: Array
@@ -32,7 +32,7 @@ class Looks:
     """Unit length. Shape (D,)."""
 
 
-def difference(a: Looks, b: Looks, s: ChangeSettings, unit: float = 1.0) -> float:
+def difference(a: GroupLooks, b: GroupLooks, s: ChangeSettings, unit: float = 1.0) -> float:
     """Return the sum of squared deviations between two looks; infinite for two that cannot be one instance."""
     deviation = np.array(s.moved_share) * (a.extent + b.extent) / 2 + s.moved_m * unit
     sides = np.minimum(((a.extent - b.extent) / deviation) ** 2, s.moved_side_most)
@@ -171,7 +171,7 @@ class Places:
         """Return whether an earlier session lies in the same world, so that an instance can be new to it."""
         return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
 
-    def looks(self, n: int, session: int, *, before: bool) -> Looks:
+    def looks(self, n: int, session: int, *, before: bool) -> GroupLooks:
         """Return its looks, the views that show most of it first; what is there all along is left out of its size.
 
         `before` a session that does not show it there any more, else in the first session that does.
@@ -181,7 +181,7 @@ class Places:
         feature = np.average([self.shapes[k].feature[self._at(k, i)] for k, i in keys], axis=0, weights=weight)
         length = float(np.linalg.norm(feature))
         views = self._views_across(n, session, before=before)
-        return Looks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
+        return GroupLooks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
 
     def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[DepthView]) -> Array:
         """Return the weighted median over its whole views, so that what one view took from its surroundings does not

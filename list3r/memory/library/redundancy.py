@@ -24,7 +24,7 @@ from list3r.memory.store.tables.library import RedundantInstance
 
 
 @dataclass(frozen=True)
-class Sightings:
+class SeenSpan:
     """When an instance is seen, redundant chunks included."""
 
     frames: int
@@ -114,7 +114,7 @@ def _members(region: Region, instance_id: int) -> list[Key]:
     return [key for key in found if key[0] in region.rows]
 
 
-def sightings(region: Region, group: Sequence[Key]) -> Sightings | None:
+def sightings(region: Region, group: Sequence[Key]) -> SeenSpan | None:
     """Return when a group is seen, with the redundant chunks that saw it."""
     frames: dict[int, list[Ints]] = {}
     holder: dict[tuple[int, int], int] = {}
@@ -130,4 +130,4 @@ def sightings(region: Region, group: Sequence[Key]) -> Sightings | None:
     every = {session: np.unique(np.concatenate(parts)) for session, parts in frames.items()}
     ends = [(session, int(f)) for session, held in every.items() for f in (held[0], held[-1])]
     times = [region.times_of(holder[end]).get(end, 0.0) for end in ends]
-    return Sightings(sum(map(len, every.values())), min(times), max(times))
+    return SeenSpan(sum(map(len, every.values())), min(times), max(times))
