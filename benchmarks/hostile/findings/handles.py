@@ -73,37 +73,23 @@ def _limited(*words: str) -> Callable[[Place], str]:
     return look
 
 
-_SLEEPS = """
-import sys, time
-sys.path.append({tests!r})
-{start}
-"""
-_BUILDS = "import list3r; list3r.build('walk', 'b.l3r', {how}workers=2)"
-
-
 def workers_of_an_ended_parent(place: Place) -> str:
-    """A benchmark's pool of processes, each at work for a minute, whose parent is ended."""
-    start = {
-        True: "from functools import partial\nfrom hostile.work import Run\n"
-        "if __name__ == '__main__':\n    Run(None, 'x', {}).go(time.sleep, 2, 2)",
-        False: "from list3r.pipeline.workers import OrderedPool\n"
-        "if __name__ == '__main__':\n    list(OrderedPool(time.sleep, 2).map([60.0] * 4))",
-    }
-    benchmarks = place.checkout / "benchmarks"
-    own = (benchmarks / "hostile" / "work.py").exists()
-    del own
+    """A pool of processes, each at work for a minute, whose parent is ended."""
     script = place.folder / "script.py"
-    script.write_text(_SLEEPS.format(tests=str(benchmarks), start=start[False]))
+    script.write_text(
+        "import time\nfrom list3r.pipeline.workers import OrderedPool\n"
+        "if __name__ == '__main__':\n    list(OrderedPool(time.sleep, 2).map([60.0] * 4))\n"
+    )
     return _left_alive(place, script)
 
 
 def _left_alive(place: Place, script: Path) -> str:
     process = subprocess.Popen([sys.executable, str(script)], cwd=place.folder, stderr=subprocess.DEVNULL)
     end = time.monotonic() + 60
-    while len(_at_work(process.pid)) < 2 and time.monotonic() < end:
+    while len(descendants(process.pid)) < 2 and time.monotonic() < end:
         time.sleep(0.1)
     time.sleep(3)
-    workers = _at_work(process.pid)
+    workers = descendants(process.pid)
     process.send_signal(signal.SIGTERM)
     process.wait()
     end = time.monotonic() + 10
@@ -112,10 +98,6 @@ def _left_alive(place: Place, script: Path) -> str:
     for pid in alive:
         os.kill(pid, signal.SIGKILL)
     return f"{len(alive)} of {len(workers)} work on after 10 s" if alive or not workers else ""
-
-
-def _at_work(parent: int) -> list[int]:
-    return descendants(parent)
 
 
 def children_of_the_caller(place: Place) -> str:
