@@ -85,7 +85,7 @@ class VideoMapSettings:
     """Frames of each of three windows by which the camera is estimated before: they move as far as 100 of others."""
     features: FinderSettings = field(default_factory=lambda: FinderSettings(count=800, contrast=0.006))
     """Before a bare wall the faintest are all there is: four times the right matches of the usual contrast."""
-    ahead: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
+    pair_steps: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
     """Keyframes ahead of each that it is matched with: near ones carry the map along, far ones its scale."""
     least_matches: int = 20
     """Fewest corners or features that make a pair."""

@@ -80,7 +80,7 @@ def video_problem(tracks: CornerTracks, features: dict[int, LocalFeatures], sett
         views[key] = KeyframeView(ids, np.concatenate([tracks.xy[key], features[key].xy]).astype(np.float32))
     corners = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     for n, a in enumerate(tracks.keyframes):
-        for b in (tracks.keyframes[n + step] for step in settings.ahead if n + step < len(tracks.keyframes)):
+        for b in (tracks.keyframes[n + step] for step in settings.pair_steps if n + step < len(tracks.keyframes)):
             rows = shared_rows(corners[a], corners[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
             alike = match_features(features[a], features[b])
             if len(rows) < settings.least_matches and len(alike) >= settings.least_matches:
