@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Camera
-from list3r.frames.inspection import describe, lines
+from list3r.frames.inspection import SourceReport
 from list3r.frames.registration.calibrate import DepthCalibrationSettings, calibrate
 from list3r.frames.registration.edges import depth_edges
 from list3r.frames.source import SourceOptions, open_source
@@ -48,9 +48,9 @@ def test_a_known_camera_is_found_from_a_wrong_start(tmp_path: Path) -> None:
     assert found.score > 1.5 * found.score_assumed and found.std["f"] < 3.0
     assert "--depth-to-color" in found.command_line()
     opened = open_source(root, found.options(START))
-    report = {**describe(opened.info), "calibration": found.as_dict()}
-    assert any("--depth-to-color" in line for line in lines(report))
-    json.dumps(report, allow_nan=False)
+    report = SourceReport(opened.info, found)
+    assert any("--depth-to-color" in line for line in report.lines())
+    json.dumps(report.as_dict(), allow_nan=False)
     assert opened.info.depth_camera is not None
     again = calibrate(root, START, DepthCalibrationSettings(frames=12, candidates=1))
     assert again.as_dict() == found.as_dict()

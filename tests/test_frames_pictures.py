@@ -13,7 +13,7 @@ from PIL import Image
 
 from list3r.frames.base import Frame, guessed_camera
 from list3r.frames.decoding.exif import exif_focal
-from list3r.frames.inspection import describe, lines
+from list3r.frames.inspection import SourceReport
 from list3r.frames.selection import select, sharpness, working_size
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
@@ -58,8 +58,8 @@ def test_the_focal_length_of_exif_is_a_start_and_no_camera(tmp_path: Path) -> No
     assert info.camera is None and info.image_size == (300, 400)
     camera = guessed_camera(info)
     assert camera.fx == pytest.approx(300.46, abs=0.1) and (camera.cx, camera.cy) == (199.5, 149.5)
-    report = describe(info)
-    assert report["size"] == [400, 300] and "EXIF" in "\n".join(lines(report))
+    report = SourceReport(info)
+    assert report.as_dict()["size"] == [400, 300] and "EXIF" in "\n".join(report.lines())
     known = open_source(tmp_path / "p", SourceOptions(intrinsics=(310, 310, 200, 150))).info
     assert known.camera_guess is None and known.camera is not None and known.camera.fx == 310
 

@@ -44,6 +44,10 @@ class UsdSettings:
             raise OptionError("a number of points cannot be negative; 0 leaves the points out")
 
 
+_TOGETHER = 200
+"""Instances that are added at once."""
+
+
 def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = None) -> tuple[Path, ...]:
     """Write `usd_stage` to a .usdc, .usd (the same, binary), .usda (text) or .usdz file (a package of one .usdc).
     Returns the file written.
@@ -93,14 +97,10 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
     paths: dict[int, Sdf.Path] = {}
     for component in components:
         scope = world if component.main else _component_scope(stage, component)
-        for instance in component.instances:
-            limit = settings.points_per_structure if instance.structure else settings.points_per_instance
-            support = thinned_support(store, instance, limit)
-            paths[instance.id] = _add_instance(stage, scope.GetPath(), instance, support)
-            if settings.mesh or settings.colliders:
-                _add_surface(stage, paths[instance.id], instance, store, settings)
-            if instance.dynamic and has_box(instance):
-                _animate(stage.GetPrimAtPath(paths[instance.id]), instance, store)
+        for start in range(0, len(component.instances), _TOGETHER):
+            with _beside(stage, scope.GetPath()) as part:
+                for instance in component.instances[start : start + _TOGETHER]:
+                    paths[instance.id] = _add(part, scope.GetPath(), instance, store, settings)
         add_cameras(stage, scope.GetPath(), component)
     set_time_range(stage, components, store)
     _add_relations(stage, store, paths)
@@ -139,6 +139,39 @@ def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:
 
 
 # ---------------------------------------------------------------------------------------------- instances
+
+
+@contextlib.contextmanager
+def _beside(stage: Usd.Stage, scope: Sdf.Path) -> Iterator[Usd.Stage]:
+    """Yield an empty stage; what is then under its scope goes to that of `stage`, all at once.
+
+    Whatever is set on a stage costs time that grows with what the stage holds already.
+    """
+    part = Usd.Stage.CreateInMemory()
+    UsdGeom.Xform.Define(part, scope)
+    yield part
+    with Sdf.ChangeBlock():
+        _take_over(part.GetRootLayer(), stage.GetRootLayer(), Sdf.Path("/World"))
+
+
+def _take_over(part: Sdf.Layer, layer: Sdf.Layer, path: Sdf.Path) -> None:
+    """Copy what lies under a path in one layer into another; what is there already stays."""
+    for spec in part.GetPrimAtPath(path).nameChildren:
+        if layer.GetPrimAtPath(spec.path):
+            _take_over(part, layer, spec.path)
+        else:
+            Sdf.CopySpec(part, spec.path, layer, spec.path)
+
+
+def _add(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, store: Store, settings: UsdSettings) -> Sdf.Path:
+    """Add an instance with its points or mesh, and its motion; return its path."""
+    limit = settings.points_per_structure if instance.structure else settings.points_per_instance
+    path = _add_instance(stage, scope, instance, thinned_support(store, instance, limit))
+    if settings.mesh or settings.colliders:
+        _add_surface(stage, path, instance, store, settings)
+    if instance.dynamic and has_box(instance):
+        _animate(stage.GetPrimAtPath(path), instance, store)
+    return path
 
 
 def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support: Support) -> Sdf.Path:
