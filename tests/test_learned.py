@@ -194,6 +194,17 @@ def test_walls_round_a_corner_are_two() -> None:
     assert len(np.unique(parted.labels[first & far])) == len(np.unique(parted.labels[~first & far])) == 1
 
 
+def test_both_sides_of_a_thin_wall_are_one() -> None:
+    grid = np.stack(np.meshgrid(np.arange(0, 1.5, 0.01), np.arange(0, 1.0, 0.01)), axis=-1).reshape(-1, 2)
+    points = np.column_stack([grid[:, 0], np.zeros(len(grid)) + 0.005, grid[:, 1]]).astype(np.float32)
+    cloud = cloud_of(points, np.tile(np.array([0, 1, 0], np.float32), (len(grid), 1)))
+    one = np.ones(1, np.float32)
+    cut = CloudCut(np.zeros(len(cloud.keys), np.int32), ThingVerdicts(one, one, one[:, None]))
+    (plane,) = find_planes(cloud, 0.03, 1.0)
+    parted = _walls_apart(cloud, cut, [plane, replace(plane, equation=-plane.equation)])
+    assert len(parted.told.structure) == 1 and set(parted.labels.tolist()) == {0}
+
+
 def cloud_of(points: np.ndarray, normals: np.ndarray) -> Cloud:
     """A cloud of 1 cm with a point in each voxel."""
     keys, row = np.unique(pack(np.floor(points / 0.01).astype(np.int64)), return_index=True)

@@ -86,7 +86,8 @@ class LearnedDiscoverer(GeometricDiscoverer):
 def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudCut:
     """The cut with structure of several planes (walls round a corner) as one thing for each.
 
-    What lies off all of them (a ledge, a bit of a neighbour) is of none, so that walls stay flat.
+    What lies off all of them (a ledge, a bit of a neighbour) is of none, so that walls stay flat; a thing of which
+    nothing is left is left out.
     """
     labels, origin = cut.labels.copy(), list(range(len(cut.told.structure)))
     for number in np.flatnonzero(cut.told.structure > 0.5).tolist():
@@ -99,7 +100,8 @@ def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudC
                 labels[mine[nearest == k]] = len(origin)
                 origin.append(number)
             labels[mine[height.min(axis=0) > OFF_WALL * cloud.voxel + 3.0 * cloud.sigma[mine]]] = -1
-    return CloudCut(labels, cut.told.rows(np.array(origin, np.int64)))
+    parted = CloudCut(labels, cut.told.rows(np.array(origin, np.int64)))
+    return parted.only(np.bincount(labels[labels >= 0], minlength=len(origin)) > 0)
 
 
 def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> list[NDArray[np.float64]]:
