@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,9 +98,8 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
     for component in components:
         scope = world if component.main else _component_scope(stage, component)
         for start in range(0, len(component.instances), _TOGETHER):
-            with _beside(stage, scope.GetPath()) as part:
-                for instance in component.instances[start : start + _TOGETHER]:
-                    paths[instance.id] = _add(part, scope.GetPath(), instance, store, settings)
+            several = component.instances[start : start + _TOGETHER]
+            paths |= _add_together(stage, scope.GetPath(), several, store, settings)
         add_cameras(stage, scope.GetPath(), component)
     set_time_range(stage, components, store)
     _add_relations(stage, store, paths)
@@ -141,17 +140,19 @@ def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:
 # ---------------------------------------------------------------------------------------------- instances
 
 
-@contextlib.contextmanager
-def _beside(stage: Usd.Stage, scope: Sdf.Path) -> Iterator[Usd.Stage]:
-    """Yield an empty stage; what is then under its scope goes to that of `stage`, all at once.
+def _add_together(
+    stage: Usd.Stage, scope: Sdf.Path, instances: Sequence[Instance], store: Store, settings: UsdSettings
+) -> dict[int, Sdf.Path]:
+    """Add instances by way of a stage of their own; return their paths.
 
     Whatever is set on a stage costs time that grows with what the stage holds already.
     """
     part = Usd.Stage.CreateInMemory()
     UsdGeom.Xform.Define(part, scope)
-    yield part
+    paths = {instance.id: _add(part, scope, instance, store, settings) for instance in instances}
     with Sdf.ChangeBlock():
         _take_over(part.GetRootLayer(), stage.GetRootLayer(), Sdf.Path("/World"))
+    return paths
 
 
 def _take_over(part: Sdf.Layer, layer: Sdf.Layer, path: Sdf.Path) -> None:
