@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -104,7 +106,7 @@ STARTED_AT = commit()
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Write a result beside the machine and the commit that it was measured on."""
+    """Write a result beside the machine and the commit that it was measured on; temporary folders are not named."""
     if path is not None:
-        told = {"machine": machine(), "commit": STARTED_AT, **result}
-        path.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+        told = json.dumps({"machine": machine(), "commit": STARTED_AT, **result}, indent=2)
+        path.write_text(re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+", "...", told) + "\n", encoding="utf-8")
