@@ -77,18 +77,18 @@ def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
     if quiet:
         return
     things = scene.instances()
-    names = {i.id: i.description for i in scene.instances(structure=None)}
+    names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
     say("", f"3. list3r list {memory}")
-    print_table([[i.id, i.description, i.confidence] for i in things], ["id", "what", "conf"])
+    print_table([[i.id, names[i.id], i.confidence] for i in things], ["id", "what", "conf"])
     say("", f"4. list3r query relations {memory} --predicate on")
     rows = [[names[r.subject], "on", names[r.object], r.confidence] for r in scene.relations(predicate="on")]
     print_table(rows, ["subject", "", "object", "conf"])
     if not things:
         return
     first = min(things, key=lambda i: float(i.box.size.prod()))
-    say("", f"5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {first.description})")
+    say("", f"5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {names[first.id]})")
     matches = scene.nearest(first.id, k=3)
-    print_table([[m.instance.id, m.instance.description, m.distance_m] for m in matches], ["id", "what", "surface (m)"])
+    print_table([[m.instance.id, names[m.instance.id], m.distance_m] for m in matches], ["id", "what", "surface (m)"])
 
 
 def _export(scene: SceneMemory, out: Path, quiet: bool) -> dict[str, str]:
