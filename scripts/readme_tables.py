@@ -30,6 +30,60 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def summary() -> str:
+    """Return the few rows of README.md: what each part reaches, on which data, beside what bounds it."""
+    depth, colour, scale = _read("redkitchen"), _read("sfm"), _read("scale")["sizes"][-1]
+    worlds, house, own = (_read(n)["mean"] for n in ("discovery", "discovery-house", "simulated"))
+    second, safety = _read("sessions")["total seeds 311 to 320"], _read("safety")
+    told = _read("relations")["pooled"]
+    fair = _read("association-fair")["runs"]
+    full, theirs = (statistics.median([r["ate_sim3_m"] for r in fair if r["variant"] == v]) for v in ("full", "vggt-long"))
+    kills = sum(part["kills"] for part in safety.values() if isinstance(part, dict) and "kills" in part and "flips" not in part)
+
+    def things(mean: Any) -> str:
+        return f"{mean['recall_0.25']:.2f} found, {mean['precision_0.25']:.2f} right"
+
+    return _table(
+        ["", "reached", "for comparison"],
+        [
+            [
+                "camera, a real kitchen of 1,000 frames, depth sensor",
+                f"{100 * depth['ate_se3_m']:.1f} cm, {depth['frames_per_second']:.0f} frames/s",
+                "truth itself good to a few cm",
+            ],
+            [
+                "the same by colour alone",
+                f"{100 * colour['list3r']['ate_sim3_m']:.1f} cm, {colour['list3r']['frames_per_s']:.0f} frames/s",
+                f"plain pycolmap {100 * colour['pycolmap']['ate_sim3_m']:.1f} cm",
+            ],
+            [
+                "long videos with revisits, simulated network: median error",
+                f"{100 * full:.1f} cm",
+                f"VGGT-Long's association {100 * theirs:.1f} cm",
+            ],
+            ["things in homes of our own simulator (whole walks)", things(own), ""],
+            [
+                "things in ten left-out worlds (one chunk)",
+                things(worlds["learned"]),
+                f"with true masks {things(worlds['true'])}",
+            ],
+            [
+                "things in a house that others made (one chunk)",
+                things(house["learned"]),
+                f"with true masks {things(house['true'])}",
+            ],
+            [
+                "`on`, in homes of our own simulator",
+                f"{own['on_recall']:.2f} found, {own['on_precision']:.2f} right",
+                f"with true masks {told['on']['recall']:.2f}, {told['on']['precision']:.2f}",
+            ],
+            ["changes between two sessions, our own simulator (by the rules)", f"F1 {second['all']['f1']:.2f}", ""],
+            ["`nearest` among a million instances", f"{scale['nearest_cpu_p50_ms']:.1f} ms", ""],
+            ["killed at random moments", f"{kills} times, nothing lost", ""],
+        ],
+    )
+
+
 def kitchen() -> str:
     """Return the table of the red kitchen: colour and depth, and four ways of giving its colour alone."""
     depth, colour = _read("redkitchen"), [_read(f"sfm{kind}") for kind in ("", "-free-focal", "-mp4", "-phone")]
@@ -265,6 +319,7 @@ def exports() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "summary": summary,
     "kitchen": kitchen,
     "walks": walks,
     "discovery": discovery,
@@ -278,7 +333,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "pack": pack,
     "exports": exports,
 }
-PAGES = ("README.md", "docs/prompt.md", "docs/commands.md")
+PAGES = ("README.md", "docs/measured.md", "docs/prompt.md", "docs/commands.md")
 """The pages with tables."""
 
 
