@@ -24,7 +24,8 @@ _MOST_CELL = 16 * 2**20
 """Bytes of a value that is looked into as a whole."""
 _MOST_LENGTH = 1e7
 """World units that anything may be away or long."""
-_ID = 2**53
+_ID = 2**31 - 1
+"""What ids and counts may be: receivers such as USD hold them in 32 bits."""
 _TIME_S = 1e12
 
 
@@ -44,7 +45,7 @@ def _number(low: float, high: float, words: str = "") -> Rule:
 
 
 def _integer(low: int, high: int = _ID) -> Rule:
-    return Rule(f"typeof({{}}) = 'integer' AND {{}} BETWEEN {low} AND {high}", f"a whole number from {low} on")
+    return Rule(f"typeof({{}}) = 'integer' AND {{}} BETWEEN {low} AND {high}", f"a whole number from {low} to {high}")
 
 
 def _text(most: int = _MOST_TEXT) -> Rule:
