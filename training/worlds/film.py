@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +69,23 @@ class FilmSettings:
     """None draws one."""
 
 
-def make_film(settings: FilmSettings) -> Film:
+@dataclass(frozen=True)
+class Visit:
+    """A walk through a world in which things may have been put elsewhere since the first one."""
+
+    number: int = 0
+    """The camera of another visit sways otherwise and goes the other way round."""
+    shifts: Mapping[int, NDArray[np.float64] | None] = field(default_factory=dict)
+    """How far things were carried, metres, shape (3,), by id; None: it is not there."""
+
+    def tour(self, stops: tuple[Stop, ...]) -> tuple[Stop, ...]:
+        """Return the places that the walk passes, in its order."""
+        return tuple(reversed(stops)) if self.number else stops
+
+
+def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
     """Return the walk of a seed through the world of that seed."""
+    visit = visit or Visit()
     world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted)
     rng = np.random.default_rng([settings.seed, 7])
     sensors = SENSORS if settings.held_out else tuple(s for s in SENSORS if s not in HELD_OUT_SENSORS)
@@ -79,8 +95,9 @@ def make_film(settings: FilmSettings) -> Film:
     camera = Camera(w, h, focal, focal, (w - 1) / 2, (h - 1) / 2)
     speed = PathSettings(fps=float(rng.uniform(9, 15)) / settings.every, speed_m_s=float(rng.uniform(0.35, 0.7)))
     stops = _stops(world, rng, settings)
-    time_s, poses = camera_path(stops, settings.frames, speed, settings.seed)
-    renderer = world_renderer(world.things, world.size, camera, settings.seed)
+    time_s, poses = camera_path(visit.tour(stops), settings.frames, speed, settings.seed + visit.number)
+    placed = tuple(p for t in world.things if (p := _shifted(t, visit)) is not None)
+    renderer = world_renderer(placed, world.size, camera, settings.seed)
     color, depth, true_depth, ids = [], [], [], []
     drift = drift_field((h, w), rng)
     for pose in poses:
@@ -94,6 +111,23 @@ def make_film(settings: FilmSettings) -> Film:
     things = tuple(_truth(t) for t in world.things)
     images = [np.stack(part) for part in (color, depth, true_depth, ids)]
     return Film(camera, sensor, time_s, poses, images[0], images[1], images[2], images[3], things)
+
+
+def _shifted(thing: Placed, visit: Visit) -> Placed | None:
+    shift = visit.shifts.get(thing.id, np.zeros(3))
+    if shift is None:
+        return None
+    T = thing.T_world_thing.copy()
+    T[:3, 3] += shift
+    return replace(thing, T_world_thing=T)
+
+
+def world_extents(settings: FilmSettings) -> dict[int, NDArray[np.float64]]:
+    """Return lower and upper corners of the things of a world that are no structure. Shapes (2, 3)."""
+    world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted)
+    return {
+        t.id: np.stack([t.vertices().min(axis=0), t.vertices().max(axis=0)]) for t in world.things if not t.structure
+    }
 
 
 def _truth(thing: Placed) -> Truth:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from copy import copy
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,13 +21,14 @@ from list3r.frames.base import Camera
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import Stop
 from training.worlds.collada import TexturedMesh, read_collada
-from training.worlds.film import Film, Truth
+from training.worlds.film import Film, Truth, Visit
 from training.worlds.mesh import turn
 from training.worlds.render import Caster, Hits, Light, Renderer
 from training.worlds.sensors import drift_field, read
 
 STRUCTURE = ("HouseWallB", "RoomWall", "RoomCeiling", "FloorB")
 GRAY = np.full((4, 4, 3), 150, np.uint8)
+_STILL = np.zeros(3)
 
 
 class _House:
@@ -50,6 +53,24 @@ class _House:
                     self.meshes.append(TexturedMesh(points, mesh.triangles, mesh.uv, mesh.image))
                     self.owner.append(number)
             self.things.append(Truth(number, name, name, name, any(s in name for s in STRUCTURE)))
+
+    def changed(self, shifts: Mapping[int, NDArray[np.float64] | None]) -> _House:
+        """Return the house with things elsewhere, or away where the shift is None."""
+        out = copy(self)
+        kept = [(m, k) for m, k in zip(self.meshes, self.owner, strict=True) if shifts.get(k, _STILL) is not None]
+        out.meshes = [TexturedMesh(m.vertices + shifts.get(k, _STILL), m.triangles, m.uv, m.image) for m, k in kept]
+        out.owner = [k for _, k in kept]
+        return out
+
+    def extents(self) -> dict[int, NDArray[np.float64]]:
+        """Return lower and upper corners of the things that are no structure. Shapes (2, 3)."""
+        out = {}
+        for thing in self.things:
+            points = [m.vertices for m, k in zip(self.meshes, self.owner, strict=True) if k == thing.id]
+            if points and not thing.structure:
+                every = np.concatenate(points)
+                out[thing.id] = np.stack([every.min(axis=0), every.max(axis=0)])
+        return out
 
 
 def _visuals(folder: Path, place: Path) -> list[Path]:
@@ -98,12 +119,24 @@ def _loaded(folder: Path) -> tuple[_House, Caster]:
     return house, Caster([(m.vertices, m.triangles) for m in house.meshes])
 
 
-def film_house(folder: Path, seed: int, sensor: str, frames: int = 30, every: int = 2) -> Film:
+def house_extents(folder: Path) -> dict[int, NDArray[np.float64]]:
+    """Return the corners of the things of the house by id; see `_House.extents`."""
+    return _loaded(folder)[0].extents()
+
+
+def film_house(
+    folder: Path, seed: int, sensor: str, frames: int = 30, every: int = 2, visit: Visit | None = None
+) -> Film:
     """Return a walk of a seed through the house, of which every n-th frame is filmed."""
     house, caster = _loaded(folder)
+    visit = visit or Visit()
     rng = np.random.default_rng([seed, 17])
     camera = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
-    time_s, poses = camera_path(_stops(house, caster, rng), frames, PathSettings(fps=12.0 / every), seed)
+    walk = PathSettings(fps=12.0 / every)
+    time_s, poses = camera_path(visit.tour(_stops(house, caster, rng)), frames, walk, seed + visit.number)
+    if visit.shifts:
+        house = house.changed(visit.shifts)
+        caster = Caster([(m.vertices, m.triangles) for m in house.meshes])
     light = Light(
         poses[frames // 2, :3, 3].astype(np.float32) + np.array([0, 0, 0.5], np.float32),
         0.5,
