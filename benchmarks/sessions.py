@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from benchmarks.simulation.changes import random_changes
 from benchmarks.simulation.walks import ChangedWalk
-from list3r.evaluation.scene import evaluate_scene, read_scene
-from list3r.evaluation.trajectory import Trajectory, align, associate, read_tum
+from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
+from list3r.evaluation.trajectory import Trajectory, read_tum
 from list3r.memory.geometry import OrientedBox, Sim3
 from list3r.memory.records import ChangeEvent
 from list3r.memory.store.store import Store
@@ -103,8 +103,8 @@ def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
     """Placement, ids and events of an updated memory against the truth."""
     truth = [read_tum(root / name / "groundtruth.txt") for name in ("first", "second")]
     scenes = [read_scene(root / name / "truth.json") for name in ("first", "second")]
-    S_truth_one = _alignment(truth[0], _path(before, 1))
-    S_truth_two = _alignment(truth[0], _path(after, 1))
+    S_truth_one = alignment_of(truth[0], _path(before, 1), with_scale=False)
+    S_truth_two = alignment_of(truth[0], _path(after, 1), with_scale=False)
     moved_m, turned_deg = _placement(truth[1], _path(after, 2), S_truth_two)
     first = evaluate_scene(_scene(before), scenes[0], S_truth_one)
     was = {e: t for t, e, _ in first["matched_ids"]}
@@ -204,14 +204,9 @@ def _path(store: Store, session: int) -> Trajectory:
     return Trajectory(np.array([f.time_s for f, _ in poses]), T)
 
 
-def _alignment(truth: Trajectory, estimate: Trajectory) -> Sim3:
-    rows, at = associate(truth.time_s, estimate.time_s, 0.01)
-    return align(truth.at(rows), estimate.at(at), with_scale=False)
-
-
 def _placement(truth: Trajectory, estimate: Trajectory, S_truth_world: Sim3) -> tuple[float, float]:
     """Metres at the middle of the path, and degrees, by which the session as a whole lies off."""
-    rest = _alignment(truth, estimate) @ S_truth_world.inverse()
+    rest = alignment_of(truth, estimate, with_scale=False) @ S_truth_world.inverse()
     middle = S_truth_world.apply(np.median(estimate.T_world_cam[:, :3, 3], axis=0)[None])
     turn = np.degrees(np.arccos(np.clip((np.trace(rest.rotation) - 1) / 2, -1, 1)))
     return float(np.linalg.norm(rest.apply(middle) - middle)), float(turn)

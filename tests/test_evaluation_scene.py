@@ -15,7 +15,8 @@ from list3r.evaluation.boxes import box_overlaps, intersection_volume, transform
 from list3r.evaluation.cloud import evaluate_cloud
 from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.evaluation.relations import evaluate_relations
-from list3r.evaluation.scene import evaluate_scene, read_scene
+from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
+from list3r.evaluation.trajectory import Trajectory
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.geometry import OrientedBox, Sim3, quat_wxyz_from_rotation, rotation_exp
 
@@ -230,3 +231,49 @@ def test_a_file_that_is_no_scene_is_named(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(SourceError, match=r"scene\.json"):
         read_scene(path)
+
+
+# ----------------------------------------------------------------------------------------------- alignment
+
+
+def short_path(turn_of_axes: float = 0.0, scale: float = 1.0) -> tuple[Trajectory, Trajectory]:
+    """A way of 0.6 m and an estimate of it, off by a centimetre and 0.1 degrees a frame, in a frame of its own."""
+    rng = np.random.default_rng(4)
+    count = 60
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = np.stack([np.linspace(0, 0.6, count), 0.1 * np.sin(np.arange(count) / 9), np.ones(count)], 1)
+    poses[:, :3, :3] = rotation_exp(rng.normal(0, 0.5, (count, 3)))
+    seen = poses.copy()
+    seen[:, :3, 3] += rng.normal(0, 0.01, (count, 3))
+    seen[:, :3, :3] = seen[:, :3, :3] @ rotation_exp(np.deg2rad(0.1) * rng.normal(size=(count, 3)))
+    seen[:, :3, :3] = seen[:, :3, :3] @ rotation_exp(np.array([0.0, turn_of_axes, 0.0]))
+    world = Sim3.exp(np.array([0.3, 2.0, -1.0, 0.4, 0.2, 1.0, 0.0]))
+    moved = np.array([(world.inverse() @ Sim3(np.asarray(1.0), T[:3, :3], T[:3, 3])).as_matrix() for T in seen])
+    moved[:, :3, 3] /= scale
+    return Trajectory(np.arange(count) / 10, poses), Trajectory(np.arange(count) / 10, moved)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_a_short_path_is_laid_on_the_truth_by_where_its_cameras_look(scale: float) -> None:
+    truth, estimate = short_path(scale=scale)
+    S = alignment_of(truth, estimate, with_scale=scale != 1.0)
+    ahead = np.array([0.0, 0.0, 3.0])
+    seen = S.apply(estimate.T_world_cam[:, :3, :3] @ (ahead / scale) + estimate.positions())
+    true = truth.T_world_cam[:, :3, :3] @ ahead + truth.positions()
+    assert np.linalg.norm((seen - true).mean(axis=0)) < 0.01 * scale  # a short path knows its scale less well
+    by_path = alignment_of(*short_path(turn_of_axes=1.0, scale=scale), with_scale=scale != 1.0)
+    assert np.linalg.norm(by_path.rotation - S.rotation) > np.deg2rad(0.5)
+
+
+def test_axes_that_mean_something_else_leave_the_path_to_decide() -> None:
+    truth, turned = short_path(turn_of_axes=1.0)
+    same, plain = short_path()
+    S = alignment_of(truth, turned, with_scale=False)
+    assert (
+        np.degrees(
+            np.linalg.norm(
+                rotation_exp(np.zeros(3)) - S.rotation.T @ alignment_of(same, plain, with_scale=False).rotation
+            )
+        )
+        < 5
+    )

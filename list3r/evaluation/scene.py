@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.evaluation.boxes import transform_box, upright
 from list3r.evaluation.instances import InstanceErrors, evaluate_instances
@@ -15,8 +16,13 @@ from list3r.evaluation.relations import RelationErrors, evaluate_relations
 from list3r.evaluation.trajectory import Trajectory, align, associate
 from list3r.frames.files import read_file
 from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz
+from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz, rotation_log, umeyama
 from list3r.memory.unpacking import parse_json
+
+_REACH_M = 2.0
+"""How far away things are from a camera indoors."""
+_SAME_AXES_DEG = 10.0
+"""Beyond what a path of half a metre with errors of centimetres leaves open, axes are other ones."""
 
 
 def read_scene(path: str | Path) -> dict[str, Any]:
@@ -49,11 +55,32 @@ def scene_relations(scene: Mapping[str, Any]) -> list[tuple[int, str, int]]:
 
 
 def alignment_of(truth: Trajectory, estimate: Trajectory, *, with_scale: bool, tolerance_s: float = 0.01) -> Sim3:
-    """Return S_truth_scene from the camera's path in both frames of reference. Raises as `align` does."""
+    """Return S_truth_scene from the camera's poses in both frames of reference. Raises as `align` does.
+
+    A path of a metre leaves a turn open that shifts things three metres away by centimetres. So what is laid on one
+    another is, beside the cameras, a point on each of their axes as far away as things are; but only where both
+    trajectories mean the same axes.
+    """
     rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
     if len(rows) < 3:
         raise OptionError(f"{len(rows)} poses within {tolerance_s} s of each other; both need one clock")
-    return align(truth.at(rows_truth), estimate.at(rows), with_scale=with_scale)
+    goal, from_ = truth.at(rows_truth), estimate.at(rows)
+    S = align(goal, from_, with_scale=with_scale)
+    turned = S.rotation @ from_.T_world_cam[:, :3, :3]
+    off = rotation_log(np.swapaxes(turned, 1, 2) @ goal.T_world_cam[:, :3, :3])
+    if np.degrees(np.median(np.linalg.norm(off, axis=1))) > _SAME_AXES_DEG:
+        return S
+    scale = float(S.scale)
+    points = [_with_axes(t, _REACH_M / s) for t, s in ((from_, scale), (goal, 1.0))]
+    rigid = umeyama(scale * points[0], points[1], with_scale=False)
+    return Sim3(S.scale, rigid.rotation, rigid.translation)
+
+
+def _with_axes(trajectory: Trajectory, reach: float) -> NDArray[np.float64]:
+    """Return the cameras and a point on each of their axes. Shape (4 F, 3)."""
+    T = trajectory.T_world_cam
+    ends = T[:, None, :3, 3] + reach * np.swapaxes(T[:, :3, :3], 1, 2)
+    return np.concatenate([T[:, :3, 3], ends.reshape(-1, 3)])
 
 
 def evaluate_scene_instances(
