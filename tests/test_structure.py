@@ -12,15 +12,14 @@ from list3r.memory.relations.structure import StructureSettings, classify_struct
 COMPUTED = StructureSettings(floor_band_m=StructureSettings().computed_floor_band_m)
 
 
-def level(height: float, thickness: float, size: float = 3.0) -> InstanceGeometry:
-    """A level surface whose middle four fifths of points are so thick."""
+def level(height: float, thickness: float, size: float = 3.0, flagged: float = 0.0) -> InstanceGeometry:
+    """A level surface whose middle four fifths of points are so thick; chunks took that share of it for structure."""
     rng = np.random.default_rng(5)
     points = rng.uniform((-size / 2, -size / 2, -1.0), (size / 2, size / 2, 1.0), (3000, 3))
     points[:, 2] = height + points[:, 2] * thickness / 1.6
     aabb = np.stack([points.min(axis=0), points.max(axis=0)])
-    return InstanceGeometry(
-        1, points, np.zeros((len(points), 3), np.uint8), upright_box(points), aabb, np.array([0.0, 0.0, 1.0])
-    )
+    rgb, up = np.zeros((len(points), 3), np.uint8), np.array([0.0, 0.0, 1.0])
+    return InstanceGeometry(1, points, rgb, upright_box(points), aabb, up, flagged=flagged)
 
 
 @pytest.mark.parametrize(
@@ -47,3 +46,20 @@ def test_a_small_level_thing_on_the_floor_is_none() -> None:
 
 def test_without_a_known_floor_there_is_none() -> None:
     assert classify_structure([level(0.0, 0.02)], None, lambda body: 1.5, 1.0) == [None]
+
+
+@pytest.mark.parametrize(
+    ("floor", "rug", "settings", "said"),
+    [
+        (1.0, 0.0, StructureSettings(), ["floor", None]),
+        (1.0, 1.0, StructureSettings(), ["floor", "floor"]),
+        (0.0, 0.0, StructureSettings(), ["floor", "floor"]),
+        (1.0, 0.0, StructureSettings(least_flagged=0.0), ["floor", "floor"]),
+    ],
+)
+def test_a_rug_is_what_chunks_told_from_a_floor(
+    floor: float, rug: float, settings: StructureSettings, said: list[str | None]
+) -> None:
+    """Discoverers that never tell structure leave the word to height alone, as does computed depth."""
+    there = [level(0.0, 0.02, flagged=floor), level(0.012, 0.02, 1.2, flagged=rug)]
+    assert classify_structure(there, 0.0, lambda body: 1.5, 1.0, settings) == said

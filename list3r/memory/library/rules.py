@@ -75,7 +75,7 @@ def settings_of(store: Store, settings: ConsolidationSettings | None) -> Consoli
     return replace(
         s,
         relations=replace(s.relations, noise_m=max(s.relations.noise_m, noise)),
-        structure=replace(s.structure, floor_band_m=max(s.structure.floor_band_m, band)),
+        structure=replace(s.structure, floor_band_m=max(s.structure.floor_band_m, band), least_flagged=0.0),
     )
 
 

@@ -25,6 +25,9 @@ class StructureSettings:
     """Level surfaces this near to the floor, and no thicker, are floor,"""
     computed_floor_band_m: float = 0.2
     """and this near where depth was computed: rooms bend, and up is known to two degrees."""
+    least_flagged: float = 0.5
+    """Of those, one of which the chunks took less than this share for structure lies on the floor, if they took others
+    for floor: a rug. 0 where depth was computed, by which chunks hardly tell a rug from a floor that bends."""
     min_area_m2: float = 0.25
     wall_height_m: float = 1.2
     wall_width_m: float = 0.8
@@ -59,11 +62,11 @@ def classify_structure(
     """floor, ceiling, wall, plane or None for each instance; z must be up.
 
     `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
-    saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level and lies at the
-    floor; a ceiling is level, above the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing
-    lies behind it. A smaller surface that the chunks flagged and that has nothing behind it is `plane`. A table top or
-    a cabinet front stands in the room and is none of these. What lies near an instance decides, so `around` may be all
-    instances (the default: those given) or those within `near_m`.
+    saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level, lies at the
+    floor, and is no rug, which chunks told from a floor; a ceiling is level, above the cameras, and faces down; a wall
+    is upright, tall and wide, and (nearly) nothing lies behind it. A smaller surface that the chunks flagged and that
+    has nothing behind it is `plane`. A table top or a cabinet front stands in the room and is none of these. What lies
+    near an instance decides, so `around` may be all instances (the default: those given) or those within `near_m`.
     """
     s = settings or StructureSettings()
     known = instances if around is None else around
@@ -75,8 +78,12 @@ def classify_structure(
             out.append(None)
             continue
         gap = np.maximum(box[:, 0] - b.aabb[1], b.aabb[0] - box[:, 1]).max(axis=1)
-        near = np.concatenate([cloud[n] for n in np.flatnonzero(gap <= s.near_m * unit)])
-        out.append(_classify(b, floor_height, eye_level, near, unit, s))
+        rows = np.flatnonzero(gap <= s.near_m * unit)
+        kind = _classify(b, floor_height, eye_level, np.concatenate([cloud[n] for n in rows]), unit, s)
+        if kind == "floor" and b.flagged < s.least_flagged and floor_height is not None:
+            told = any(known[n].flagged >= s.least_flagged and _low(known[n], floor_height, unit, s) for n in rows)
+            kind = None if told else kind
+        out.append(kind)
     return out
 
 
@@ -99,8 +106,8 @@ def _classify(
     thickness = float(np.ptp(np.quantile(along, [s.trim, 1.0 - s.trim])))
     edges = np.sort(instance.box.size)
     height, most = float(np.median(instance.points[:, 2])), max(s.thickness_m * unit, s.thickness * edges[1])
-    level = abs(instance.normal[2]) > np.cos(np.radians(s.level_deg))
-    low = level and floor_height is not None and abs(height - floor_height) < s.floor_band_m * unit
+    level = _level(instance, s)
+    low = floor_height is not None and _low(instance, floor_height, unit, s)
     most = max(most, s.floor_band_m * unit) if low else most
     if thickness > most or edges[1] * edges[2] < s.min_area_m2 * unit**2:
         return None
@@ -119,6 +126,16 @@ def _classify(
         if tall >= s.wall_height_m * unit and wide >= s.wall_width_m * unit:
             return "wall"
     return "plane" if instance.flagged > 0.5 else None
+
+
+def _level(instance: InstanceGeometry, s: StructureSettings) -> bool:
+    return instance.normal is not None and bool(abs(instance.normal[2]) > np.cos(np.radians(s.level_deg)))
+
+
+def _low(instance: InstanceGeometry, floor_height: float, unit: float, s: StructureSettings) -> bool:
+    """Return whether a surface is level and lies at the floor."""
+    away = abs(float(np.median(instance.points[:, 2])) - floor_height)
+    return _level(instance, s) and away < s.floor_band_m * unit
 
 
 def _bounds(instance: InstanceGeometry, cloud: Array, unit: float, s: StructureSettings) -> bool:
