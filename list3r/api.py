@@ -60,22 +60,35 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
     return guarded
 
 
-def open(path: str | Path, *, writable: bool = False, at: int | None = None) -> SceneMemory:
+def open(
+    path: str | Path, *, writable: bool = False, at: int | None = None, min_confidence: float | None = None
+) -> SceneMemory:
     """Open a memory, for reading or for editing too. Raises `MemoryFileError` for anything that is not one.
 
     Many may read while one writes; a second writer is refused. With `at` every question is about the world as it was
     after that session, and nothing can be written; `OptionError` for a session that there is not.
 
+    With `min_confidence` every question is about all that is at least so sure to be one thing, also what is too unsure
+    to be listed (scraps); nothing can be written then, and with `at` no scraps are shown.
+
     >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
+    >>> list3r.open("house.l3r", min_confidence=0.2).instances()
     """
-    if at is None:
+    if min_confidence is not None and not 0.0 <= min_confidence <= 1.0:
+        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    if at is None and min_confidence is None:
         return SceneMemory(Store.open(path, writable=writable))
     if writable:
-        raise OptionError(f"{path} as it was after session {at} can only be read")
-    from list3r.memory.maintenance.as_of import store_at
-
+        which = "with its scraps" if at is None else f"as it was after session {at}"
+        raise OptionError(f"{path} {which} can only be read")
     with Store.open(path) as store:
-        return SceneMemory(store_at(store, at))
+        if at is not None:
+            from list3r.memory.maintenance.as_of import store_at
+
+            return SceneMemory(store_at(store, at))
+        from list3r.memory.maintenance.with_scraps import store_with_scraps
+
+        return SceneMemory(store_with_scraps(store, min_confidence or 0.0))
 
 
 @naming_extras()

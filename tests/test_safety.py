@@ -25,7 +25,7 @@ from list3r.simulation.dataset import WalkSettings, write_walk
 
 Make = Callable[..., Path]
 FIXTURES = Path(__file__).parent / "fixtures"
-OLD = ["schema1.l3r", "schema2.l3r", "schema3.l3r", "schema6.l3r", "schema7.l3r", "schema8.l3r"]
+OLD = ["schema1.l3r", "schema2.l3r", "schema3.l3r", "schema6.l3r", "schema7.l3r", "schema8.l3r", "schema9.l3r"]
 
 
 @pytest.fixture(scope="module")

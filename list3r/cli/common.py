@@ -47,14 +47,15 @@ def asked_at() -> int | None:
 
 
 @contextlib.contextmanager
-def open_memory(path: Path) -> Iterator[SceneMemory]:
-    """The memory behind a path, for reading: as it is, or as it was after the session of `--at`.
+def open_memory(path: Path, min_confidence: float | None = None) -> Iterator[SceneMemory]:
+    """The memory behind a path, for reading: as it is, as it was after the session of `--at`, or all of it that is at
+    least so sure, scraps too.
 
     All that is read belongs to one state, whatever a build or an update commits meanwhile.
     """
     from list3r.api import open as open_scene
 
-    with open_scene(path, at=_AT.get()) as scene, scene.store.snapshot():
+    with open_scene(path, at=_AT.get(), min_confidence=min_confidence) as scene, scene.store.snapshot():
         yield scene
 
 

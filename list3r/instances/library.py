@@ -14,6 +14,7 @@ from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.movers import with_movers
 from list3r.instances.tracking.reprojection import ReprojectionTracker
+from list3r.instances.tracking.scraps import scrap_instances
 from list3r.memory.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
@@ -37,11 +38,13 @@ def build_library(
     discoverer = discoverer or GeometricDiscoverer(settings)
     tracker = tracker or ReprojectionTracker(settings)
     try:
-        anchors = chunk_views(frames, reconstruction, settings).anchors
-        proposals = [discoverer(frames, reconstruction, position) for position in anchors]
+        views = chunk_views(frames, reconstruction, settings)
+        proposals = [discoverer(frames, reconstruction, position) for position in views.anchors]
         prompts = [select_prompts(p, settings) for p in proposals]
         library = tracker(frames, reconstruction, prompts, discoverer.feature_space)
-        return with_movers(library, frames, reconstruction, settings.movers)
+        library = with_movers(library, frames, reconstruction, settings.movers)
+        scraps = [p.scraps for p in proposals if p.scraps is not None]
+        return replace(library, scraps=scrap_instances(views, scraps, settings, len(library.instances)))
     finally:
         forget_views()
 

@@ -152,6 +152,17 @@ class MoverInstanceSettings:
 
 
 @dataclass(frozen=True)
+class ScrapSettings:
+    """What is kept of things that are not listed."""
+
+    least_anchors: int = 2
+    """Anchors that must see it, where a chunk has so many."""
+    least_points: int = 10
+    support_points: int = 400
+    """Surface points kept of one."""
+
+
+@dataclass(frozen=True)
 class InstanceSettings:
     """The local instance library of a chunk."""
 
@@ -163,6 +174,7 @@ class InstanceSettings:
     segment: SegmentSettings = field(default_factory=SegmentSettings)
     track: MaskTrackSettings = field(default_factory=MaskTrackSettings)
     movers: MoverInstanceSettings = field(default_factory=MoverInstanceSettings)
+    scraps: ScrapSettings = field(default_factory=ScrapSettings)
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     """Of networks that look for things."""

@@ -106,6 +106,9 @@ class LocalLibrary:
     """Pairs of local ids seen side by side in one frame with disjoint masks: two things, not one. Shape (P, 2)."""
     feature_space: str
     """Name of the embedding space of the features, `model@revision/dim`."""
+    scraps: tuple[LocalInstance, ...] = ()
+    """What is too seldom one thing and all of it to be listed; `stability` is that probability. Seen in anchors alone,
+    without part in anything that is derived from the instances."""
 
 
 @dataclass(frozen=True)
@@ -324,6 +327,10 @@ class BestView:
     frame_index: int
     box_xyxy: tuple[float, float, float, float]
     """px."""
+
+
+FIRST_SCRAP = 1_000_000_000
+"""From this on ids are those of scraps, see `library.scraps`."""
 
 
 @dataclass(frozen=True)

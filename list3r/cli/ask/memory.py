@@ -58,26 +58,31 @@ def info(
 def list_instances(
     memory: MemoryArgument,
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
-    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")] = 0.0,
+    min_confidence: Annotated[
+        float | None,
+        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+    ] = None,
     at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
     json: JsonOption = False,
 ) -> None:
     """List the instances with their place and size.
 
-    Example: list3r list house.l3r --min-confidence 0.5
+    Example: list3r list house.l3r --min-confidence 0.2
     """
     from list3r.memory.errors import OptionError
+    from list3r.memory.records import FIRST_SCRAP
 
-    if not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"--min-confidence {min_confidence:g} must lie between 0 and 1")
-    with open_memory(memory) as scene:
+    least = min_confidence or 0.0
+    if not 0.0 <= least <= 1.0:
+        raise OptionError(f"--min-confidence {least:g} must lie between 0 and 1")
+    with open_memory(memory, None if at is not None else min_confidence) as scene:
         found = scene.instances(structure=None if structure else False)
         if at is not None:
             from list3r.memory.maintenance.history import world_at
 
             found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.units
-    kept = [i for i in found if i.confidence >= min_confidence]
+    kept = [i for i in found if i.confidence >= least]
     if json:
         print_answer(map(instance_dict, kept), units, total=len(found))
         return
@@ -89,7 +94,7 @@ def list_instances(
             _triple(i.box.size),
             i.confidence,
             i.observations,
-            i.structure or ("dynamic" if i.dynamic else ""),
+            i.structure or ("dynamic" if i.dynamic else "scrap" if i.id >= FIRST_SCRAP else ""),
             "" if i.state == "present" else i.state,
         ]
         for i in kept

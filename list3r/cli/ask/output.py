@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from list3r.queries.views.camera import PosedCamera
 
 Count = Annotated[int, typer.Option("-k", help="How many at most.")]
-MinConfidence = Annotated[float, typer.Option("--min-confidence", help="Only instances at least this sure.")]
+MinConfidence = Annotated[
+    float | None,
+    typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+]
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
 Label = Annotated[
     str | None,

@@ -38,7 +38,7 @@ def nearest(
     Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
     """
     origin = near.origin()
-    with open_memory(memory) as scene:
+    with open_memory(memory, filters.min_confidence) as scene:
         from list3r.queries.nearest import nearest as ask
 
         matches = ask(
@@ -68,7 +68,7 @@ def within(
     Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
     """
     lengths: dict[str, Any] = region.lengths(camera)
-    with open_memory(memory) as scene:
+    with open_memory(memory, filters.min_confidence) as scene:
         seen_by = camera_from(scene, camera)
         found = scene.within(
             **lengths, camera=seen_by, max_depth=camera.max_depth, occlusion=occlusion, **filters.options()
@@ -99,7 +99,7 @@ def similar(
     """
     from list3r.memory.errors import OptionError
 
-    with open_memory(memory) as scene:
+    with open_memory(memory, filters.min_confidence) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
             raise OptionError("say what to compare with: --id ID, or --image FILE, with --box for a part of it")
         if like.image is not None:

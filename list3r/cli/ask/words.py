@@ -41,7 +41,7 @@ class FilterWords:
     color: Color = None
     min_size: MinSize = None
     max_size: MaxSize = None
-    min_confidence: MinConfidence = 0.0
+    min_confidence: MinConfidence = None
     state: State = None
     component: Component = None
     structure: Structure = False
@@ -53,7 +53,7 @@ class FilterWords:
             "color": self.color,
             "min_size": self.min_size,
             "max_size": self.max_size,
-            "min_confidence": self.min_confidence,
+            "min_confidence": self.min_confidence or 0.0,
             "state": self.state,
             "component": self.component,
             "structure": self.structure,
@@ -143,7 +143,7 @@ class RelationWords:
             "of the two.",
         ),
     ] = None
-    min_confidence: MinConfidence = 0.0
+    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only relations at least this sure.")] = 0.0
 
 
 @dataclass(frozen=True)

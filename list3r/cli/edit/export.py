@@ -52,6 +52,10 @@ def export(
     out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for a pipe.")],
     *,
     words: ExportWords,
+    min_confidence: Annotated[
+        float | None,
+        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, a page to
@@ -65,10 +69,10 @@ def export(
     if out == Path("-"):
         if json:
             raise OptionError("--out - takes standard output, --json too; leave one of them out")
-        with open_memory(memory) as scene:
+        with open_memory(memory, min_confidence) as scene:
             _pipe(scene, to, options)
         return
-    with open_memory(memory) as scene:
+    with open_memory(memory, min_confidence) as scene:
         written = scene.export(to, out, **options)
     sizes = {str(path): path.stat().st_size for path in written}
     if json:

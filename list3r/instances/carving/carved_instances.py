@@ -77,7 +77,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         pictures = [_picture(k) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
         maker = _Maker(chunk, list(zip(own, pictures, strict=True)), frames, unit, upright, s)
         in_chunk = unit / float(chunk.S_world_chunk.scale)
-        following = 1 + max((n.local_id for n in nodes), default=-1)
+        following = store.local_instances.next_id(chunk.chunk_id)
         for cluster in clusters:
             thing = maker.make(following, cluster)
             if thing is not None:

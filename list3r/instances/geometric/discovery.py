@@ -39,10 +39,17 @@ class GeometricDiscoverer:
         views = chunk_views(frames, reconstruction, self.settings)
         if views is not self._views or self._cut is None:
             self._views, self._cut = views, self._segment(views)
-        cloud, cut, features = self._cut
-        labels = self._label_view(views, position, cloud, cut)
+        return self._looked_at(reconstruction, position, *self._cut[1:])
+
+    def _looked_at(
+        self, reconstruction: Reconstruction, position: int, cut: Segmentation, features: NDArray[np.float32]
+    ) -> Proposals:
+        """A cut of the cloud of the chunk in hand, as the frame at `position` sees it."""
+        assert self._views is not None and self._cut is not None
+        labels = self._label_view(self._views, position, self._cut[0], cut)
         shape = (reconstruction.camera.height, reconstruction.camera.width)
-        return _proposals(views.view(position), labels, cut, features, stride=views.stride, shape=shape)
+        view = self._views.view(position)
+        return _proposals(view, labels, cut, features, stride=self._views.stride, shape=shape)
 
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
         settings = self.settings.segment

@@ -19,13 +19,16 @@ from list3r.instances.geometric.segments import Segment, Segmentation
 from list3r.instances.geometric.surfaces import estimate_up
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
-from list3r.instances.learned.graph import Surroundings, chunk_surface
+from list3r.instances.learned.doubt import DoubtSettings, voxel_doubt, without_bends, without_slivers
+from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
 from list3r.instances.learned.network import Weights
 from list3r.instances.learned.things import ThingVerdicts, names_of
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
 from list3r.reconstruction.base import Reconstruction
 
+Features = NDArray[np.float32]
+"""Unit features of T things. Shape (T, D)."""
 OFF_WALL = 4.0
 """Voxels, besides three deviations of depth, from which a point lies off the plane of a wall or floor."""
 MOST_NAMES = 3
@@ -39,13 +42,17 @@ class LearnedSettings:
     """What is listed, and where agglomeration stops."""
 
     least_confidence: float = 0.6
-    """Things that are less probably one whole are scraps and not proposed; chosen on left-out worlds, where recall and
-    precision meet near it."""
+    """Things that are less probably one whole are scraps, which are kept but not listed; chosen on left-out worlds,
+    where recall and precision meet near it."""
+    least_scrap: float = 0.1
+    """Things that are less probably one whole are not even kept."""
     least_name: float = 0.5
     """Names that are less probable are not told."""
     plane_area_m2: float = 0.25
     """Smallest flat surface looked for, from which gravity is told and structure is parted."""
     cut: CutSettings = field(default_factory=CutSettings)
+    doubt: DoubtSettings = field(default_factory=DoubtSettings)
+    """Of computed depth."""
 
 
 class LearnedDiscoverer(GeometricDiscoverer):
@@ -60,13 +67,15 @@ class LearnedDiscoverer(GeometricDiscoverer):
         super().__init__(settings)
         self._learned = learned or LearnedSettings()
         self._weights: Weights = load_weights(weights)
+        self._scraps: tuple[Segmentation, Features] | None = None
 
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Propose masks on the frame at `position`, best first, with the probability that each is one thing."""
         found = super().__call__(frames, reconstruction, position)
-        return replace(found, whole=found.score)
+        scraps = None if self._scraps is None else self._looked_at(reconstruction, position, *self._scraps)
+        return replace(found, whole=found.score, scraps=scraps)
 
-    def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
+    def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, Features]:
         settings = self.settings.segment
         shown = [views.view(p) for p in views.anchors]
         cloud = build_cloud(shown, settings.voxel_m * views.unit)
@@ -75,12 +84,25 @@ class LearnedDiscoverer(GeometricDiscoverer):
         up = estimate_up(planes, poses)
         height = float(np.median(poses[:, :3, 3] @ up))
         around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
-        cut = cut_cloud(chunk_surface(cloud, shown, around), self._weights, self._learned.cut)
+        surface = chunk_surface(cloud, shown, around)
+        cut = cut_cloud(surface, self._weights, self._learned.cut)
+        if around.computed:
+            cut = self._as_sure_as_depth(views, surface, cut, planes)
         listed = (cut.told.whole >= self._learned.least_confidence) | (cut.told.structure > 0.5)
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(self._weights)
-        labels, segments, features = _described(cloud, parted, up, views.unit, names, self._learned.least_name)
-        return cloud, Segmentation(labels, tuple(segments), up), features
+        kept, features = _described(cloud, parted, up, views.unit, names, self._learned.least_name)
+        scraps = cut.only(~listed & (cut.told.whole >= self._learned.least_scrap))
+        self._scraps = _described(cloud, scraps, up, views.unit, names, self._learned.least_name)
+        return cloud, kept, features
+
+    def _as_sure_as_depth(
+        self, views: ChunkViews, surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane]
+    ) -> CloudCut:
+        """The cut without what errors of computed depth explain."""
+        s, doubt = self._learned.doubt, voxel_doubt(views, surface.cloud)
+        cut = without_bends(surface, cut, planes, doubt, s)
+        return without_slivers(surface.cloud, cut, doubt, s, 0.5 * self._learned.least_confidence)
 
 
 def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudCut:
@@ -130,8 +152,8 @@ def _named(told: ThingVerdicts, names: Sequence[str], least: float) -> list[tupl
 
 def _described(
     cloud: Cloud, cut: CloudCut, up: NDArray[np.float64], unit: float, names: Sequence[str], least_name: float
-) -> tuple[NDArray[np.int32], list[Segment], NDArray[np.float32]]:
-    """Labels from 1 (0 for none), what each segment is, and its feature."""
+) -> tuple[Segmentation, Features]:
+    """The segments of a cut and their features."""
     rgb, count = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8), len(cut.told.structure)
     order = np.argsort(cut.labels, kind="stable")
     bounds = np.searchsorted(cut.labels[order], np.arange(count + 1))
@@ -144,7 +166,7 @@ def _described(
         kind = "surface" if structure and plane is not None else "thing"
         score = 0.95 if structure else float(cut.told.whole[number])
         segments.append(Segment(kind, plane, structure, score, named=named[number]))
-    return np.asarray(cut.labels + 1, np.int32), segments, features
+    return Segmentation(np.asarray(cut.labels + 1, np.int32), tuple(segments), up), features
 
 
 def _plane_of(cloud: Cloud, mine: NDArray[np.int64], unit: float) -> NDArray[np.float64] | None:

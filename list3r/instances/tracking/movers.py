@@ -50,7 +50,7 @@ def with_movers(
         blank = np.zeros_like(library.instances[0].feature)
         found = [replace(i, feature=blank) for i in found]
     pairs = np.concatenate([library.cannot_link, _apart(found, s.cannot_link_frames)]).astype(np.int32)
-    return LocalLibrary((*library.instances, *found), pairs, library.feature_space)
+    return replace(library, instances=(*library.instances, *found), cannot_link=pairs)
 
 
 def _instance(

@@ -25,7 +25,7 @@ SAMPLES = 150
 
 
 @dataclass
-class _Track:
+class GrowingTrack:
     """What grows frame by frame for one instance."""
 
     frames: list[int] = field(default_factory=list)
@@ -35,6 +35,18 @@ class _Track:
     visible: list[float] = field(default_factory=list)
     agreement: list[float] = field(default_factory=list)
     masks: list[NDArray[np.uint32]] = field(default_factory=list)
+
+    def record(self, size: tuple[int, int]) -> MaskTrack:
+        """Return the track as it is kept; `size` is (height, width) of the masks."""
+        return MaskTrack(
+            np.array(self.frames, np.int64),
+            np.array(self.boxes, np.float32),
+            np.array(self.centers, np.float32),
+            np.array(self.areas, np.int32),
+            np.array(self.visible, np.float32),
+            tuple(self.masks),
+            size,
+        )
 
 
 class ReprojectionTracker:
@@ -82,15 +94,17 @@ class LabelledChunk:
 
         `labels_of` gives instance + 1 of each pixel of a frame at working size, by position.
         """
-        return self._library(self._follow(labels_of), feature_space)
+        posed = np.flatnonzero(self.views.reconstruction.posed).tolist()
+        return self._library(self.follow(labels_of, posed), feature_space)
 
-    def _follow(self, labels_of: Callable[[int], NDArray[np.int32]]) -> list[_Track]:
+    def follow(self, labels_of: Callable[[int], NDArray[np.int32]], positions: Sequence[int]) -> list[GrowingTrack]:
+        """Return where each instance is seen among the frames at some positions."""
         views, supports = self.views, self.supports
-        tracks = [_Track() for _ in supports]
+        tracks = [GrowingTrack() for _ in supports]
         samples, owner = _sample_supports(supports)
         settings, camera = self.settings.track, views.reconstruction.camera
         min_area = settings.min_area_px * camera.width * camera.height / (640 * 480)
-        for position in np.flatnonzero(views.reconstruction.posed).tolist():
+        for position in positions:
             labels = labels_of(position)
             seen, hit = _look_for(views, position, labels, samples, owner=owner, count=len(supports))
             runs = encode_labels(labels, views.stride, (camera.height, camera.width))
@@ -107,7 +121,7 @@ class LabelledChunk:
                 track.masks.append(mask)
         return tracks
 
-    def _library(self, tracks: Sequence[_Track], feature_space: str) -> LocalLibrary:
+    def _library(self, tracks: Sequence[GrowingTrack], feature_space: str) -> LocalLibrary:
         views, proposals, joined, supports = self.views, self.proposals, self.joined, self.supports
         size = (views.reconstruction.camera.height, views.reconstruction.camera.width)
         posed = int(views.reconstruction.posed.sum())
@@ -118,19 +132,10 @@ class LabelledChunk:
             if len(track.frames) < least or stability < self.settings.track.min_stability or len(support.points) < 10:
                 continue
             plane, structure = _surface(views, proposals, joined, number)
-            mask_track = MaskTrack(
-                np.array(track.frames, np.int64),
-                np.array(track.boxes, np.float32),
-                np.array(track.centers, np.float32),
-                np.array(track.areas, np.int32),
-                np.array(track.visible, np.float32),
-                tuple(track.masks),
-                size,
-            )
             feature = _joined_feature(proposals, joined, number)
             names = () if structure else _names(proposals, joined, number)
             stability *= 1.0 if structure else _whole(proposals, joined, number)
-            instance = LocalInstance(len(instances), mask_track, feature, support, stability, plane, structure)
+            instance = LocalInstance(len(instances), track.record(size), feature, support, stability, plane, structure)
             named = () if structure else _named(proposals, joined, number)
             instances.append(replace(instance, names=names, named=named))
         pairs = cannot_link_pairs(instances, self.settings.track.cannot_link_frames, views.unit)

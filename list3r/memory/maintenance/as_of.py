@@ -7,26 +7,18 @@ today. Relations among what has not changed since are those of the file; the oth
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
-import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from list3r.memory.geometry import Array
 from list3r.memory.library.rules import settings_of
 from list3r.memory.maintenance.history import world_at
+from list3r.memory.maintenance.shown import put_before, store_shown
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations import predicates
 from list3r.memory.relations.instance_geometry import InstanceGeometry
-from list3r.memory.store.committed import Committed
-from list3r.memory.store.connection import Connection
-from list3r.memory.store.lock import WriterLock
-from list3r.memory.store.read_checks import ReadChecks
 from list3r.memory.store.store import Store
 
 _BY_SESSION = ("sessions", "chunks", "frames", "events")
@@ -39,79 +31,10 @@ def store_at(store: Store, session_id: int) -> Store:
     """Return a store to read, as it was after a session; close it like any other. Raises `OptionError` for no such
     session.
     """
-    connection = _PastConnection.open(store.path)
-    past = _PastStore(connection)
-    connection.take_in = partial(_take_in, weakref.proxy(past), session_id)
-    try:
-        with past.snapshot():
-            return past
-    except BaseException:
-        past.close()
-        raise
+    return store_shown(store.path, partial(_take_in, session_id=session_id))
 
 
-class _PastConnection(Connection):
-    """A connection whose tables end with a session; what is read is checked in the file itself, by another one.
-    What another process writes is taken in when the next snapshot begins, all of it or nothing.
-    """
-
-    def __init__(self, path: Path, database: sqlite3.Connection, lock: WriterLock | None) -> None:
-        super().__init__(path, database, lock)
-        file = database.execute("SELECT file FROM pragma_database_list WHERE name = 'main'").fetchone()[0]
-        self._plain = Committed(path)
-        self._shown: int | None = None
-        self.take_in: Callable[[], None] = lambda: None
-        """Show the file as it is now; called when it has changed."""
-        if file and Path(file).exists():  # else a copy of our own, whose rows were checked as it was made
-            self._checks = ReadChecks(database, self._plain, whole=not self._checks.by_part("supports"))
-
-    def close(self) -> None:
-        """Let the file go. A second call does nothing."""
-        self._plain.close()
-        super().close()
-
-    @contextlib.contextmanager
-    def _state(self) -> Iterator[None]:
-        with self._guard:
-            if self._database.in_transaction:
-                yield
-                return
-            self._database.execute("BEGIN")
-            try:
-                self._database.execute("SELECT 1 FROM main.memory LIMIT 1").fetchall()
-                version = int(self._database.execute("PRAGMA main.data_version").fetchone()[0])
-                if version != self._shown:
-                    self._take_back()
-                    self.take_in()
-                    self._shown = version
-                yield
-            finally:
-                if self._database.in_transaction:
-                    self._database.execute("COMMIT")
-
-    def _take_back(self) -> None:
-        """Show the file itself."""
-        with self.temporary():
-            for kind, name in self._database.execute("SELECT type, name FROM sqlite_temp_master").fetchall():
-                if kind == "view" or name in ("instances", "relations", "instance_boxes"):
-                    self._database.execute(f"DROP {kind} temp.{name}")
-        self.forget()
-
-    def believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Return the rows: they are others than those that the checksums were written of."""
-        return rows
-
-
-class _PastStore(Store):
-    """A store whose tables end with a session."""
-
-    def verify(self) -> list[str]:
-        """Return every damage of the file itself."""
-        with Store.open(self.path) as store:
-            return store.verify()
-
-
-def _take_in(past: Store, session_id: int) -> None:
+def _take_in(past: Store, *, session_id: int) -> None:
     """Show the file as it is now, as far as it was known after a session."""
     then, now = world_at(past, session_id), {i.id: i for i in past.instances.all()}
     known = past.relations.all()
@@ -125,9 +48,7 @@ def _take_in(past: Store, session_id: int) -> None:
 
 def _show(past: Store, session_id: int, instances: Sequence[Instance]) -> None:
     """Let a store read only what was known after a session, from now on."""
-    connection = past.connection
-    connection.forget()
-    made = dict(connection.rows("SELECT name, sql FROM main.sqlite_master WHERE sql IS NOT NULL"))
+    put_before(past, instances, "relations")
     last = int(session_id)
     chunks = f"(SELECT chunk_id FROM main.chunks WHERE session_id <= {last})"
     ids = "(SELECT id FROM temp.instances)"
@@ -136,14 +57,9 @@ def _show(past: Store, session_id: int, instances: Sequence[Instance]) -> None:
     views["observations"] = f"chunk_id IN {chunks} AND instance IN {ids}"
     views["embeddings"] = views["detected_labels"] = f"instance IN {ids}"
     views["words"] = f"word = '' OR instance IN {ids}"
-    with connection.temporary():
-        for table in ("instances", "relations"):
-            connection.execute(made[table].replace("CREATE TABLE", "CREATE TEMP TABLE", 1))
-        boxes = made["instance_boxes"].replace("VIRTUAL TABLE instance_boxes", "VIRTUAL TABLE temp.instance_boxes", 1)
-        connection.execute(boxes)
-        past.instances.put(instances)
+    with past.connection.temporary():
         for table, condition in views.items():
-            connection.execute(f"CREATE TEMP VIEW {table} AS SELECT * FROM main.{table} WHERE {condition}")
+            past.connection.execute(f"CREATE TEMP VIEW {table} AS SELECT * FROM main.{table} WHERE {condition}")
 
 
 def _has_changed(then: Instance, now: Instance | None) -> bool:

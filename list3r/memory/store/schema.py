@@ -187,6 +187,10 @@ MIGRATIONS: tuple[str, ...] = (
         instance INTEGER PRIMARY KEY REFERENCES instances, shape TEXT NOT NULL, resting INTEGER NOT NULL,
         swatches BLOB NOT NULL);
     """,
+    # 10: what is too seldom one thing to be listed
+    """
+    ALTER TABLE local_instances ADD COLUMN scrap INTEGER NOT NULL DEFAULT 0;
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -156,6 +156,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "track": _ARCHIVE,
         "dynamic": _FLAG,
         "motion": _maybe(_ARCHIVE),
+        "scrap": _FLAG,
     },
     "supports": {
         "chunk_id": _CHUNK,

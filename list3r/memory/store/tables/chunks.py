@@ -112,6 +112,8 @@ class Chunks:
         self._keyframes.add(chunk_id, result.keyframes)
         for instance in result.library.instances:
             self._local_instances.add(chunk_id, instance)
+        for scrap in result.library.scraps:
+            self._local_instances.add(chunk_id, scrap, scrap=True)
         return chunk_id
 
     def all(self, session_id: int | None = None) -> list[ChunkRow]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from list3r.memory.constraints import standing
 from list3r.memory.errors import UnknownIdError
+from list3r.memory.records import FIRST_SCRAP
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.facts import Facts
 from list3r.memory.store.rows.columns import Columns
@@ -54,8 +55,9 @@ class Ids:
         return max(int(self._connection.rows(query)[0][0]), self._facts.last_id) + 1
 
     def largest(self) -> int:
-        """Return the largest id that an instance has now, 0 without any: about how many there are."""
-        return int(self._connection.rows("SELECT coalesce(max(id), 0) FROM instances")[0][0])
+        """Return the largest id that an instance has now, scraps apart, 0 without any: about how many there are."""
+        query = "SELECT coalesce(max(id), 0) FROM instances WHERE id < ?"
+        return int(self._connection.rows(query, (FIRST_SCRAP,))[0][0])
 
     def sample(self, count: int) -> list[int]:
         """Return about `count` ids, ascending, spread evenly over those given so far."""

@@ -58,6 +58,7 @@ class LocalSupport:
 class _LocalRow:
     chunk_id: int
     instance: LocalInstance
+    scrap: bool
 
 
 def _support_columns(support: Support) -> tuple[int, bytes, bytes, bytes, bytes]:
@@ -158,17 +159,27 @@ class LocalInstances:
             connection, "local_instances", _NODE, order, source=nodes, parts=("local_instances", "supports")
         )
 
-    def add(self, chunk_id: int, instance: LocalInstance) -> None:
-        """Store one more local instance of a chunk, under a local id that the chunk does not have yet."""
+    def add(self, chunk_id: int, instance: LocalInstance, *, scrap: bool = False) -> None:
+        """Store one more local instance or scrap of a chunk, under a local id that the chunk does not have yet."""
         self._library.unsettle(chunk_id)
-        self._rows.add(_LocalRow(chunk_id, instance))
+        self._rows.add(_LocalRow(chunk_id, instance, scrap))
         self._supports.add(chunk_id, instance.local_id, instance.support)
 
-    def nodes(self, chunk_ids: Sequence[int] | None = None) -> list[LocalNode]:
-        """Return local instances without masks, of some chunks or of all, in the order of (chunk, local id)."""
+    def nodes(self, chunk_ids: Sequence[int] | None = None, *, scraps: bool = False) -> list[LocalNode]:
+        """Return local instances, or the `scraps`, without masks, of some chunks or of all, by (chunk, local id)."""
         if chunk_ids is None:
-            return self._nodes.all()
-        return self._nodes.all(f"chunk_id IN ({','.join('?' * len(chunk_ids))})", tuple(chunk_ids))
+            return self._nodes.all("scrap = ?", (scraps,))
+        return self._nodes.all(f"scrap = ? AND chunk_id IN ({','.join('?' * len(chunk_ids))})", (scraps, *chunk_ids))
+
+    def scraps(self) -> list[tuple[int, int]]:
+        """Return (chunk id, local id) of all scraps, in order."""
+        query = "SELECT chunk_id, local_id FROM local_instances WHERE scrap ORDER BY chunk_id, local_id"
+        return [(int(k), int(n)) for k, n in self._connection.rows(query)]
+
+    def next_id(self, chunk_id: int) -> int:
+        """Return a local id that no local instance of a chunk has, larger than all."""
+        query = "SELECT coalesce(max(local_id), -1) FROM local_instances WHERE chunk_id = ?"
+        return int(self._connection.rows(query, (chunk_id,))[0][0]) + 1
 
     def mask_track(self, chunk_id: int, local_id: int) -> MaskTrack:
         """Return the masks of one local instance. Raises `MemoryFileError` when it is not there."""

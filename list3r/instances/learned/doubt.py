@@ -1,0 +1,116 @@
+"""What a cut of computed depth says that its own errors may have made: bends of walls, and slivers.
+
+Computed depth is off by more than it is rough, alike over a patch, so that a patch of a wall stands before it like a
+thing. Two things that the networks do not see tell them apart: how far depth may be off there, and whether the picture
+shows a border round the patch (docs/decisions/0088-scraps-and-colour-alone.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.geometric.cloud import Cloud
+from list3r.instances.geometric.planes import Plane
+from list3r.instances.geometric.views import ChunkViews
+from list3r.instances.learned.cut import CloudCut
+from list3r.instances.learned.graph import ChunkSurface
+
+
+@dataclass(frozen=True)
+class DoubtSettings:
+    """What the errors of computed depth explain; chosen on walk 41 of `benchmarks/colour.py`."""
+
+    deviations: float = 2.0
+    """Deviations of depth within which a voxel may lie in a plane."""
+    within: float = 0.75
+    """Share of a thing's voxels that do, for its shape to say nothing."""
+    step: float = 3.2
+    """Median step of colour across the rim of a thing, Lab with lightness halved, below which the picture shows
+    no border. Patches of walls and floors had 0.9 to 2.6, pictures, rugs and bed-covers 4 to 28."""
+    reach_px: int = 4
+    """Pixels between the two sides of a rim that are compared."""
+    least_spread: float = 0.75
+    """Deviation of a thing's points along the second of its axes over that of its depth, below which it is a scrap; a
+    bar as wide as what its depth may be off by to either side has 0.58."""
+
+
+def voxel_doubt(views: ChunkViews, cloud: Cloud) -> NDArray[np.float32]:
+    """Return the mean deviation of the computed depth that fell into each voxel, chunk units. Shape (N,)."""
+    noise = views.reconstruction.depth_noise
+    assert noise is not None
+    total, count = np.zeros(len(cloud.keys)), np.zeros(len(cloud.keys))
+    for position, index in zip(views.anchors, cloud.index, strict=True):
+        known = index >= 0
+        confidence = views.reconstruction.confidence[position][:: views.stride, :: views.stride]
+        doubt = noise.doubt(views.view(position).depth[known], confidence[known])
+        total += np.bincount(index[known], doubt, minlength=len(total))
+        count += np.bincount(index[known], minlength=len(total))
+    return np.asarray(total / np.maximum(count, 1.0), np.float32)
+
+
+def without_bends(
+    surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane], doubt: NDArray[np.float32], s: DoubtSettings
+) -> CloudCut:
+    """Return the cut with what is a patch of a wall or floor joined to it: what lies in the plane of a structure within
+    the doubt of depth (N,), and what no border in the pictures parts from what is round it.
+    """
+    structure = cut.told.structure > 0.5
+    held = np.append(structure, False)[cut.labels]
+    bounding = [p for p in planes if held[p.members].mean() > 0.5]
+    steps = rim_steps(surface, cut, s.reach_px)
+    into = np.arange(len(structure) + 1)
+    order = np.argsort(cut.labels, kind="stable")
+    bounds = np.searchsorted(cut.labels[order], np.arange(len(structure) + 1))
+    for number in np.flatnonzero(~structure & (steps < s.step)).tolist():
+        mine = order[bounds[number] : bounds[number + 1]]
+        reach, points = s.deviations * doubt[mine] + surface.cloud.voxel, surface.cloud.points[mine]
+        share = [float(np.mean(np.abs(p.height(points)) < reach)) for p in bounding]
+        if share and max(share) >= s.within:
+            owners = cut.labels[bounding[int(np.argmax(share))].members]
+            into[number] = np.bincount(owners[np.append(structure, False)[owners]]).argmax()
+    into[-1] = -1
+    labels = np.asarray(into[cut.labels], np.int32)
+    left = np.bincount(labels[labels >= 0], minlength=len(structure)) > 0
+    return CloudCut(labels, cut.told).only(left)
+
+
+def rim_steps(surface: ChunkSurface, cut: CloudCut, reach_px: int) -> NDArray[np.float64]:
+    """Return the median step of colour across the rim of each thing, where beyond it is structure or nothing known.
+    Infinite where nothing is. Shape (T,).
+    """
+    count = len(cut.told.structure)
+    structure, owner = np.append(cut.told.structure > 0.5, True), [np.zeros(0, np.int64)]
+    step = [np.zeros(0, np.float32)]
+    for index, lab in zip(surface.cloud.index, surface.view_lab, strict=True):
+        image = np.append(cut.labels, -1)[index]
+        for axis in (0, 1):
+            one, two = ([slice(None), slice(None)] for _ in range(2))
+            one[axis], two[axis] = slice(None, -reach_px), slice(reach_px, None)
+            for here, there in ((tuple(one), tuple(two)), (tuple(two), tuple(one))):
+                rim = ~structure[image[here]] & structure[image[there]]
+                owner.append(image[here][rim].astype(np.int64))
+                step.append(np.linalg.norm(lab[here][rim] - lab[there][rim], axis=1))
+    owners, steps = np.concatenate(owner), np.concatenate(step)
+    out = np.full(count, np.inf)
+    order = np.lexsort((steps, owners))
+    bounds = np.searchsorted(owners[order], np.arange(count + 1))
+    seen = np.flatnonzero(np.diff(bounds))
+    out[seen] = steps[order[(bounds[seen] + bounds[seen + 1]) // 2]]
+    return out
+
+
+def without_slivers(cloud: Cloud, cut: CloudCut, doubt: NDArray[np.float32], s: DoubtSettings, most: float) -> CloudCut:
+    """Return the cut in which what is narrower than the doubt of its depth (N,) is one whole with at most the
+    probability `most`.
+    """
+    whole = cut.told.whole.copy()
+    for number in np.flatnonzero((cut.told.structure <= 0.5) & (whole > most)).tolist():
+        mine = np.flatnonzero(cut.labels == number)
+        second = float(np.linalg.eigvalsh(np.cov(cloud.points[mine].T))[1]) if len(mine) > 2 else 0.0
+        if second < (s.least_spread * float(np.median(doubt[mine]))) ** 2:
+            whole[number] = most
+    return replace(cut, told=replace(cut.told, whole=whole))

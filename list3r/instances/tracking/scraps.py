@@ -1,0 +1,50 @@
+"""What is too seldom one thing to be listed, kept as it is seen on the anchors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.instances.base import Proposals
+from list3r.instances.geometric.support import collect_supports
+from list3r.instances.geometric.views import ChunkViews
+from list3r.instances.settings import InstanceSettings
+from list3r.instances.tracking.reprojection import LabelledChunk
+from list3r.memory.records import LocalInstance
+
+
+def scrap_instances(
+    views: ChunkViews, proposals: Sequence[Proposals], settings: InstanceSettings, first_id: int
+) -> tuple[LocalInstance, ...]:
+    """Return the scraps of a chunk, with local ids from `first_id` on; a discoverer tells them by `identity`.
+
+    They are seen on anchors alone: what is not listed is not worth following from frame to frame.
+    """
+    told = [(p, identity_of(p)) for p in proposals if len(p.score)]
+    if not told:
+        return ()
+    kept, numbers, s = [p for p, _ in told], [n for _, n in told], settings.scraps
+    count = 1 + max(int(n.max()) for n in numbers)
+    stride, images = views.stride, dict[int, NDArray[np.int32]]()
+    for p, n in told:
+        images[p.position] = np.append(0, n + 1).astype(np.int32)[p.labels[::stride, ::stride]]
+    nowhere = np.full((count, 4), np.nan)
+    supports = collect_supports(views, kept, list(images.values()), nowhere, s.support_points)
+    tracks = LabelledChunk(views, kept, numbers, supports, settings).follow(images.__getitem__, sorted(images))
+    whole = {k: float(v) for p, n in told for k, v in zip(n.tolist(), p.score, strict=True)}
+    feature = {k: v for p, n in told for k, v in zip(n.tolist(), p.features, strict=True)}
+    camera, least = views.reconstruction.camera, min(s.least_anchors, len(views.anchors))
+    out: list[LocalInstance] = []
+    for number, (track, support) in enumerate(zip(tracks, supports, strict=True)):
+        if len(track.frames) >= least and len(support.points) >= s.least_points:
+            seen = track.record((camera.height, camera.width))
+            out.append(LocalInstance(first_id + len(out), seen, feature[number], support, whole[number]))
+    return tuple(out)
+
+
+def identity_of(proposals: Proposals) -> NDArray[np.int64]:
+    """Return the thing that each candidate is a view of, which its discoverer must know. Shape (N,)."""
+    assert proposals.identity is not None
+    return proposals.identity
