@@ -22,7 +22,7 @@ from list3r.instances.learned.graph import ChunkSurface
 
 @dataclass(frozen=True)
 class DoubtSettings:
-    """What the errors of computed depth explain; chosen on walk 41 of `benchmarks/colour.py`."""
+    """What the errors of computed depth explain; chosen on walks 41 and 42 of `benchmarks/colour.py`."""
 
     deviations: float = 2.0
     """Deviations of depth within which a voxel may lie in a plane."""
@@ -33,9 +33,9 @@ class DoubtSettings:
     no border. Patches of walls and floors had 0.9 to 2.6, pictures, rugs and bed-covers 4 to 28."""
     reach_px: int = 4
     """Pixels between the two sides of a rim that are compared."""
-    least_spread: float = 0.75
-    """Deviation of a thing's points along the second of its axes over that of its depth, below which it is a scrap; a
-    bar as wide as what its depth may be off by to either side has 0.58."""
+    least_spread: float = 0.58
+    """Deviation of a thing's points along the second of its axes over that of its depth, below which it is a scrap:
+    that of a bar as wide as what its depth may be off by to either side."""
 
 
 def voxel_doubt(views: ChunkViews, cloud: Cloud) -> NDArray[np.float32]:
