@@ -135,7 +135,7 @@ def test_it_is_asked_for_by_name() -> None:
     assert isinstance(found, LearnedDiscoverer)
 
 
-def test_it_is_taken_where_a_sensor_measures_depth_and_its_weights_are_whole(
+def test_it_is_taken_where_a_sensor_measures_depth_and_damage_to_its_weights_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
@@ -145,8 +145,10 @@ def test_it_is_taken_where_a_sensor_measures_depth_and_its_weights_are_whole(
     assert settings_asked(BuildRequest(reconstruction="sfm"), depth, "any")[0].discovery == "geometric"
     load_weights.cache_clear()
     monkeypatch.setattr("list3r.instances.learned.weights.SHIPPED", tmp_path / "weights.npz")
-    settings, (line,) = settings_asked(BuildRequest(), depth, "any")
-    assert settings.discovery == "geometric" and "weights.npz" in line and "\n" not in line
+    with pytest.raises(OptionError, match=r"weights\.npz") as said:
+        settings_asked(BuildRequest(), depth, "any")
+    assert "\n" not in str(said.value)
+    assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "geometric"
     load_weights.cache_clear()
 
 

@@ -158,14 +158,17 @@ def _local_features(words: str) -> tuple[str, str | None]:
 
 
 def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSelection:
-    """Return the preset's models, or the classical ones, with what was asked for by name put in their place."""
+    """Return the preset's models, or the classical ones, with what was asked for by name put in their place.
+
+    Raises `OptionError` where the weights of the learned discoverer are missing, damaged or of another version.
+    """
     chosen = ModelSelection()
     if request.preset is not None:
         gpu = find_gpu(request.device) if request.preset == "auto" else None
         chosen = select(request.preset, has_depth=info.has_depth, profile=licence, gpu=gpu)
     sensed = info.has_depth and (request.reconstruction or chosen.reconstruction) in SENSED
     if request.discovery is None and chosen.discovery == "geometric" and sensed:
-        chosen = _with_learned(chosen)
+        chosen = replace(chosen, discovery="learned")
     given = {k: getattr(request, k) for k in ("reconstruction", "discovery", "tracking", "features")}
     named = {k: str(v) for k, v in given.items() if v is not None}
     if "discovery" in named and "features" not in named:
@@ -176,18 +179,12 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
             named["features"] = "geometric"
     if named and chosen.why:
         named["why"] = f"{chosen.why}; {', '.join(f'--{k} {v}' for k, v in named.items())} as asked"
-    return replace(chosen, **named)
+    found = replace(chosen, **named)
+    if found.discovery == "learned":
+        from list3r.instances.learned.weights import load_weights
 
-
-def _with_learned(chosen: ModelSelection) -> ModelSelection:
-    """Return a selection with the learned discoverer; with the rules, and one line, where its weights are no good."""
-    from list3r.instances.learned.weights import load_weights
-
-    try:
         load_weights()
-    except OptionError as error:
-        return replace(chosen, why="; ".join(filter(None, [chosen.why, f"{error}, which is done now"])))
-    return replace(chosen, discovery="learned")
+    return found
 
 
 def _reads_files(name: str) -> bool:
