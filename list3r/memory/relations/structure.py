@@ -78,7 +78,7 @@ def classify_structure(
             out.append(None)
             continue
         gap = np.maximum(box[:, 0] - b.aabb[1], b.aabb[0] - box[:, 1]).max(axis=1)
-        rows = np.flatnonzero(gap <= s.near_m * unit)
+        rows = np.flatnonzero(gap <= s.near_m * unit).tolist()
         kind = _classify(b, floor_height, eye_level, np.concatenate([cloud[n] for n in rows]), unit, s)
         if kind == "floor" and b.flagged < s.least_flagged and floor_height is not None:
             told = any(known[n].flagged >= s.least_flagged and _low(known[n], floor_height, unit, s) for n in rows)
