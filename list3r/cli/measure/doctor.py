@@ -19,6 +19,7 @@ _PACKAGES = (
     ("numpy", "everything"),
     ("scipy", "everything"),
     ("opencv-python-headless", "reading frames, features"),
+    ("numba", "building memories"),
     ("av", "video files"),
     ("pillow", "the plan picture"),
     ("networkx", "graphs in Python"),

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.frames.registration.kernels import close_gaps, project
 
-_FAR = np.iinfo(np.int64).max
 # Two neighbouring depth pixels lie on one surface when their depths differ by less than this share of the depth for
 # every radian between them (a slant of 80 degrees), or by less than the sensor's own noise, quadratic in depth.
 _SLANT = math.tan(math.radians(80.0))
@@ -35,7 +35,6 @@ class DepthReprojection:
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1).reshape(-1, 3)
         projection = color_camera.matrix() @ rotation
         slope = (rays @ projection.T).astype(np.float32)
-        # u = (slope_u z + shift_u) / (slope_w z + shift_w); half a pixel is added so that truncation rounds.
         self._shift = (color_camera.matrix() @ translation).astype(np.float32)
         self._slope = np.ascontiguousarray(slope.T)
         self._straight = bool(np.allclose(slope[:, 2], 1.0, atol=1e-7)) and abs(float(self._shift[2])) < 1e-9
@@ -46,72 +45,9 @@ class DepthReprojection:
         `depth` is the depth camera's, metres, 0 where unknown, shape (H, W) of the depth camera.
         """
         fine = _refine(depth, self.factor, self._jump) if self.factor > 1 else depth
-        height, width = self.color_camera.height, self.color_camera.width
-        source, target, z = self._project(fine.ravel())
-        # The bits of a positive float order as the float does, so one minimum finds the nearest depth and its pixel.
-        key = (z.view(np.int32).astype(np.int64) << 32) | source
-        nearest = np.full(height * width, _FAR, dtype=np.int64)
-        np.minimum.at(nearest, target, key)
-        hit = nearest != _FAR
-        out = np.where(hit, (nearest >> 32).astype(np.int32).view(np.float32), np.float32(0.0)).reshape(height, width)
-        origin = np.where(hit, nearest & 0xFFFFFFFF, -1).astype(np.int32).reshape(height, width)
-        return self._close_gaps(out, origin, fine)
-
-    def _project(self, z: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-        """Source pixels that land in the colour image, where they land, and their depth there."""
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            if self._straight:
-                inverse, out = 1.0 / z, z
-                u = self._slope[0] + self._shift[0] * inverse
-                v = self._slope[1] + self._shift[1] * inverse
-            else:
-                out = self._slope[2] * z + self._shift[2]
-                inverse = 1.0 / out
-                u = (self._slope[0] * z + self._shift[0]) * inverse
-                v = (self._slope[1] * z + self._shift[1]) * inverse
-        u += np.float32(0.5)
-        v += np.float32(0.5)
-        camera = self.color_camera
-        inside = (z > 0) & (out > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        source = np.flatnonzero(inside)
-        target = v[source].astype(np.int32) * camera.width + u[source].astype(np.int32)
-        return source, target, out[source]
-
-    def _close_gaps(
-        self, out: NDArray[np.float32], origin: NDArray[np.int32], fine: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Fill pixels that rounding missed, and those where a far surface shows through such a gap in a near one.
-
-        A pixel is filled from two opposite neighbours when the depth pixels these came from are themselves close
-        neighbours on one surface, with depth known between them. A true hole or an edge is left as it is.
-        """
-        width = out.shape[1]
-        flat_out, flat_origin, flat_fine = out.ravel(), origin.ravel(), fine.ravel()
-        filled = out.copy()
-        flat_filled = filled.ravel()
-        steep = np.float32(1.0 + 2.0 * self._jump)
-        for step, before, here, after in (
-            (1, out[:, :-2], out[:, 1:-1], out[:, 2:]),
-            (width, out[:-2], out[1:-1], out[2:]),
-        ):
-            gap = ((here == 0) | (here > steep * np.maximum(before, after))) & (before > 0) & (after > 0)
-            row, column = np.nonzero(gap)
-            at = (row * width + column + step).astype(np.int32)
-            at = at[self._one_surface(flat_origin[at - step], flat_origin[at + step], flat_fine)]
-            value = 0.5 * (flat_out[at - step] + flat_out[at + step])
-            still = (flat_filled[at] == 0) | (flat_filled[at] > value)
-            flat_filled[at[still]] = value[still]
-        return filled
-
-    def _one_surface(self, a: NDArray[np.int32], b: NDArray[np.int32], fine: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return whether pixels a and b of the depth image are at most three apart on one surface. Shape (N,)."""
-        width = self._source.width
-        (ay, ax), (by, bx) = np.divmod(a, width), np.divmod(b, width)
-        near = (np.abs(ay - by) <= 3) & (np.abs(ax - bx) <= 3)
-        middle = ((ay + by) // 2) * width + (ax + bx) // 2
-        za, zb, zm = fine[a], fine[b], fine[middle]
-        allowed = 3.0 * self._jump * zm + _NOISE_PER_M * zm * zm
-        return np.asarray(near & (zm > 0) & (np.abs(za - zm) <= allowed) & (np.abs(zb - zm) <= allowed))
+        size = self.color_camera.height, self.color_camera.width
+        out, origin = project(fine.ravel(), self._slope, self._shift, self._straight, *size)
+        return close_gaps(out, origin, fine, self._jump, _NOISE_PER_M)
 
 
 def _finer(camera: Camera, factor: int) -> Camera:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.compiled import compiled
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.features import mean_feature
@@ -19,6 +20,8 @@ from list3r.instances.separation import cannot_link_pairs
 from list3r.instances.settings import InstanceSettings
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.reconstruction.base import Reconstruction
+
+Ints = NDArray[np.int64]
 
 SAMPLES = 150
 """Support points of an instance that are looked for in every frame."""
@@ -199,33 +202,45 @@ def encode_labels(
     known = value > 0
     order = np.argsort(value[known], kind="stable")
     starts, stops, value = starts[known][order], stops[known][order], value[known][order]
-    bounds = np.flatnonzero(np.diff(value, prepend=-1, append=-1))
+    bounds = np.append(np.flatnonzero(np.diff(value, prepend=-1)), len(value))
+    runs, ends, figures = _codes(starts, stops, bounds, *shape)
     out = {}
-    for low, high in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        out[int(value[low]) - 1] = _code(starts[low:high], stops[low:high], shape)
+    for k, (area, x0, y0, x1, y1, x, y) in enumerate(figures.tolist()):
+        out[int(value[bounds[k]]) - 1] = runs[ends[k] : ends[k + 1]], int(area), (x0, y0, x1, y1), (x, y)
     return out
 
 
-def _code(
-    starts: NDArray[np.int64], stops: NDArray[np.int64], shape: tuple[int, int]
-) -> tuple[NDArray[np.uint32], int, tuple[float, float, float, float], tuple[float, float]]:
-    bounds = np.empty(2 * len(starts) + 1, np.int64)
-    bounds[0], bounds[1::2], bounds[2::2] = 0, starts, stops
-    runs = np.diff(bounds)
-    tail = shape[0] * shape[1] - int(stops[-1])
-    runs = np.append(runs, tail) if tail else runs
-    length = stops - starts
-    row, column = starts // shape[1], starts % shape[1]
-    last_row, last_column = (stops - 1) // shape[1], (stops - 1) % shape[1]
-    wraps = last_row > row
-    x0 = 0 if wraps.any() else int(column.min())
-    x1 = shape[1] - 1 if wraps.any() else int(last_column.max())
-    area = int(length.sum())
-    middle = (starts + stops - 1) / 2.0
-    center_y = float((length * (middle // shape[1])).sum() / area)
-    center_x = float((length * np.where(wraps, shape[1] / 2.0, middle % shape[1])).sum() / area)
-    box = (float(x0), float(row.min()), float(x1 + 1), float(last_row.max() + 1))
-    return runs.astype(np.uint32), area, box, (center_x, center_y)
+@compiled
+def _codes(
+    starts: Ints, stops: Ints, bounds: Ints, height: int, width: int
+) -> tuple[NDArray[np.uint32], Ints, NDArray[np.float64]]:
+    """Run-length codes of masks, one behind the other, where each ends, and area, box and centroid of each (M, 7).
+
+    `starts` and `stops` (N,) are runs of pixels, those of mask k from `bounds[k]` to `bounds[k + 1]`.
+    """
+    runs, used = np.empty(2 * len(starts) + len(bounds), np.uint32), 0
+    ends, figures = np.zeros(len(bounds), np.int64), np.zeros((len(bounds) - 1, 7))
+    for k in range(len(bounds) - 1):
+        at, area, across, down = 0, 0, 0.0, 0.0
+        x0, y0, x1, y1 = width, height, 0, 0
+        for n in range(bounds[k], bounds[k + 1]):
+            runs[used], runs[used + 1] = starts[n] - at, stops[n] - starts[n]
+            used, at = used + 2, stops[n]
+            row, last_row = starts[n] // width, (stops[n] - 1) // width
+            left, right = starts[n] % width, (stops[n] - 1) % width
+            middle = (starts[n] + stops[n] - 1) / 2.0
+            if last_row > row:
+                left, right = 0, width - 1
+            length = stops[n] - starts[n]
+            across += length * (width / 2.0 if last_row > row else middle % width)
+            down += length * (middle // width)
+            x0, y0, x1, y1 = min(x0, left), min(y0, row), max(x1, right + 1), max(y1, last_row + 1)
+            area += length
+        if at < height * width:
+            runs[used], used = height * width - at, used + 1
+        ends[k + 1] = used
+        figures[k] = np.array([area, x0, y0, x1, y1, across / area, down / area])
+    return runs[:used], ends, figures
 
 
 def _sample_supports(supports: Sequence[Support]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

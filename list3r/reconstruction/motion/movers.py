@@ -12,8 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.compiled import compiled
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.motion.settings import MoverSettings
+from list3r.reconstruction.rgbd.kernels import centred
 from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register, steps_without
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
@@ -55,26 +57,59 @@ def pixel_costs(
     model: Samples, view: WorkingFrame, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Truncated squares of depth and brightness residuals in units of noise, summed, and the pixels they fall on."""
-    camera, gray = view.camera, model.gray
-    R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
-    p = (model.points - t) @ R
-    z = np.maximum(p[:, 2], np.float32(1e-3))
-    u = p[:, 0] / z * np.float32(camera.fx) + np.float32(camera.cx)
-    v = p[:, 1] / z * np.float32(camera.fy) + np.float32(camera.cy)
-    inside = (p[:, 2] > 0.05) & (u > 0) & (v > 0) & (u < camera.width - 1) & (v < camera.height - 1)
-    index = np.flatnonzero(inside)
-    pixel = np.rint(v[index]).astype(np.int64) * camera.width + np.rint(u[index]).astype(np.int64)
-    known = view.valid.ravel()[pixel]
-    index, pixel = index[known], pixel[known]
-    apart = view.points.reshape(-1, 3)[pixel] @ R.T + t - model.points[index]
-    residual = np.einsum("ij,ij->i", apart, model.normals[index]) / noise.sigma(view.depth.ravel()[pixel])
+    camera = view.camera
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    law = noise.constant_m, noise.quadratic_per_m, noise.nearest_m
+    seen = view.points, view.gray, view.valid
+    residual, error, pixel = _residuals(model.laid_out(), np.ascontiguousarray(T_model_cam), intrinsics, seen, law)
     limit = np.float32(settings.truncate**2)
     cost = np.minimum(residual * residual, limit)
-    if gray is not None and len(index):
-        error = cv2.remap(view.gray, u[index][None], v[index][None], cv2.INTER_LINEAR)[0] - gray[index]
-        error = (error - np.median(error)) / np.float32(settings.gray_sigma)
-        cost = cost + np.minimum(error * error, limit)
-    return np.asarray(cost, np.float32), pixel
+    if model.gray is not None and len(pixel):
+        error = centred(error) / np.float32(settings.gray_sigma)
+        cost += np.minimum(error * error, limit)
+    return cost, pixel
+
+
+@compiled
+def _residuals(
+    model: tuple[Floats, Floats, Floats],
+    T_model_cam: Pose,
+    intrinsics: tuple[float, float, float, float],
+    view: tuple[Floats, Floats, Mask],
+    law: tuple[float, float, float],
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Distances of a view's surface from model points over noise, differences of brightness, and pixels, (M,) each."""
+    points, normals, gray = model
+    there, tone, valid = view
+    R, t = T_model_cam[:3, :3], T_model_cam[:3, 3]
+    height, width = valid.shape
+    size, count = len(points), 0
+    residual, error, pixel = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int64)
+    for k in range(size):
+        p = (points[k, 0] - t[0], points[k, 1] - t[1], points[k, 2] - t[2])
+        z = p[0] * R[0, 2] + p[1] * R[1, 2] + p[2] * R[2, 2]
+        if not z > 0.05:
+            continue
+        u = (p[0] * R[0, 0] + p[1] * R[1, 0] + p[2] * R[2, 0]) / z * intrinsics[0] + intrinsics[2]
+        v = (p[0] * R[0, 1] + p[1] * R[1, 1] + p[2] * R[2, 1]) / z * intrinsics[1] + intrinsics[3]
+        if not (u > 0 and v > 0 and u < width - 1 and v < height - 1):
+            continue
+        row, column = int(v + 0.5), int(u + 0.5)
+        if not valid[row, column]:
+            continue
+        q, distance = there[row, column], 0.0
+        for c in range(3):
+            moved = R[c, 0] * q[0] + R[c, 1] * q[1] + R[c, 2] * q[2] + t[c]
+            distance += (moved - points[k, c]) * normals[k, c]
+        away = q[2] - law[2]
+        residual[count] = distance / (law[0] + law[1] * away * away)
+        x, y, left, top = u - int(u), v - int(v), int(u), int(v)
+        above = tone[top, left] * (1 - x) + tone[top, left + 1] * x
+        below = tone[top + 1, left] * (1 - x) + tone[top + 1, left + 1] * x
+        error[count] = above * (1 - y) + below * y - gray[k]
+        pixel[count] = row * width + column
+        count += 1
+    return residual[:count], error[:count], pixel[:count]
 
 
 def surfaces(view: WorkingFrame, settings: MoverSettings, noise: SensorNoise) -> list[Mask]:

@@ -6,19 +6,44 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.compiled import compiled
 from list3r.frames.base import Camera
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 from list3r.reconstruction.rgbd.view import Floats, shrink_depth, surface
 
+_BEYOND = 1e6
+"""Farther than any depth, metres."""
+
 
 def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> NDArray[np.float16]:
     """Confidence in [0, 1] of each pixel, 0 where depth is unknown. Shape (H, W)."""
-    known = depth > 0
-    sigma = settings.noise.sigma(depth) * np.float32(1.0 / settings.half_sigma_m)
-    confidence = np.where(known, 1.0 / (1.0 + sigma * sigma), np.float32(0))
-    confidence *= _facing(depth, camera, settings)
-    confidence[beside_edge(depth, known, settings.edge_step)] *= np.float32(settings.edge_confidence)
-    return confidence.astype(np.float16)
+    window, noise = np.ones((3, 3), np.uint8), settings.noise
+    lowest = cv2.erode(np.where(depth > 0, depth, np.float32(_BEYOND)), window)
+    law = noise.constant_m, noise.quadratic_per_m, noise.nearest_m, settings.half_sigma_m
+    edge = 2 * settings.edge_step, settings.edge_confidence
+    return _confidence(depth, cv2.dilate(depth, window) - lowest, _facing(depth, camera, settings), law, edge).astype(
+        np.float16
+    )
+
+
+@compiled
+def _confidence(
+    depth: Floats, relief: Floats, facing: Floats, law: tuple[float, float, float, float], edge: tuple[float, float]
+) -> Floats:
+    """Confidence of each pixel, by its depth, how much depth differs beside it, and how it is faced. Shape (H, W).
+
+    `law` is that of `SensorNoise` and the noise at which confidence is one half, metres; `edge` the relief of an edge,
+    as a share of depth, and the factor there.
+    """
+    out = np.zeros(depth.shape, np.float32)
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            z = depth[row, column]
+            if z > 0:
+                sigma = (law[0] + law[1] * (z - law[2]) * (z - law[2])) / law[3]
+                found = facing[row, column] / (1 + sigma * sigma)
+                out[row, column] = found * edge[1] if relief[row, column] > edge[0] * z else found
+    return out
 
 
 def _facing(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> Floats:
@@ -35,5 +60,5 @@ def beside_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray
     """Pixels next to a jump of depth by more than a share `step` of it. Shape (H, W)."""
     window = np.ones((3, 3), np.uint8)
     highest = cv2.dilate(depth, window)
-    lowest = cv2.erode(np.where(known, depth, np.float32(1e6)), window)
+    lowest = cv2.erode(np.where(known, depth, np.float32(_BEYOND)), window)
     return known & (highest - lowest > np.float32(2 * step) * depth)

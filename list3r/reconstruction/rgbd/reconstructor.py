@@ -56,7 +56,10 @@ class RgbdReconstructor:
         if not any(frame.depth is not None for frame in frames):
             raise TrackingError("the frames have no depth; the rgbd reconstruction needs it")
         shape = (camera.height, camera.width)
-        depth = np.stack([np.zeros(shape, np.float32) if f.depth is None else f.depth for f in frames])
+        depth = np.zeros((len(frames), *shape), np.float32)
+        for k, frame in enumerate(frames):
+            if frame.depth is not None:
+                depth[k] = frame.depth
         if self.poses == "given":
             T, posed = given_poses(frames)
             keyframes = select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry.keyframes)
@@ -70,13 +73,16 @@ class RgbdReconstructor:
                 moving = self._moving(frames, T, posed, camera, left_out)
         if moving is not None:
             _take_out(depth, moving)
+        confidence = np.zeros(depth.shape, np.float16)
+        for k, image in enumerate(depth):
+            confidence[k] = depth_confidence(image, camera, self.settings.confidence)
         return Reconstruction(
             frame_indices=np.array([frame.index for frame in frames], np.int64),
             posed=posed,
             T_chunk_cam=T,
             camera=camera,
             depth=depth,
-            confidence=np.stack([depth_confidence(d, camera, self.settings.confidence) for d in depth]),
+            confidence=confidence,
             scale_kind="metric",
             keyframes=np.array(keyframes, np.int64),
             moving=moving,

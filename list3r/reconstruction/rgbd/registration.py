@@ -16,6 +16,15 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import skew
 from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.rgbd.kernels import (
+    bilinear,
+    brightness_slopes,
+    centred,
+    huber_equations,
+    pair_up,
+    plane_slopes,
+    spread,
+)
 from list3r.reconstruction.rgbd.settings import RegistrationSettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
@@ -33,6 +42,11 @@ class Samples:
     """Unit. Shape (N, 3)."""
     gray: Floats | None = None
     """Brightness, 0 to 255. Shape (N,)."""
+
+    def laid_out(self) -> tuple[Floats, Floats, Floats]:
+        """Points, normals and brightness as compiled loops read them."""
+        gray = np.zeros(len(self.points), np.float32) if self.gray is None else np.ascontiguousarray(self.gray)
+        return np.ascontiguousarray(self.points), np.ascontiguousarray(self.normals), gray
 
 
 @dataclass(frozen=True)
@@ -188,10 +202,10 @@ def steps_without(
         if len(rest) < 50:
             out.append(None)
             continue
-        information, gradient = _normal_equations(rows[0][rest], errors[0][rest], _spread(errors[0][rest], 1e-3))
+        information, gradient = _normal_equations(rows[0][rest], errors[0][rest], spread(errors[0][rest], 1e-3))
         if len(rows) > 1:
-            error = errors[1][rest] - np.median(errors[1][rest])
-            more, slope64 = _normal_equations(rows[1][rest], error, _spread(error, 1.0))
+            error = centred(errors[1][rest])
+            more, slope64 = _normal_equations(rows[1][rest], error, spread(error, 1.0))
             information += settings.photometric_weight * more
             gradient += settings.photometric_weight * slope64
         out.append(_exp(-np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient)))
@@ -199,17 +213,14 @@ def steps_without(
 
 
 class _Frame:
-    """The images of a view laid out for look-ups by pixel number."""
+    """The images of a view as the loops read them."""
 
     def __init__(self, view: WorkingFrame, noise: SensorNoise) -> None:
         self.camera = view.camera
-        self.points = view.points.reshape(-1, 3)
-        self.normals = view.normals.reshape(-1, 3)
-        self.valid = view.valid.ravel()
-        self.inverse_sigma = 1.0 / noise.sigma(view.depth).ravel()
+        self.surface = view.points, view.normals, view.valid, 1.0 / noise.sigma(view.depth)
         dx = cv2.Sobel(view.gray, cv2.CV_32F, 1, 0, scale=0.125)
         dy = cv2.Sobel(view.gray, cv2.CV_32F, 0, 1, scale=0.125)
-        self.brightness = cv2.merge([view.gray, dx, dy])
+        self.brightness = np.stack([view.gray, dx, dy], axis=-1, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -239,39 +250,21 @@ class _SurfelPairs:
 
 def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, agreement: float) -> _SurfelPairs:
     camera = frame.camera
-    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-    points_cam: Floats = np.asarray((model.points - t) @ R, np.float32)
-    inverse_z = 1.0 / np.maximum(points_cam[:, 2], np.float32(1e-3))
-    u = points_cam[:, 0] * inverse_z * np.float32(camera.fx) + np.float32(camera.cx)
-    v = points_cam[:, 1] * inverse_z * np.float32(camera.fy) + np.float32(camera.cy)
-    inside = (points_cam[:, 2] > 0.05) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
-    index = np.flatnonzero(inside)
-    pixel = np.rint(v[index]).astype(np.int64) * camera.width + np.rint(u[index]).astype(np.int64)
-    known = frame.valid[pixel]
-    index, pixel = index[known], pixel[known]
-    moved, normals = frame.points[pixel] @ R.T + t, model.normals[index]
-    apart = moved - model.points[index]
-    distance = np.einsum("ij,ij->i", apart, normals)
-    alike = np.einsum("ij,ij->i", frame.normals[pixel] @ R.T, normals) > agreement
-    near = (np.abs(distance) < gate_m) & (np.einsum("ij,ij->i", apart, apart) < (4 * gate_m) ** 2) & alike
-    keep = np.flatnonzero(near)
-    inverse_sigma = frame.inverse_sigma[pixel[keep]]
-    residual = distance[keep] * inverse_sigma
-    scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3 if len(keep) else 1.0
-    index = index[keep]
-    gray = None if model.gray is None else model.gray[index]
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    known, *found = pair_up(model.laid_out(), np.ascontiguousarray(T), intrinsics, frame.surface, gate_m, agreement)
+    moved, points, normals, gray, uv, points_cam, residual, inverse_sigma = found
     return _SurfelPairs(
-        moved=moved[keep],
-        points=model.points[index],
-        normals=normals[keep],
-        gray=gray,
-        uv=np.stack([u[index], v[index]], axis=1),
-        points_cam=points_cam[index],
+        moved=moved,
+        points=points,
+        normals=normals,
+        gray=None if model.gray is None else gray,
+        uv=uv,
+        points_cam=points_cam,
         residual=residual,
         inverse_sigma=inverse_sigma,
-        scale=scale,
-        overlap=len(pixel) / max(1, len(model.points)),
-        share=len(keep) / max(1, len(pixel)),
+        scale=spread(residual, 1e-3),
+        overlap=known / max(1, len(model.points)),
+        share=len(residual) / max(1, known),
     )
 
 
@@ -281,8 +274,7 @@ def _geometric(pairs: _SurfelPairs, huber: float) -> NormalEquations:
 
 
 def _geometric_slope(pairs: _SurfelPairs) -> Floats:
-    slope = np.concatenate([pairs.normals, _cross(pairs.moved, pairs.normals)], axis=1)
-    return np.asarray(slope * pairs.inverse_sigma[:, None])
+    return plane_slopes(pairs.moved, pairs.normals, pairs.inverse_sigma)
 
 
 def _solid_information(
@@ -308,54 +300,33 @@ def _photometric(
 ) -> NormalEquations:
     """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
     slope, error = _photometric_slope(pairs, frame, T, least_gradient)
-    error -= np.median(error)
-    return _normal_equations(slope, error, _spread(error, 1.0))
+    error = centred(error)
+    return _normal_equations(slope, error, spread(error, 1.0))
 
 
 def _photometric_slope(
     pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
 ) -> tuple[Floats, Floats]:
     assert pairs.gray is not None
-    value, dx, dy = _sample(frame, pairs.uv)
-    if least_gradient > 0:
-        strong = dx * dx + dy * dy > least_gradient**2
-        dx, dy = dx * strong, dy * strong
-    camera, p = frame.camera, pairs.points_cam
-    inverse_z = 1.0 / p[:, 2]
-    gx, gy = dx * np.float32(camera.fx) * inverse_z, dy * np.float32(camera.fy) * inverse_z
-    slope_cam = np.stack([gx, gy, -(gx * p[:, 0] + gy * p[:, 1]) * inverse_z], axis=1)
-    slope_model = slope_cam @ T[:3, :3].T.astype(np.float32)
-    slope = -np.concatenate([slope_model, _cross(pairs.points, slope_model)], axis=1)
-    return slope, value - pairs.gray
-
-
-def _spread(error: Floats, least: float) -> float:
-    """Robust standard deviation."""
-    return 1.4826 * float(np.median(np.abs(error))) + least
+    sampled, camera = bilinear(frame.brightness, pairs.uv), frame.camera
+    R, focal = np.ascontiguousarray(T[:3, :3]), (camera.fx, camera.fy)
+    slope = brightness_slopes(pairs.points, pairs.points_cam, sampled, R, focal, least_gradient)
+    return slope, sampled[:, 0] - pairs.gray
 
 
 def _normal_equations(slope: Floats, error: Floats, scale: float, huber: float = 1.345) -> NormalEquations:
     """Huber-weighted, with the residuals in units of their robust scale."""
-    limit = huber * scale
-    weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-9)).astype(np.float32) / np.float32(scale * scale)
-    weighted = slope * weight[:, None]
-    return (weighted.T @ slope).astype(np.float64), (weighted.T @ error).astype(np.float64)
+    information, gradient = huber_equations(slope, error, scale, huber)
+    return information, gradient
 
 
 def _correlation(pairs: _SurfelPairs, frame: _Frame) -> float:
     if pairs.gray is None or pairs.count < 2:
         return float("nan")
-    value = _sample(frame, pairs.uv)[0]
+    value = bilinear(frame.brightness, pairs.uv)[:, 0]
     a, b = value - value.mean(), pairs.gray - pairs.gray.mean()
     spread = float(a.std() * b.std())
     return float((a * b).mean()) / spread if min(a.std(), b.std()) > 2.0 else float("nan")
-
-
-def _sample(frame: _Frame, uv: Floats) -> tuple[Floats, Floats, Floats]:
-    """Brightness and its gradient at sub-pixel places."""
-    u, v = np.ascontiguousarray(uv[None, :, 0]), np.ascontiguousarray(uv[None, :, 1])
-    found = np.asarray(cv2.remap(frame.brightness, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))[0]
-    return found[:, 0], found[:, 1], found[:, 2]
 
 
 def _cross(a: Floats, b: Floats) -> Floats:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.rgbd.kernels import foremost, fuse
 from list3r.reconstruction.rgbd.registration import Samples
 from list3r.reconstruction.rgbd.settings import SurfelSettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
@@ -21,36 +22,30 @@ class SurfelModel:
 
     def __init__(self, settings: SurfelSettings, noise: SensorNoise) -> None:
         self._settings, self._noise = settings, noise
-        self.points = np.zeros((0, 3), np.float32)
-        self.normals = np.zeros((0, 3), np.float32)
-        self.gray = np.zeros(0, np.float32)
-        self.weight = np.zeros(0, np.float32)
+        self._room, self._count = np.zeros((0, 8), np.float32), 0
 
     def __len__(self) -> int:
-        return len(self.points)
+        return self._count
 
-    def visible(self, T_model_cam: NDArray[np.float64], camera: Camera) -> NDArray[np.int64]:
+    @property
+    def elements(self) -> Floats:
+        """Point, normal, grey value and weight of each. Shape (N, 8)."""
+        return self._room[: self._count]
+
+    def visible(self, T_model_cam: NDArray[np.float64], camera: Camera) -> NDArray[np.int32]:
         """Number of the foremost element at each pixel, -1 for none. Shape (h * w,)."""
-        R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
-        rays = self.points - t
-        facing = np.einsum("ij,ij->i", rays, self.normals) < 0
-        candidates = np.flatnonzero(facing & (rays @ R[:, 2] > 0.1))
-        p = rays[candidates] @ R
-        u = np.rint(p[:, 0] / p[:, 2] * np.float32(camera.fx) + np.float32(camera.cx))
-        v = np.rint(p[:, 1] / p[:, 2] * np.float32(camera.fy) + np.float32(camera.cy))
-        inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
-        order = inside[np.argsort(-p[inside, 2], kind="stable")]
-        foremost = np.full(camera.height * camera.width, -1, np.int64)
-        foremost[v[order].astype(np.int64) * camera.width + u[order].astype(np.int64)] = candidates[order]
-        return foremost
+        intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+        return foremost(self.elements, np.ascontiguousarray(T_model_cam), intrinsics, camera.height, camera.width)
 
     def samples(self, T_model_cam: NDArray[np.float64], camera: Camera, count: int) -> Samples:
         """About `count` visible elements, evenly spread over the image."""
-        foremost = self.visible(T_model_cam, camera)
-        index = foremost[foremost >= 0]
+        index = self.visible(T_model_cam, camera)
+        index = index[index >= 0]
         if len(index) > count:
             index = index[np.arange(count) * len(index) // count]
-        return Samples(self.points[index], self.normals[index], self.gray[index])
+        chosen = self.elements[index]
+        points, normals, gray = (np.ascontiguousarray(part) for part in (chosen[:, :3], chosen[:, 3:6], chosen[:, 6]))
+        return Samples(points, normals, gray)
 
     def fuse(self, view: WorkingFrame, T_model_cam: NDArray[np.float64]) -> None:
         """Average the view into the elements that it agrees with, add what is new, weaken what it sees through."""
@@ -58,24 +53,16 @@ class SurfelModel:
         R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
         local = view.points.reshape(-1, 3)[pixel]
         sigma = self._noise.sigma(local[:, 2])
-        points, normals = local @ R.T + t, view.normals.reshape(-1, 3)[pixel] @ R.T
-        gray, weight = view.gray.ravel()[pixel], (np.float32(self._noise.constant_m) / sigma) ** 2
-        if not len(self):
-            self._append(points, normals, gray, weight)
-            return
+        rows = np.empty((len(pixel), 8), np.float32)
+        rows[:, :3], rows[:, 3:6] = local @ R.T + t, view.normals.reshape(-1, 3)[pixel] @ R.T
+        rows[:, 6], rows[:, 7] = view.gray.ravel()[pixel], (np.float32(self._noise.constant_m) / sigma) ** 2
         element = self.visible(T_model_cam, view.camera)[pixel]
-        behind = np.einsum("ij,j->i", points - self.points[element], R[:, 2])
-        limit = 3 * sigma + np.float32(0.01) * local[:, 2]
-        hit = element >= 0
-        alike = np.einsum("ij,ij->i", self.normals[element], normals) > self._settings.normal_agreement
-        same = hit & (np.abs(behind) < limit) & alike
-        self._average(element[same], points[same], normals[same], gray[same], weight[same])
-        through = element[hit & (behind > limit)]
-        self.weight[through] *= 0.5
-        new = ~hit | (np.abs(behind) > limit)
-        if (self.weight[through] <= self._settings.drop_below).any():
+        seen = rows, np.ascontiguousarray(local[:, 2]), sigma
+        limits = self._settings.normal_agreement, self._settings.weight_cap
+        new, through = fuse(self.elements, element, seen, np.ascontiguousarray(T_model_cam[:3, 2]), limits)
+        if (self.elements[through, 7] <= self._settings.drop_below).any():
             self._drop()
-        self._append(points[new], normals[new], gray[new], weight[new])
+        self._append(rows[new])
 
     def forget(self, view: WorkingFrame, mask: NDArray[np.bool_], T_model_cam: NDArray[np.float64]) -> None:
         """Drop the elements at the surface that the view shows inside a mask."""
@@ -85,29 +72,18 @@ class SurfelModel:
         local = view.points.reshape(-1, 3)[pixel]
         element = self.visible(T_model_cam, view.camera)[pixel]
         R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
-        depth = (self.points[element] - t) @ R[:, 2]
+        depth = (self.elements[element, :3] - t) @ R[:, 2]
         near = (element >= 0) & (np.abs(depth - local[:, 2]) < np.float32(0.05) * local[:, 2])
-        self.weight[element[near]] = 0.0
+        self.elements[element[near], 7] = 0.0
         if near.any():
             self._drop()
 
-    def _average(self, index: NDArray[np.int64], points: Floats, normals: Floats, gray: Floats, weight: Floats) -> None:
-        old = self.weight[index]
-        total = old + weight
-        share = (weight / total)[:, None]
-        self.points[index] += (points - self.points[index]) * share
-        normal = self.normals[index] + (normals - self.normals[index]) * share
-        self.normals[index] = normal / np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
-        self.gray[index] += (gray - self.gray[index]) * share[:, 0]
-        self.weight[index] = np.minimum(total, self._settings.weight_cap)
-
     def _drop(self) -> None:
-        keep = self.weight > self._settings.drop_below
-        self.points, self.normals = self.points[keep], self.normals[keep]
-        self.gray, self.weight = self.gray[keep], self.weight[keep]
+        kept = self.elements[self.elements[:, 7] > self._settings.drop_below]
+        self._room[: len(kept)], self._count = kept, len(kept)
 
-    def _append(self, points: Floats, normals: Floats, gray: Floats, weight: Floats) -> None:
-        self.points = np.concatenate([self.points, points])
-        self.normals = np.concatenate([self.normals, normals])
-        self.gray = np.concatenate([self.gray, gray])
-        self.weight = np.concatenate([self.weight, weight])
+    def _append(self, rows: Floats) -> None:
+        count = self._count + len(rows)
+        if count > len(self._room):
+            self._room = np.concatenate([self.elements, np.zeros((2 * count - self._count, 8), np.float32)])
+        self._room[self._count : count], self._count = rows, count

@@ -1,0 +1,82 @@
+"""The loops of `reprojection`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.compiled import compiled
+
+Floats = NDArray[np.float32]
+
+
+@compiled
+def project(
+    depth: Floats, slope: Floats, shift: Floats, straight: bool, height: int, width: int
+) -> tuple[Floats, NDArray[np.int32]]:
+    """Nearest depth at each pixel of a camera, 0 for none, and the source pixel it comes from, -1. Shapes (H, W).
+
+    u = (slope[0] z + shift[0]) / (slope[2] z + shift[2]), likewise v; where `straight` the divisor is z. `depth` and
+    the rows of `slope` have N source pixels.
+    """
+    out, origin = np.zeros((height, width), np.float32), np.full((height, width), -1, np.int32)
+    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
+    for k in range(len(depth)):
+        z = depth[k]
+        if not z > none:
+            continue
+        if straight:
+            there, inverse = z, one / z
+            u, v = slope[0, k] + shift[0] * inverse, slope[1, k] + shift[1] * inverse
+        else:
+            there = slope[2, k] * z + shift[2]
+            if not there > none:
+                continue
+            inverse = one / there
+            u, v = (slope[0, k] * z + shift[0]) * inverse, (slope[1, k] * z + shift[1]) * inverse
+        u, v = u + half, v + half
+        if u >= none and u < width and v >= none and v < height:
+            row, column = int(v), int(u)
+            before = out[row, column]
+            if before == none or there < before:
+                out[row, column], origin[row, column] = there, k
+    return out, origin
+
+
+@compiled
+def close_gaps(out: Floats, origin: NDArray[np.int32], fine: Floats, jump: float, noise: float) -> Floats:
+    """`out` with pixels filled that rounding missed, or where a far surface shows through such a gap in a near one.
+
+    A pixel is filled from two opposite neighbours when the depth pixels these came from are themselves close
+    neighbours on one surface, with depth known between them. A true hole or an edge is left as it is. `out` and
+    `origin` are those of `project`, shape (H, W); `fine` is the depth image they come from, shape (h, w).
+    """
+    height, width = out.shape
+    steep, filled = np.float32(1 + 2 * jump), out.copy()
+    for row in range(height):
+        for column in range(width):
+            here = out[row, column]
+            for down, right in ((0, 1), (1, 0)):
+                if row - down < 0 or row + down >= height or column - right < 0 or column + right >= width:
+                    continue
+                before, after = out[row - down, column - right], out[row + down, column + right]
+                if not (before > 0 and after > 0) or (here != 0 and here <= steep * max(before, after)):
+                    continue
+                a, b = origin[row - down, column - right], origin[row + down, column + right]
+                if _one_surface(a, b, fine, jump, noise):
+                    value = np.float32(0.5) * (before + after)
+                    if filled[row, column] == 0 or filled[row, column] > value:
+                        filled[row, column] = value
+    return filled
+
+
+@compiled
+def _one_surface(a: int, b: int, fine: Floats, jump: float, noise: float) -> bool:
+    """Whether two pixels of the depth image are at most three apart on one surface."""
+    width = fine.shape[1]
+    ay, ax, by, bx = a // width, a % width, b // width, b % width
+    if abs(ay - by) > 3 or abs(ax - bx) > 3:
+        return False
+    middle = fine[(ay + by) // 2, (ax + bx) // 2]
+    allowed = 3 * jump * middle + noise * middle * middle
+    return bool(middle > 0 and abs(fine[ay, ax] - middle) <= allowed and abs(fine[by, bx] - middle) <= allowed)
