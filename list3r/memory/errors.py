@@ -56,6 +56,7 @@ class ExportError(List3rError):
 
 EXTRA_OF_PACKAGE = {
     "cv2": "build",
+    "numba": "build",
     "av": "build",
     "PIL": "build",
     "tqdm": "build",
