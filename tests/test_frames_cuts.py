@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
-from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+from list3r.frames.chunking.chunks import ChunkSettings, even_chunks, plan_chunks
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.source import open_source
 
@@ -106,3 +106,15 @@ def test_real_walks_have_no_jump(name: str) -> None:
     if not (DATA / name).is_dir():
         pytest.skip(f"{DATA / name} is absent")
     assert find_cuts(open_source(DATA / name)) == ()
+
+
+@given(count=st.integers(1, 700), length=st.integers(2, 90), data=st.data())
+def test_even_chunks_are_no_more_and_no_longer_than_others_and_about_equal(
+    count: int, length: int, data: st.DataObject
+) -> None:
+    settings = ChunkSettings(length, data.draw(st.integers(1, length - 1)))
+    usual, even = plan_chunks(count, settings), even_chunks(count, settings)
+    lengths = [s.stop - s.start for s in even]
+    assert len(even) == len(usual) and (even[0].start, even[-1].stop) == (0, count)
+    assert all(a.stop - b.start == settings.overlap for a, b in itertools.pairwise(even))
+    assert max(lengths) <= length and max(lengths) - min(lengths) < len(even)

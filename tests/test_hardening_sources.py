@@ -26,7 +26,7 @@ from list3r.frames.recordings import bag_chunks, stored
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import FrameError, OptionError, SourceError
 from list3r.memory.unpacking import open_archive, parse_json
-from list3r.reconstruction.precomputed_files import read_piece
+from list3r.reconstruction.precomputed_files import check_archives, read_piece
 from tests import recordings
 from tests.frames_scenes import write_png, write_replica, write_seven_scenes, write_tum
 
@@ -132,6 +132,8 @@ def test_an_archive_that_unfolds_is_refused(tmp_path: Path) -> None:
     archive_bomb(tmp_path / "a.npz")
     with pytest.raises(OptionError, match="claims"):
         read_piece(tmp_path / "a.npz")
+    with pytest.raises(OptionError, match="claims"):
+        check_archives(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"camera": ' * 5000, "1" * 10_000, '{"camera": {"fx": "a"}}', "\x00"])

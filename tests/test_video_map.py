@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,16 +15,21 @@ from benchmarks.simulation.wide_steps import WideStepWalk
 from list3r.association.overlap.camera_edge import camera_edge, in_one_frame, one_frame_edge
 from list3r.association.whole_map.drift import spread_drift
 from list3r.association.whole_map.joining import join_maps
-from list3r.association.whole_map.revisits import Revisit, find_revisits
+from list3r.association.whole_map.revisits import Revisit, find_revisits, seen_again
 from list3r.association.whole_map.settings import DriftSettings, JoiningSettings, RevisitPairSettings
 from list3r.association.whole_map.views import MapView, shared_views
 from list3r.frames.base import Camera
+from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+from list3r.frames.source import open_source
 from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.records import FrameSamples
+from list3r.memory.records import ChunkRow, FrameSamples
+from list3r.pipeline.chunks.whole_map import map_spans
+from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.sfm.adjustment import adjust
+from list3r.reconstruction.sfm.calibration import calibrate_by_map
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, shared_rows
-from list3r.reconstruction.sfm.settings import AdjustmentSettings, MappingSettings
+from list3r.reconstruction.sfm.settings import AdjustmentSettings, MappingSettings, SfmSettings
 from list3r.reconstruction.sfm.two_view import verified_rows
 
 Array = NDArray[np.float64]
@@ -111,6 +118,28 @@ def test_a_revisit_that_the_way_between_contradicts_is_none() -> None:
     assert not find_revisits(looks, CAMERA, RevisitPairSettings(apart=20))[0]
 
 
+def test_a_place_comes_back_only_where_it_was_out_of_sight_between() -> None:
+    near, back = Revisit(0, 3, Sim3.identity(), 40), Revisit(0, COUNT - 1, Sim3.identity(), 40)
+    assert seen_again(views(ring()), CAMERA, [near, back], RevisitPairSettings()) == [back]
+
+
+@pytest.mark.parametrize(("k1", "focal"), [(0.0, 1.0), (-0.08, 1.0), (0.0, 1.6)])
+def test_a_map_tells_the_lens_and_doubts_a_focal_length_that_does_not_fit(k1: float, focal: float) -> None:
+    held, all_ids = {}, set()
+    for k, T in enumerate(ring()):
+        ids, xy, _ = seen(T)
+        at = (xy - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx
+        bent = at * (1.0 + k1 * np.square(at).sum(axis=1, keepdims=True)) * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
+        held[k] = KeyframeView(ids, bent.astype(np.float32))
+        all_ids |= set(ids.tolist())
+    points = {n: POINTS[n] for n in all_ids}
+    found = SparseMap(dict(enumerate(ring())), points, CAMERA, seen=held)
+    start = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy)
+    told = calibrate_by_map(start, (MapProblem(held, {}), found), SfmSettings())
+    assert bool(told.notes) == (focal != 1.0) and told.camera.fx == start.fx
+    assert (told.camera.distortion or (0.0,))[0] == pytest.approx(k1, abs=0.01)
+
+
 def test_adjusting_recovers_poses_that_are_roughly_known() -> None:
     rng, true = np.random.default_rng(3), ring()
     noisy = {}
@@ -155,7 +184,7 @@ def part_of(problem: MapProblem, keys: range, S: Sim3) -> SparseMap:
         placed = S @ Sim3.from_matrix(ring()[k])
         poses[k] = Sim3(np.ones(()), placed.rotation, placed.translation).as_matrix()
     held = {k: problem.views[k] for k in keys}
-    points = {n: S.apply(POINTS[n]) for view in held.values() for n in view.ids.tolist()}
+    points = {n: S.apply(POINTS[n])[0] for view in held.values() for n in view.ids.tolist()}
     return SparseMap(poses, points, CAMERA, seen=held)
 
 
@@ -168,6 +197,7 @@ def test_maps_of_parts_are_joined_whether_or_not_they_share_keyframes(first: int
     assert sorted(joined.T_map_cam) == list(range(COUNT))
     assert error(np.stack([joined.T_map_cam[k] for k in range(COUNT)]), ring()) < 0.01
     assert all(set(view.ids.tolist()) <= joined.points.keys() for view in joined.seen.values())
+    assert {np.shape(xyz) for xyz in joined.points.values()} == {(3,)}
 
 
 def test_matches_that_agree_are_verified_and_others_are_not() -> None:
@@ -185,3 +215,21 @@ def test_a_walk_of_wide_steps_neither_moves_nor_turns_farther_than_its_steps() -
     moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     turned = np.degrees([np.linalg.norm(Sim3.from_matrix(np.linalg.inv(a) @ b).log()[3:6]) for a, b in pairwise(T)])
     assert moved.max() < 0.09 and turned.max() < 4.6 and np.median(np.maximum(moved / 0.08, turned / 4.0)) > 0.9
+
+
+def test_chunks_of_a_mapped_video_are_even_unless_it_was_begun_or_asked_otherwise(tmp_path: Path) -> None:
+    for k in range(120):
+        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), np.full((8, 8, 3), k, np.uint8))
+    source, settings = open_source(tmp_path), BuildSettings("sfm")
+    usual = plan_chunks(120, settings.chunks)
+
+    def spans(*last: int, asked: BuildSettings = settings) -> list[tuple[int, int]]:
+        begun = [
+            ChunkRow(k + 1, 1, k, 0, n, 1, Sim3.identity(), (1.0, 1.0, 0.0, 0.0), (8, 8), "relative")
+            for k, n in enumerate(last)
+        ]
+        return [(s.start, s.stop) for s in map_spans(source, asked, usual, begun)]
+
+    even, before = [(0, 66), (54, 120)], [(s.start, s.stop) for s in usual]
+    assert spans() == spans(65) == even and spans(99) == before
+    assert spans(asked=replace(settings, chunks=ChunkSettings(80, 30))) == before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,12 +30,14 @@ from list3r.pipeline.choice import check_beside, settings_asked, settings_beside
 from list3r.pipeline.chunks.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.chunks.joint_windows import joint_windows
+from list3r.pipeline.chunks.whole_map import map_spans, map_whole, takes_wide_steps
 from list3r.pipeline.finishing import check_run
 from list3r.pipeline.mapping import add_chunk
 from list3r.pipeline.placing import place_chunks
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.pipeline.settings import AssociationSettings, BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
+from list3r.reconstruction.precomputed_files import check_archives
 from list3r.reconstruction.registry import entry, usual_model
 
 if TYPE_CHECKING:
@@ -136,17 +139,14 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     count = job.info.frame_count
     cuts = _cuts(store, session, job, watch)
     step = settled_step(store, session, job, watch)
-    spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
-    done = {c.index for c in store.chunks.all(session)}
-    wide = step == 1 and not cuts and any(s.index not in done for s in spans) and _takes_wide_steps(job)
-    how = with_short_windows(job.settings) if wide else job.settings
-    options = with_camera(
-        store,
-        session,
-        job.options,
-        lambda: estimated_camera(job.source, job.options, how, job.info, watch.look),
-    )
-    whole = _whole_map(job, options) if wide else None
+    spans, begun = plan_chunks(count, job.settings.chunks.times(step), cuts), store.chunks.all(session)
+    done = {c.index for c in begun}
+    wide = step == 1 and not cuts and takes_wide_steps(job.frames(), job.settings)
+    shorter = map_spans(job.frames(), job.settings, spans, begun) if wide else spans
+    left = any(s.index not in done for s in shorter)
+    options, whole = _camera_and_map(store, session, job, watch, wide and left)
+    if whole is not None or not left:
+        spans = shorter
     tasks = []
     for span in spans:
         if span.index not in done:
@@ -155,6 +155,22 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
             known = None if whole is None else whole.T_map_cam
             tasks.append(ChunkTask(str(job.source), options, span, job.settings, where, shot, step, known))
     return Plan(session, spans, done, tasks, whole)
+
+
+def _camera_and_map(
+    store: Store, session: int, job: Job, watch: Watch, wide: bool
+) -> tuple[SourceOptions, VideoMap | None]:
+    """The options with the camera as it was estimated, and the map of a whole video of wide steps, which tells what is
+    not known of a camera whose focal length is given.
+    """
+    given = job.info.camera is not None
+    whole = map_whole(job.frames(), job.settings) if wide and given else None
+    how = with_short_windows(job.settings) if wide else job.settings
+    estimate = partial(estimated_camera, job.source, job.options, how, job.info, watch.look, whole)
+    options = with_camera(store, session, job.options, estimate)
+    if wide and not given:
+        whole = map_whole(open_source(job.source, options), job.settings)
+    return options, whole
 
 
 def add_chunks(
@@ -258,24 +274,6 @@ def note_lost(store: Store, session: int, result: ChunkResult) -> None:
             store.sessions.put(replace(row, lost_reasons=(*row.lost_reasons, result.lost_reason)))
 
 
-def _takes_wide_steps(job: Job) -> bool:
-    """Whether a video is one to be mapped as a whole, by a model that can."""
-    s = job.settings
-    if not entry(s.reconstruction).maps_videos or (s.poses, s.local_features) != ("estimate", "sift"):
-        return False
-    from list3r.association.whole_map.source import takes_wide_steps
-
-    return takes_wide_steps(job.frames(), s.video_map, s.pace)
-
-
-def _whole_map(job: Job, options: SourceOptions) -> VideoMap | None:
-    """The map of a whole video, by Frame.index; None where it gives none."""
-    from list3r.association.whole_map.source import map_source
-
-    with threadpool_limits(1):
-        return map_source(open_source(job.source, options), job.settings.models.sfm, job.settings.video_map)
-
-
 def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]:
     """Where the video jumps, found once; given poses know where the camera is on either side."""
     if job.settings.poses != "estimate":
@@ -323,6 +321,8 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
     if settings.poses != "estimate" and not info.has_poses:
         raise OptionError(f"{info.path} has no poses; use --poses estimate")
+    if model.reads_files and settings.weights is not None:
+        check_archives(Path(settings.weights).expanduser())
     if settings.poses == "prior":
         _check_prior(info, settings.reconstruction)
     check_choice(settings.discovery, settings.tracking, settings.features)

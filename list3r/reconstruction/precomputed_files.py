@@ -184,6 +184,12 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         raise OptionError(f"{path} cannot be read: {reason}") from None
 
 
+def check_archives(folder: Path) -> None:
+    """Raise `OptionError` where a file of a folder claims too much, before processes are started that would read it."""
+    for path in sorted(folder.glob("*.npz")):
+        read_arrays(path, ())
+
+
 def read_array(path: Path) -> NDArray[Any]:
     """Return the array of an .npy file. Raises `OptionError` when it is damaged, or holds anything but numbers."""
     try:

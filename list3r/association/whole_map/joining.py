@@ -146,7 +146,8 @@ def _merged(whole: SparseMap, other: SparseMap, S: Sim3) -> SparseMap:
         fresh = _without(other.seen[key], whole.points)
         before = seen.get(key)
         seen[key] = fresh if before is None else _both(before, fresh)
-    points = {n: S.apply(xyz) for n, xyz in other.points.items()} | whole.points
+    places = S.apply(np.array(list(other.points.values())).reshape(-1, 3))
+    points = dict(zip(other.points, places, strict=True)) | whole.points
     return replace(whole, T_map_cam=poses, points=points, seen=seen)
 
 

@@ -69,6 +69,14 @@ def find_revisits(
     return out, common
 
 
+def seen_again(
+    views: Sequence[MapView], camera: Camera, revisits: Sequence[Revisit], settings: RevisitPairSettings
+) -> list[Revisit]:
+    """Return the revisits between whose views another sees hardly anything of what the first one sees."""
+    share = shared_views(views, camera)
+    return [r for r in revisits if share[r.a, r.a + 1 : r.b].min(initial=1.0) < settings.away]
+
+
 @dataclass(frozen=True)
 class ViewRelation:
     """How two views lie to each other."""

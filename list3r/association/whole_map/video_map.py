@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from list3r.association.whole_map.drift import spread_drift
 from list3r.association.whole_map.joining import join_maps
-from list3r.association.whole_map.revisits import Revisit, find_revisits
+from list3r.association.whole_map.revisits import find_revisits, seen_again
 from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.association.whole_map.views import view_of
 from list3r.frames.base import Camera
@@ -39,7 +39,10 @@ class VideoMap:
     T_map_cam: dict[int, Array]
     """By position of the frame. Shape (4, 4) each."""
     revisits: list[tuple[int, int, int]]
-    """Positions of frames that see the same again, the earlier first, and by how many features."""
+    """Positions of frames that see again what was out of sight between them, the earlier first, and by how many
+    features."""
+    keyframes: tuple[MapProblem, SparseMap]
+    """Some of the keyframes that it stands on, with their points."""
 
 
 def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings: VideoMapSettings) -> VideoMap | None:
@@ -59,7 +62,14 @@ def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings:
     segments = fill_segments([found], tracks, grays, sfm.fill, adjusted=True)
     if not segments or len(segments[0].T_map_cam) < settings.least_posed * len(grays):
         return None
-    return VideoMap(_scaled(segments[0]), revisits)
+    return VideoMap(_scaled(segments[0]), revisits, _some_keyframes(found, problem))
+
+
+def _some_keyframes(found: SparseMap, problem: MapProblem) -> tuple[MapProblem, SparseMap]:
+    """Return every third keyframe of a map: enough to tell the camera by."""
+    kept = sorted(found.T_map_cam)[::3]
+    some = replace(found, T_map_cam={k: found.T_map_cam[k] for k in kept}, seen={k: found.seen[k] for k in kept})
+    return MapProblem({k: problem.views[k] for k in kept}, {}), some
 
 
 def _scaled(segment: PosedSegment) -> dict[int, Array]:
@@ -121,8 +131,5 @@ def _closed(
     closed = adjust(wider, camera, T_map_cam, settings.adjustment)
     if closed is None:
         return found, []
-    return replace(closed, camera=found.camera), [_told(views[r.a].key, views[r.b].key, r) for r in believed]
-
-
-def _told(a: int, b: int, revisit: Revisit) -> tuple[int, int, int]:
-    return a, b, revisit.inliers
+    again = seen_again(views, camera, believed, settings.revisits)
+    return replace(closed, camera=found.camera), [(views[r.a].key, views[r.b].key, r.inliers) for r in again]

@@ -53,6 +53,13 @@ def plan_chunks(frame_count: int, settings: ChunkSettings, cuts: Sequence[int] =
     return spans
 
 
+def even_chunks(frame_count: int, settings: ChunkSettings) -> list[ChunkSpan]:
+    """Return as many spans as `plan_chunks` of a video without a jump, of about equal length."""
+    shared = (len(plan_chunks(frame_count, settings)) - 1) * settings.overlap
+    length = -(-(frame_count + shared) // (1 + shared // settings.overlap))
+    return plan_chunks(frame_count, ChunkSettings(max(length, settings.overlap + 1), settings.overlap))
+
+
 def shot_of(span: ChunkSpan, cuts: Sequence[int], frame_count: int) -> tuple[int, int]:
     """Positions [start, stop) of the shot between two cuts that a span lies in; `cuts` ascend."""
     shots = [0, *cuts, frame_count]

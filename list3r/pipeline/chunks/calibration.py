@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
@@ -16,6 +17,9 @@ from list3r.memory.records import SessionCamera
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
+
+if TYPE_CHECKING:
+    from list3r.association.whole_map.video_map import VideoMap
 
 _SILENT_ON_DISTORTION = ("images", "video", "live")
 """Kinds of source that say nothing of their lens but what the user does."""
@@ -44,21 +48,26 @@ def estimated_camera(
     settings: BuildSettings,
     info: SourceInfo,
     look: Callable[[str, int, int], None] | None = None,
+    whole: VideoMap | None = None,
 ) -> SessionCamera | None:
     """Return the camera of pictures as stored; None where the source or the model says it.
 
-    `look` hears ("camera", windows of the video done, in all).
+    `look` hears ("camera", windows of the video done, in all). Where the focal length is given and the `whole` video
+    is mapped, that map tells the rest.
     """
-    module = entry(settings.reconstruction).calibration
+    name = entry(settings.reconstruction).calibration
     told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
-    if not module or (info.camera is not None and told):
+    if not name or (info.camera is not None and told):
         return None
     with threadpool_limits(1):
         progress = None if look is None else (lambda done, total: look("camera", done, total))
-        calibrate = import_module(f"list3r.reconstruction.{module}").calibrate
+        module = import_module(f"list3r.reconstruction.{name}")
         opened, size = open_source(source, options), _stored_size(source, options)
-        height, width = opened.info.image_size or size
-        found = calibrate(opened, settings.models.sfm, progress, stored_px=max(size) / max(height, width))
+        stored_px = max(size) / max(opened.info.image_size or size)
+        if whole is None:
+            found = module.calibrate(opened, settings.models.sfm, progress, stored_px=stored_px)
+        else:
+            found = module.calibrate_by_map(info.camera, whole.keyframes, settings.models.sfm, stored_px)
     full = found.camera.resized(*size)
     return SessionCamera((full.fx, full.fy, full.cx, full.cy), tuple(found.camera.distortion), tuple(found.notes))
 

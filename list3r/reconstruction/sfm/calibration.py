@@ -58,21 +58,45 @@ def calibrate(
     if found is None:
         return _nothing(start, known, stored_px)
     windows, free, k1 = found.windows, found.camera, found.k1
+    if known:
+        return _of_known(windows, (start, free), chosen, stored_px, _parted(found, stored_px, chosen))
     sigma = _focal_sigma(windows, chosen)
-    told = f"{free.fx * stored_px:.0f} px, give or take {100 * sigma:.0f} %"
-    if not known:
-        said = f"the camera was estimated from the pictures: focal length {told}; distortion k1 {k1:.3f}"
-        notes = (said, *_parted(found, stored_px, chosen))
-        return CameraCalibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
-    if abs(np.log(free.fx / start.fx)) > chosen.doubted_sigmas * sigma:
+    said = f"the camera was estimated from the pictures: focal length {_told_px(free, sigma, stored_px)}"
+    notes = (f"{said}; distortion k1 {k1:.3f}", *_parted(found, stored_px, chosen))
+    return CameraCalibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
+
+
+def calibrate_by_map(
+    start: Camera, keyframes: tuple[MapProblem, SparseMap], settings: SfmSettings, stored_px: float = 1.0
+) -> CameraCalibration:
+    """Estimate what is not known of a camera whose focal length is given, from some keyframes of a map of the video."""
+    free, _ = _adjust_together([keyframes], start, True, settings.calibration)
+    return _of_known([keyframes], (start, free), settings.calibration, stored_px)
+
+
+def _of_known(
+    windows: _Windows,
+    cameras: tuple[Camera, Camera],
+    settings: CameraCalibrationSettings,
+    stored_px: float,
+    notes: tuple[str, ...] = (),
+) -> CameraCalibration:
+    """Return the lens of a camera as given, or a doubt about it where the camera by the pictures alone is another."""
+    start, free = cameras
+    sigma = _focal_sigma(windows, settings)
+    if abs(np.log(free.fx / start.fx)) > settings.doubted_sigmas * sigma:
         said = (
-            f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which say about {told}; "
-            "check --intrinsics, or leave it out"
+            f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which say about "
+            f"{_told_px(free, sigma, stored_px)}; check --intrinsics, or leave it out"
         )
         return CameraCalibration(start, len(windows), free.fx, sigma, (said,))
-    _, k1 = _adjust_together(windows, start, False, chosen)
-    lens = _lens(start, k1, chosen) if _believable(start, k1, chosen) else start
-    return CameraCalibration(lens, len(windows), free.fx, sigma, _parted(found, stored_px, chosen))
+    _, k1 = _adjust_together(windows, start, False, settings)
+    lens = _lens(start, k1, settings) if _believable(start, k1, settings) else start
+    return CameraCalibration(lens, len(windows), free.fx, sigma, notes)
+
+
+def _told_px(camera: Camera, sigma: float, stored_px: float) -> str:
+    return f"{camera.fx * stored_px:.0f} px, give or take {100 * sigma:.0f} %"
 
 
 _Windows = list[tuple[MapProblem, SparseMap]]
