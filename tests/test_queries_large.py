@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
@@ -164,3 +168,41 @@ def test_what_nothing_bears_is_said(store: Store, large: pytest.MonkeyPatch) -> 
     assert nearest(store, words="red zebra", point=(4, 4, 1)).notes == ()
     for said in (nearest(store, words="zebra").notes[0], relations(store, subject="zebra").reason):
         assert said.startswith("no instance has the word 'zebra' in its label or description; frequent names: ")
+
+
+DAMAGES = (
+    "UPDATE instances SET confidence = 1 - confidence WHERE id = ?",
+    "UPDATE instances SET state = 'removed' WHERE id = ?",
+    "UPDATE instances SET structure = CASE WHEN structure IS NULL THEN 'wall' END WHERE id = ?",
+    "UPDATE instances SET label = 'red box' WHERE id = ?",
+    "UPDATE instances SET description = 'blue sheet' WHERE id = ?",
+    "UPDATE words SET weight = weight + 7 WHERE instance = ?",
+    "INSERT OR IGNORE INTO words SELECT 'red', ?, 999",
+)
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_find_in_a_large_damaged_file_answers_as_in_a_sound_one_or_refuses(
+    store: Store, damage: str, large: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    large.setattr(gather, "EVERYTHING", 0)
+    large.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
+    large.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
+    texts = ("red box", "mug", "red", "wall")
+    wanted = {text: plain(find(store, text)) for text in texts}
+    with contextlib.closing(sqlite3.connect(store.path)) as sound, sound:
+        pages = sound.serialize()
+    refused = 0
+    for n in range(2, 62, 5):
+        path = tmp_path / f"{n}.l3r"
+        path.write_bytes(pages)
+        with contextlib.closing(sqlite3.connect(path)) as database, database:
+            database.execute(damage, (n,))
+        with Store.open(path) as damaged:
+            for text in texts:
+                try:
+                    assert plain(find(damaged, text)) == wanted[text], (n, text)
+                except MemoryFileError as error:
+                    assert "repair" in str(error)
+                    refused += 1
+    assert refused

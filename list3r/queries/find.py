@@ -89,7 +89,9 @@ def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
     order = sorted(ranks, key=lambda n: (-total[n], -ranks[n][0], n))
     named = f"named {' '.join(words)}"
     scores = {n: total[n] / (100 * len(words)) for n in order}
-    matches = [Match(i, round(scores[i.id], 4), None, None, named) for i in store.instances.of(order[:k])]
+    best = store.instances.of(order[:k])
+    store.words.check(best, words, total)
+    matches = [Match(i, round(scores[i.id], 4), None, None, named) for i in best]
     equal = sum(score > scores[order[0]] - _EQUAL for score in scores.values())
     told = [f"{equal} instances match equally well; add words to tell them apart"] if equal > 1 and k > 1 else []
     return Found(matches, (*gathered.notes, *told), (), len(order))

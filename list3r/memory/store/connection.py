@@ -224,8 +224,8 @@ class Connection:
 
     def _finish_writing(self) -> None:
         """Check what was written, and what it was written over, then write what follows from it."""
-        self._refuse(self._checks.found())
-        self._refuse(self._written_over())
+        self.refuse(self._checks.found())
+        self.refuse(self._written_over())
         for follower in self._followers:
             follower.write()
 
@@ -235,7 +235,8 @@ class Connection:
             return None
         return next((str(bad) for bad in self._sums.damaged_before(self._committed())), None)
 
-    def _refuse(self, found: str | None) -> None:
+    def refuse(self, found: str | None) -> None:
+        """Raise `MemoryFileError` where damage was found, and say so each time."""
         if found is not None:
             raise MemoryFileError(damaged(self.path, found))
 
@@ -261,7 +262,7 @@ class Connection:
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
         """All that is read inside belongs to one state of the memory, whatever a writer commits meanwhile."""
-        self._refuse(self._checks.damage)
+        self.refuse(self._checks.damage)
         with self._state():
             yield
 
@@ -333,7 +334,7 @@ class Connection:
         self._check_process()
         try:
             rows = self._database.execute(query, arguments).fetchall()
-            self._refuse(self._checks.found())
+            self.refuse(self._checks.found())
             return rows
         except FAILURES as error:
             raise MemoryFileError(explained(self.path, error)) from error
@@ -343,6 +344,10 @@ class Connection:
         if os.getpid() != self._process:
             raise MemoryFileError(f"{self.path} was opened by the process that this one was forked from; open it again")
 
+    def by_part(self, table: str) -> bool:
+        """Whether the rows of a table are checked as they are read, and not all when the first of them is."""
+        return self._checks.by_part(table)
+
     def believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
         if self._checks.by_part(table):
@@ -351,12 +356,12 @@ class Connection:
                 bad = unbelieved(self._database, table, [row for row in rows if int(row[0]) >> 4 not in written])
             except FAILURES as error:
                 raise MemoryFileError(explained(self.path, error)) from error
-            self._refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
+            self.refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
         return rows
 
     def sound(self, table: str, keys: Iterable[int]) -> None:
         """Check what rows with these first keys stand in, where the table is not checked as a whole."""
-        self._refuse(self._checks.found_in_parts(table, keys))
+        self.refuse(self._checks.found_in_parts(table, keys))
 
 
 class _Closed:

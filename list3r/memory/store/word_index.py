@@ -46,7 +46,7 @@ class WordIndex:
 
     def _touch(self, instance: int, label: object, structure: object, description: object, color: object) -> None:
         if instance not in self._before:
-            self._before[instance] = _weights(label, structure, description, color) if description is not None else {}
+            self._before[instance] = hundredths(label, structure, description, color) if description is not None else {}
 
     def write(self) -> None:
         """Write what has changed since the last call; inside the transaction that changed it."""
@@ -54,7 +54,7 @@ class WordIndex:
         come: list[tuple[str, int, int]] = []
         for instance, before in sorted(self._before.items()):
             row = self._database.execute(f"SELECT {_TEXTS} FROM instances WHERE id = ?", (instance,)).fetchone()
-            now = {} if row is None else _weights(*row)
+            now = {} if row is None else hundredths(*row)
             gone += [(word, instance) for word in before if word not in now]
             come += [(word, instance, weight) for word, weight in now.items() if before.get(word) != weight]
         self._database.executemany("DELETE FROM words WHERE word = ? AND instance = ?", gone)
@@ -88,11 +88,11 @@ def up_to_date(database: sqlite3.Connection) -> bool:
 def expected_words(database: sqlite3.Connection) -> Iterator[tuple[str, int, int]]:
     """What the table should hold, by what the instances are called."""
     for instance, *texts in database.execute(f"SELECT id, {_TEXTS} FROM instances"):
-        yield from ((word, instance, weight) for word, weight in _weights(*texts).items())
+        yield from ((word, instance, weight) for word, weight in hundredths(*texts).items())
 
 
-def _weights(label: object, structure: object, description: object, color: object) -> Weights:
-    """Words of texts as they come out of a file, which may be damaged."""
+def hundredths(label: object, structure: object, description: object, color: object) -> Weights:
+    """Return the words of texts as they come out of a file, which may be damaged, and how well each names."""
     texts = [text if isinstance(text, str) else "" for text in (label, structure, description, color)]
     named = vocabulary(None if label is None else texts[0], texts[1] or None, texts[2], texts[3])
     return {word: round(100 * weight) for word, weight in named.items()}

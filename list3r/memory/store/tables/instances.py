@@ -117,8 +117,7 @@ class Instances:
         """Return confidence, state and structure of some instances, by id: what answers are ordered by, before those
         are read that are given.
         """
-        query = "SELECT id, confidence, state, structure FROM instances WHERE id IN ({})"
-        rows = (row for part, marks in batches(ids) for row in self._connection.rows(query.format(marks), part))
+        rows = self._rows.columns_among(("id", "confidence", "state", "structure"), "id", ids)
         return {n: (float(confidence), state, structure) for n, confidence, state, structure in rows}
 
     def states(self) -> dict[int, tuple[str, int]]:

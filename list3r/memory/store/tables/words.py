@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+from list3r.memory.records import Instance
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.word_index import ASK_STAMP, STAMP, expected_words
+from list3r.memory.store.word_index import ASK_STAMP, STAMP, expected_words, hundredths
 
 
 class Words:
@@ -52,6 +53,14 @@ class Words:
             for (instance,) in self._connection.rows(query, (word, last, limit)):
                 hits[instance] = hits.get(instance, 0) + 1
         return [sorted(n for n, c in hits.items() if c == most) for most in sorted(set(hits.values()), reverse=True)]
+
+    def check(self, instances: Iterable[Instance], words: Iterable[str], totals: Mapping[int, int]) -> None:
+        """Raise `MemoryFileError` where instances are not called by some words as well as the table says."""
+        wanted = set(words)
+        for i in instances:
+            borne = hundredths(i.label, i.structure, i.description, i.color_name)
+            if sum(borne.get(word, 0) for word in wanted) != totals[i.id] and self._is_current():
+                self._connection.refuse(f"words: those of instance {i.id} are not what it is called")
 
     def _is_current(self) -> bool:
         """Whether the table holds the words that this program knows."""
