@@ -12,6 +12,7 @@ import pytest
 
 from list3r.cli.app import run
 from list3r.memory.description.printable import shown
+from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, MergeDecision
 from list3r.memory.store.store import Store
@@ -125,3 +126,13 @@ def test_links_that_lead_to_themselves_are_said(tmp_path: Path, capsys: pytest.C
     for command in (["list", str(loop)], ["repair", str(loop)], ["build", str(tmp_path), "-m", str(loop)]):
         assert run(command) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_names_that_are_no_text_are_not_written(make_memory: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    path, name = make_memory(), os.fsdecode(b"w\xffalk")
+    with Store.open(path, writable=True) as store, pytest.raises(OptionError, match="no text of UTF-8"):
+        with store.transaction():
+            store.sessions.add(name, "", {}, 4)
+    assert run(["label", str(path), "2", name]) == 2 and "error: " in capsys.readouterr().err
+    with Store.open(path) as store:
+        assert len(store.sessions.all()) == 1 and store.verify() == []

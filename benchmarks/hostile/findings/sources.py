@@ -203,20 +203,23 @@ def chained_aliases(place: Place) -> str:
 
 
 def long_label(place: Place) -> str:
-    memory = lie(place.memory(), f"UPDATE instances SET label = '{'x' * 20_000_000}' WHERE id = 2")
+    memory, text = place.memory(), "ab cd " * 3_300_000
+    place.do(
+        lambda: lie(memory, f"UPDATE instances SET label = '{text}' WHERE id = 2") and 0, 60
+    )  # its memory is not ours
     words = (("list", memory), ("show", memory, 2), ("query", "find", memory, "mug"), ("info", memory))
     return first(*(place.ask(*w).beyond(10, 500) for w in words))
 
 
 def repair_of_a_hole(place: Place) -> str:
-    """No more than 300 MB may be written here, of a file of 8 GB with a hole."""
+    """A file of a terabyte with a hole, and no more than 300 MB may be written here."""
     memory = place.memory("holes/m.l3r")
-    os.truncate(memory, 2**33)
-    most = 300 * 2**20
-    ended = place.ask("repair", memory, longest_s=60, limit={resource.RLIMIT_FSIZE: most})
+    os.truncate(memory, 2**40)
+    ended = place.ask("repair", memory, longest_s=60, limit={resource.RLIMIT_FSIZE: 300 * 2**20})
     left = [p for p in memory.parent.iterdir() if (p != memory and ".repair" in p.name) or "-repair-" in p.name]
     size = sum(p.stat().st_blocks * 512 for p in left) // 2**20
-    return first(f"leaves {left[0].name[:24]} of {size} MB" if left else "", ended.beyond(10, 1000))
+    written = "writes until there is no more room" if "File too large" in ended.told else ""
+    return first(f"leaves {left[0].name[:24]} of {size} MB" if left else written, ended.beyond(10, 1000))
 
 
 ROWS: dict[str, Callable[[Place], str]] = {
@@ -236,7 +239,7 @@ ROWS: dict[str, Callable[[Place], str]] = {
     "9 half of the source unreadable": half_unreadable,
     "12 a picture of rgb.txt is a pipe; inspect": _waited("rgb/0.png", "inspect"),
     "12 a picture of rgb.txt is a pipe; build": _waited("rgb/0.png", "build"),
-    "12 depth.txt is a pipe; inspect": _waited("depth.txt", "inspect"),
+    "12 a picture of depth.txt is a pipe; inspect": _waited("depth/0.png", "inspect"),
     "12 a picture is /dev/zero; inspect": _waited("rgb/0.png", "inspect", "/dev/zero"),
     "12 a chunk of --reconstruction precomputed is a pipe": pipe_as_archive,
     "12 MEMORY-journal is a pipe; six commands": pipe_as_journal,

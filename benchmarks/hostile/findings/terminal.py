@@ -108,10 +108,17 @@ def exports(place: Place) -> str:
 
 def path_that_is_no_text(place: Place) -> str:
     place.memory(os.fsdecode(b"r\xffom.l3r"))
-    (place.folder / os.fsdecode(b"w\xffalk")).mkdir()
+    place.walk(os.fsdecode(b"w\xffalk"), frames=12, size=(160, 120))
     name, walk = "$'r\\xffom.l3r'", "$'w\\xffalk'"
-    commands = (f"list {name}", f"label {name} 2 mug", f"show {name} 77", f"verify {name}", f"inspect {walk}")
-    return first(*(place.shell(f"list3r {words}").bad for words in commands))
+    commands = (
+        f"list {name}",
+        f"label {name} 2 mug",
+        f"show {name} 77",
+        f"verify {name}",
+        f"inspect {walk}",
+        f"build {walk} -m new.l3r --poses given --workers 1",
+    )
+    return first(*(place.shell(f"list3r {words}", 200).bad for words in commands))
 
 
 def large_photo(place: Place) -> str:

@@ -14,7 +14,7 @@ from traceback import walk_tb
 from types import TracebackType
 from typing import Any, Self, cast
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.store.checksums import Sums
 from list3r.memory.store.committed import Committed
 from list3r.memory.store.file import (
@@ -219,6 +219,8 @@ class Connection:
             except sqlite3.Error as error:
                 self._roll_back()
                 raise MemoryFileError(explained(self.path, error)) from error
+            except UnicodeEncodeError as error:  # a name of a file may hold any bytes
+                raise OptionError(f"{str(error.object)[:200]} is no text of UTF-8; name it otherwise") from error
             finally:
                 self._writing = False
 
