@@ -41,7 +41,7 @@ class ChunkSurface:
     cloud: Cloud
     views: Sequence[View]
     around: Surroundings
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64]]
+    pairs: tuple[NDArray[np.int32], NDArray[np.int32]]
     """Voxels that are neighbours. Shape (M,) each."""
     lab: Float
     """Colours of the voxels, Lab with lightness halved. Shape (N, 3)."""
@@ -52,7 +52,8 @@ class ChunkSurface:
 def chunk_surface(cloud: Cloud, views: Sequence[View], around: Surroundings) -> ChunkSurface:
     """Return a cloud with its neighbours and colours."""
     shown = [lab_of(v.rgb.reshape(-1, 3).astype(np.float32)).reshape(v.rgb.shape) for v in views]
-    return ChunkSurface(cloud, views, around, neighbour_pairs(cloud.keys, 1), lab_of(cloud.rgb), tuple(shown))
+    left, right = (rows.astype(np.int32) for rows in neighbour_pairs(cloud.keys, 1))
+    return ChunkSurface(cloud, views, around, (left, right), lab_of(cloud.rgb), tuple(shown))
 
 
 @dataclass(frozen=True)
@@ -200,10 +201,10 @@ class _Touching:
     """True where the pair's left voxel is of the greater piece. Shape (T,)."""
 
 
-def _touching(labels: NDArray[np.int32], pairs: tuple[NDArray[np.int64], NDArray[np.int64]], count: int) -> _Touching:
-    a, b = labels[pairs[0]].astype(np.int64), labels[pairs[1]].astype(np.int64)
-    row = np.flatnonzero((a != b) & (a >= 0) & (b >= 0))
-    a, b = a[row], b[row]
+def _touching(labels: NDArray[np.int32], pairs: tuple[NDArray[np.int32], NDArray[np.int32]], count: int) -> _Touching:
+    here, there = labels[pairs[0]], labels[pairs[1]]
+    row = np.flatnonzero((here != there) & (here >= 0) & (there >= 0))
+    a, b = here[row].astype(np.int64), there[row].astype(np.int64)
     return _Touching(row, np.minimum(a, b) * count + np.maximum(a, b), a > b)
 
 
@@ -216,8 +217,10 @@ def _codes(
 ) -> NDArray[np.int64]:
     """Codes of pieces that touch or come near each other, ascending. Shape (E,)."""
     if count > MOST_IN_TABLE:
-        parts = [touching.code, *_near_codes(cloud, labels, count, doublings)]
-        return np.unique(np.concatenate(parts))
+        found = np.unique(touching.code)
+        for codes in _near_codes(cloud, labels, count, doublings):
+            found = np.union1d(found, codes)
+        return found
     table = np.zeros(-(-count * count // 8) * 8, bool)
     table[touching.code] = True
     for codes in _near_codes(cloud, labels, count, doublings):

@@ -60,18 +60,33 @@ def cut_superpoints(surface: ChunkSurface, settings: SuperpointSettings | None =
 
 def _costs(surface: ChunkSurface, s: SuperpointSettings) -> NDArray[np.float32]:
     """Length of the way between neighbouring voxels. Shape (M,)."""
-    cloud, (left, right) = surface.cloud, surface.pairs
-    known = (cloud.normals != 0).any(axis=1)
-    both = known[left] & known[right]
+    left, right = surface.pairs
+    out = np.empty(len(left), np.float32)
+    for start in range(0, len(left), BLOCK):
+        rows = slice(start, start + BLOCK)
+        out[rows] = _cost(surface, left[rows], right[rows], s)
+    return out
+
+
+BLOCK = 1 << 18
+"""Neighbours whose ways are worked out at once: a chunk has millions, which would take half its memory."""
+
+
+def _cost(
+    surface: ChunkSurface, left: NDArray[np.int32], right: NDArray[np.int32], s: SuperpointSettings
+) -> NDArray[np.float32]:
+    """Length of the way between some neighbours. Shape (B,)."""
+    cloud = surface.cloud
+    n, m = cloud.normals[left], cloud.normals[right]
+    both = (n != 0).any(axis=1) & (m != 0).any(axis=1)
+    away = (cloud.points[right] - cloud.points[left]) / np.float32(cloud.voxel)
+    tone = np.square(surface.lab[left] - surface.lab[right])
     cosine, step, way, color = (np.zeros(len(left), np.float32) for _ in range(4))
     for k in range(3):
-        n, p, tone = (np.ascontiguousarray(a[:, k]) for a in (cloud.normals, cloud.points, surface.lab))
-        a, b = n[left], n[right]
-        away = (p[right] - p[left]) / np.float32(cloud.voxel)
-        cosine += a * b
-        step += away * (a + b)
-        way += away * away
-        color += np.square(tone[left] - tone[right])
+        cosine += n[:, k] * m[:, k]
+        step += away[:, k] * (n[:, k] + m[:, k])
+        way += away[:, k] * away[:, k]
+        color += tone[:, k]
     bend = np.where(both, 1.0 - np.clip(cosine, -1.0, 1.0), np.float32(0.3))
     rise = np.where(both, np.abs(step) / np.float32(2.0), np.float32(0.0))
     return np.asarray(
@@ -85,7 +100,7 @@ def _costs(surface: ChunkSurface, s: SuperpointSettings) -> NDArray[np.float32]:
 
 
 def _seeds(
-    cloud: Cloud, left: NDArray[np.int64], right: NDArray[np.int64], cost: NDArray[np.float32], spacing: float
+    cloud: Cloud, left: NDArray[np.int32], right: NDArray[np.int32], cost: NDArray[np.float32], spacing: float
 ) -> NDArray[np.int64]:
     """The calmest voxel of each cell of a grid and of each way that surfaces in it face, ascending."""
     size = len(cloud.keys)
