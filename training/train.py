@@ -30,9 +30,8 @@ from training.worlds.catalogue import LABELS
 FIRST_SEED, FIRST_FITTED_SEED, FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 1000, 2000, 5000, 5500
 """Seeds count up from here: worlds for training, those with what is built in, and left-out worlds of both kinds."""
 
-USUAL_THRESHOLD, OTHER_THRESHOLDS = 2.0, (0.5, 3.5)
-"""Where agglomeration of fine pieces stops, and besides, so that the second network sees parts of other sizes too: it
-judges all that they make up on the way to things."""
+OTHER_THRESHOLDS = (0.5, 3.5)
+"""Where agglomeration of fine pieces stops besides, so that the second network sees parts of other sizes too."""
 
 
 def main() -> None:
@@ -71,7 +70,7 @@ def train(
     fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), depth=depth)
     settings = FitSettings(epochs, start=start and start / "fine", blind=blind)
     arrays = named("fine", fit(fine, lessons, seen, out / "fine", settings))
-    usual = USUAL_THRESHOLD
+    usual = CutSettings().sure
     every = [
         lesson
         for k, p in enumerate(paths)
