@@ -37,8 +37,10 @@ def summary() -> str:
     second, safety = _read("sessions")["total seeds 311 to 320"], _read("safety")
     told = _read("relations")["pooled"]
     fair = _read("association-fair")["runs"]
-    full, theirs = (statistics.median([r["ate_sim3_m"] for r in fair if r["variant"] == v]) for v in ("full", "vggt-long"))
-    kills = sum(part["kills"] for part in safety.values() if isinstance(part, dict) and "kills" in part and "flips" not in part)
+    kills = safety["asked"]["kills"]
+
+    def median(variant: str) -> float:
+        return statistics.median([r["ate_sim3_m"] for r in fair if r["variant"] == variant])
 
     def things(mean: Any) -> str:
         return f"{mean['recall_0.25']:.2f} found, {mean['precision_0.25']:.2f} right"
@@ -58,8 +60,8 @@ def summary() -> str:
             ],
             [
                 "long videos with revisits, simulated network: median error",
-                f"{100 * full:.1f} cm",
-                f"VGGT-Long's association {100 * theirs:.1f} cm",
+                f"{100 * median('full'):.1f} cm",
+                f"VGGT-Long's association {100 * median('vggt-long'):.1f} cm",
             ],
             ["things in homes of our own simulator (whole walks)", things(own), ""],
             [
