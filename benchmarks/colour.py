@@ -78,18 +78,19 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
     parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
     parser.add_argument("--hard", action="store_true", help="... with wider turns, and through door frames")
-    parser.add_argument("--frames", type=int, default=150, help="of each such walk")
+    parser.add_argument("--frames", type=int, help="of each walk; without it 150 of such walks, else all")
     parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
     if words.step is not None:
+        words.frames = words.frames or 150
         compare_walks(words)
         return
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         root = words.keep or Path(scratch)
         for seed, method in ((int(w), m) for w in words.seeds.split(",") for m in words.discovery.split(",")):
-            figures = measured(root / f"seed-{seed}", seed, words.workers, method)
+            figures = measured(root / f"seed-{seed}", seed, words.workers, method, words.frames)
             rows.append({"seed": seed, "discovery": method or "default", **figures})
             print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
             write_json(words.json, {"mean": means_of(rows), "seeds": rows})
@@ -111,9 +112,9 @@ def means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     return {k: round(statistics.fmean(values), 4) if values else None for k, values in known.items()}
 
 
-def measured(folder: Path, seed: int, workers: int, discovery: str = "") -> dict[str, Any]:
-    """The figures of one walk, which is filmed, built and compared in `folder`."""
-    settings = WalkSettings(seed=seed, size=SIZE, write_ids=True)
+def measured(folder: Path, seed: int, workers: int, discovery: str = "", frames: int | None = None) -> dict[str, Any]:
+    """The figures of one walk, which is filmed, built and compared in `folder`; of its first `frames` alone."""
+    settings = WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=frames)
     walk = folder / "walk"
     if not (walk / "truth.json").exists():
         write_walk(walk, settings, workers)
