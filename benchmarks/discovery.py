@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from list3r.evaluation.calibration import calibration
 from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.instances.base import Discoverer, Proposals
-from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.support import thin, without_fliers
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
 from list3r.instances.library import select_prompts
+from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings, MaskTrackSettings
 from list3r.memory.geometry import OrientedBox, upright_box
 from list3r.memory.relations.instance_geometry import fit_box, without_strays

@@ -25,10 +25,8 @@ from numpy.typing import NDArray
 
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.cloud import Cloud, build_cloud
-from list3r.instances.geometric.discovery import _proposals
-from list3r.instances.geometric.planes import find_planes
-from list3r.instances.geometric.segments import Segment, Segmentation
-from list3r.instances.geometric.surfaces import estimate_up
+from list3r.instances.geometric.cuts import Segment, Segmentation, proposals_of
+from list3r.instances.geometric.planes import estimate_up, find_planes
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CutSettings, make_parts, spread_labels
@@ -133,7 +131,7 @@ def proposed(discoverer: LearnedDiscoverer, chunk: Chunk, labels: Labels, flat: 
     camera = chunk.views.reconstruction.camera
     features = np.ones((len(flat), 1), np.float32)
     view = chunk.views.view(p)
-    return _proposals(view, image, cut, features, stride=chunk.views.stride, shape=(camera.height, camera.width))
+    return proposals_of(view, image, cut, features, stride=chunk.views.stride, shape=(camera.height, camera.width))
 
 
 def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np.bool_]]]:

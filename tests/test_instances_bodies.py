@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame
-from list3r.instances.geometric.rules.furniture import _rename
 from list3r.instances.library import build_library
+from list3r.instances.rules.furniture import _rename
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary
 from tests.test_instances_library import FLOOR, WALL, Block, look_at, reconstruction_of, render, world_points

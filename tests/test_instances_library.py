@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.instances.geometric.discovery import GeometricDiscoverer
-from list3r.instances.geometric.rules.joining import join_candidates
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings, build_library
 from list3r.instances.overlays import draw_debug
+from list3r.instances.rules.discovery import GeometricDiscoverer
+from list3r.instances.tracking.joining import join_candidates
 from list3r.memory.masks import decode_mask, shown_surface
 from list3r.memory.records import LocalInstance, LocalLibrary
 from list3r.memory.store.store import Store

@@ -12,10 +12,10 @@ from hypothesis.extra import numpy as hnp
 
 from list3r.instances.geometric.cloud import neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import mean_feature, object_feature
-from list3r.instances.geometric.rules.sheets import merge_regions
-from list3r.instances.geometric.segments import _plane_of
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings
+from list3r.instances.rules.segments import _plane_of
+from list3r.instances.rules.sheets import merge_regions
 from list3r.instances.tracking.reprojection import encode_labels
 from list3r.memory.masks import decode_mask, encode_mask
 from list3r.reconstruction.base import Reconstruction

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import Cloud, pack
-from list3r.instances.geometric.rules.vessels import fit_circle, join_vessels
-from list3r.instances.geometric.surfaces import Scene
+from list3r.instances.rules.surfaces import Scene
+from list3r.instances.rules.vessels import fit_circle, join_vessels
 from list3r.instances.settings import SegmentSettings
 
 

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import Cloud
-from list3r.instances.geometric.rules.necks import part_necks
-from list3r.instances.geometric.segments import Segment, Segmentation
+from list3r.instances.geometric.cuts import Segment, Segmentation
 from list3r.instances.geometric.views import ChunkViews
+from list3r.instances.rules.necks import part_necks
 
 RED, GREY, WOOD = (170, 30, 35), (150, 155, 160), (190, 150, 100)
 BOX, PAD, GAP = (slice(60, 150), slice(60, 150)), (slice(80, 130), slice(170, 230)), slice(150, 170)

@@ -12,7 +12,6 @@ import torch
 pytest.importorskip("transformers")
 
 from list3r.instances.base import Proposals
-from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.views import chunk_views
 from list3r.instances.library import build_library
 from list3r.instances.neural.appearance import Appearance, WithAppearance, label_shares
@@ -20,6 +19,7 @@ from list3r.instances.neural.candidates import SoftMasks, bounds_the_room, choos
 from list3r.instances.neural.query_segmenter import QuerySegmenter
 from list3r.instances.neural.sam_masks import SamMasks
 from list3r.instances.registry import check_choice, make_discoverer, make_tracker
+from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import CandidateSettings, InstanceSettings, SamMaskSettings, VideoTrackerSettings
 from list3r.instances.tracking.video_tracker import VideoTracker, _Things
 from list3r.memory.errors import OptionError

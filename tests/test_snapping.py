@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from list3r.instances.geometric.rules.snapping import _elected, snap_things, snapped, without_segments
-from list3r.instances.geometric.segments import Segment, Segmentation
+from list3r.instances.geometric.cuts import Segment, Segmentation
+from list3r.instances.rules.snapping import _elected, snap_things, snapped, without_segments
 
 TABLE, MUG, OTHER = 1, 2, 3
 THING = np.array([False, False, True, True])

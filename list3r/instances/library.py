@@ -9,8 +9,8 @@ import numpy as np
 
 from list3r.frames.base import Frame
 from list3r.instances.base import Discoverer, Proposals, Tracker
-from list3r.instances.geometric.discovery import GeometricDiscoverer
 from list3r.instances.geometric.views import chunk_views, forget_views
+from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.movers import with_movers
 from list3r.instances.tracking.reprojection import ReprojectionTracker

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from list3r.instances.base import Discoverer, Tracker
-from list3r.instances.geometric.discovery import GeometricDiscoverer
+from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.reprojection import ReprojectionTracker
 from list3r.memory.errors import OptionError

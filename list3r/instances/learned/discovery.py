@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.cloud import Cloud, build_cloud
-from list3r.instances.geometric.discovery import GeometricDiscoverer
+from list3r.instances.geometric.cuts import CloudDiscoverer, Segment, Segmentation
 from list3r.instances.geometric.features import object_feature
-from list3r.instances.geometric.planes import Plane, find_planes
-from list3r.instances.geometric.segments import Segment, Segmentation
-from list3r.instances.geometric.surfaces import estimate_up
+from list3r.instances.geometric.planes import Plane, estimate_up, find_planes
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
 from list3r.instances.learned.doubt import DoubtSettings, voxel_doubt, without_bends, without_slivers
@@ -55,7 +53,7 @@ class LearnedSettings:
     """Of computed depth."""
 
 
-class LearnedDiscoverer(GeometricDiscoverer):
+class LearnedDiscoverer(CloudDiscoverer):
     """Proposes the things of the chunk's fused cloud as masks on an anchor, cut by the trained networks."""
 
     def __init__(
@@ -72,7 +70,7 @@ class LearnedDiscoverer(GeometricDiscoverer):
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Propose masks on the frame at `position`, best first, with the probability that each is one thing."""
         found = super().__call__(frames, reconstruction, position)
-        scraps = None if self._scraps is None else self._looked_at(reconstruction, position, *self._scraps)
+        scraps = None if self._scraps is None else self.looked_at(reconstruction, position, *self._scraps)
         return replace(found, whole=found.score, scraps=scraps)
 
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, Features]:

@@ -13,11 +13,11 @@ from list3r.compiled import compiled
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.features import mean_feature
-from list3r.instances.geometric.rules.joining import join_candidates, warp_labels
 from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.separation import cannot_link_pairs
 from list3r.instances.settings import InstanceSettings
+from list3r.instances.tracking.joining import join_candidates, warp_labels
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.reconstruction.base import Reconstruction
 

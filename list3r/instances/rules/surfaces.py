@@ -55,22 +55,6 @@ class Surface:
     """A thin flat thing that lies on another level surface."""
 
 
-def estimate_up(planes: list[Plane], T_chunk_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The normal, within 55 degrees of the cameras' mean up, that the most area is level or upright to."""
-    prior = -T_chunk_cam[:, :3, 1].mean(axis=0)
-    prior /= max(float(np.linalg.norm(prior)), 1e-9)
-    best, best_area = prior, 0.0
-    for candidate in planes:
-        if candidate.normal @ prior < 0.57:
-            continue
-        cosines = [abs(float(plane.normal @ candidate.normal)) for plane in planes]
-        area = sum(p.area for p, c in zip(planes, cosines, strict=True) if c > 0.985 or c < 0.09)
-        area *= float(candidate.normal @ prior)
-        if area > best_area:
-            best, best_area = candidate.normal, area
-    return np.asarray(best)
-
-
 def choose_surfaces(scene: Scene, planes: list[Plane]) -> list[Surface]:
     """The planes that cut, largest first: big ones, what bounds the room, what things rest on, and sheets."""
     out: list[Surface] = []

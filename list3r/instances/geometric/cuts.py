@@ -1,28 +1,54 @@
-"""The discoverer that needs no weights: geometry of the whole chunk, looked at from each anchor."""
+"""A cut of the chunk's cloud into things, looked at from each anchor."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
-from list3r.instances.geometric.cloud import Cloud, build_cloud
-from list3r.instances.geometric.features import object_feature
+from list3r.instances.geometric.cloud import Cloud
 from list3r.instances.geometric.fusion import View
-from list3r.instances.geometric.rules.necks import part_necks
-from list3r.instances.geometric.rules.snapping import snap_things, without_segments
-from list3r.instances.geometric.rules.things import least_size
-from list3r.instances.geometric.segments import Segmentation, segment_cloud
 from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.reconstruction.base import Reconstruction
 
 
-class GeometricDiscoverer:
-    """Proposes the things of the chunk's fused cloud as masks on an anchor.
+@dataclass(frozen=True)
+class Segment:
+    """One thing of the chunk."""
+
+    kind: str
+    """surface, sheet, thing."""
+    plane: NDArray[np.float64] | None
+    """Its plane in chunk coordinates where it is flat. Shape (4,)."""
+    structure: bool
+    """A surface that bounds the room."""
+    score: float
+    """How sure it is one thing, in [0, 1]."""
+    base: NDArray[np.float64] | None = None
+    """Plane of the wall or floor that a panel lies on, chunk coordinates, n towards the cameras. Shape (4,)."""
+    named: tuple[tuple[str, float], ...] = ()
+    """Names that it may have, with their probabilities."""
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Every voxel's thing."""
+
+    labels: NDArray[np.int32]
+    """0 for none, s + 1 for segment s. Shape (N,)."""
+    segments: tuple[Segment, ...]
+    up: NDArray[np.float64]
+    """Upward direction, chunk frame. Shape (3,)."""
+
+
+class CloudDiscoverer(ABC):
+    """Proposes the things of the chunk's fused cloud as masks on an anchor; how it is cut, others say.
 
     The cloud of a chunk is cut once, at the first anchor; the other anchors look at the same cut.
     """
@@ -39,9 +65,9 @@ class GeometricDiscoverer:
         views = chunk_views(frames, reconstruction, self.settings)
         if views is not self._views or self._cut is None:
             self._views, self._cut = views, self._segment(views)
-        return self._looked_at(reconstruction, position, *self._cut[1:])
+        return self.looked_at(reconstruction, position, *self._cut[1:])
 
-    def _looked_at(
+    def looked_at(
         self, reconstruction: Reconstruction, position: int, cut: Segmentation, features: NDArray[np.float32]
     ) -> Proposals:
         """A cut of the cloud of the chunk in hand, as the frame at `position` sees it."""
@@ -49,23 +75,11 @@ class GeometricDiscoverer:
         labels = self._label_view(self._views, position, self._cut[0], cut)
         shape = (reconstruction.camera.height, reconstruction.camera.width)
         view = self._views.view(position)
-        return _proposals(view, labels, cut, features, stride=self._views.stride, shape=shape)
+        return proposals_of(view, labels, cut, features, stride=self._views.stride, shape=shape)
 
+    @abstractmethod
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, NDArray[np.float32]]:
-        settings = self.settings.segment
-        cloud = build_cloud([views.view(p) for p in views.anchors], settings.voxel_m * views.unit)
-        poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
-        cut = segment_cloud(cloud, poses, views.unit, settings)
-        if views.reconstruction.depth_noise is not None:
-            least = least_size(settings.thing_size_m * views.unit, cloud.voxel)
-            cut = part_necks(views, cloud, snap_things(views, cloud, cut, least), least)
-            cut = above_noise(views, cloud, cut, settings.least_spread)
-        features = np.zeros((len(cut.segments), 64), np.float32)
-        rgb = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8)
-        for number in range(len(cut.segments)):
-            mine = cut.labels == number + 1
-            features[number] = object_feature(cloud.points[mine], rgb[mine], cut.up, views.unit)
-        return cloud, cut, features
+        """Return the cloud of a chunk, its cut, and a feature of each segment. Shape (S, D)."""
 
     def _label_view(self, views: ChunkViews, position: int, cloud: Cloud, cut: Segmentation) -> NDArray[np.int32]:
         """Segment of each pixel of the view at `position`, 0 for none. Shape (h, w)."""
@@ -74,40 +88,6 @@ class GeometricDiscoverer:
         else:
             index = _nearest_voxels(views.view(position), cloud)
         return np.asarray(np.append(cut.labels, 0)[index], np.int32)
-
-
-def above_noise(views: ChunkViews, cloud: Cloud, cut: Segmentation, least_spread: float) -> Segmentation:
-    """The cut of computed depth without things that are narrower than the deviation of their own depth.
-
-    Such depth is off by more than it is rough, alike over a patch, so that a piece of a surface stands before it like
-    a thing; only the width of a thing over what its depth may be off by tells them apart. Narrower means that the
-    deviation along the second of its axes is less than `least_spread` of the depth's.
-
-    Of what parts pieces of surfaces from things in chunks of two rooms (a kitchen, a simulated one) this tells most:
-    area under the curve 0.82 and 0.88; the confidence alone 0.79 and 0.85, the width over the roughness of depth 0.81
-    and 0.85, the share of the outline that is a depth edge 0.61 and 0.78, or lies in a hole 0.47 and 0.44.
-    """
-    label, doubt = _doubts(views, cloud, cut)
-    kept = np.ones(len(cut.segments) + 1, bool)
-    for number, segment in enumerate(cut.segments, start=1):
-        mine, points = doubt[label == number], cloud.points[cut.labels == number].astype(np.float64)
-        if segment.kind == "thing" and len(mine) and len(points) > 2:
-            second = float(np.linalg.eigvalsh(np.cov(points.T))[1])
-            kept[number] = second >= (least_spread * float(np.median(mine))) ** 2
-    return without_segments(cut, kept[1:])
-
-
-def _doubts(views: ChunkViews, cloud: Cloud, cut: Segmentation) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Segment + 1 of the pixels of all anchors that are in the cloud, and the deviation of their depth. (P,) each."""
-    noise = views.reconstruction.depth_noise
-    assert noise is not None
-    labels, doubt = [np.zeros(0, np.int32)], [np.zeros(0, np.float32)]
-    for position, index in zip(views.anchors, cloud.index, strict=True):
-        known = index >= 0
-        confidence = views.reconstruction.confidence[position][:: views.stride, :: views.stride]
-        labels.append(cut.labels[index[known]])
-        doubt.append(noise.doubt(views.view(position).depth[known], confidence[known]))
-    return np.concatenate(labels), np.concatenate(doubt)
 
 
 def _nearest_voxels(view: View, cloud: Cloud) -> NDArray[np.int32]:
@@ -120,7 +100,7 @@ def _nearest_voxels(view: View, cloud: Cloud) -> NDArray[np.int32]:
     return index
 
 
-def _proposals(
+def proposals_of(
     view: View,
     labels: NDArray[np.int32],
     cut: Segmentation,
@@ -129,6 +109,7 @@ def _proposals(
     stride: int,
     shape: tuple[int, int],
 ) -> Proposals:
+    """Return the segments that a view shows as candidates; `labels` (h, w) is segment + 1 of each of its pixels."""
     count = np.bincount(labels.ravel(), minlength=len(cut.segments) + 1)[1:]
     score = np.array([segment.score for segment in cut.segments], np.float32)
     present = np.flatnonzero(count > 0)

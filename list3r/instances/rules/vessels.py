@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.geometric.rules.things import least_voxels, members_of
-from list3r.instances.geometric.surfaces import Labels, Scene, Surface
+from list3r.instances.rules.surfaces import Labels, Scene, Surface
+from list3r.instances.rules.things import least_voxels, members_of
 
 RIM_M = 0.03
 """Height of the band under a piece's top that is taken for its rim."""

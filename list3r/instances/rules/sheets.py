@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from list3r.instances.geometric.features import lab_of
 from list3r.instances.geometric.planes import Raster, plane_raster
-from list3r.instances.geometric.rules.things import members_of
-from list3r.instances.geometric.surfaces import Labels, Scene, Surface, hull_of
+from list3r.instances.rules.surfaces import Labels, Scene, Surface, hull_of
+from list3r.instances.rules.things import members_of
 
 Float = NDArray[np.float32]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import lab_of
-from list3r.instances.geometric.rules.things import members_of
-from list3r.instances.geometric.surfaces import Labels, Scene, Surface
+from list3r.instances.rules.surfaces import Labels, Scene, Surface
+from list3r.instances.rules.things import members_of
 
 CELL_M = 0.03
 """Grain on which faces are said to touch; the edge between two faces is often blind by about this much."""

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from list3r.instances.geometric.cloud import Cloud, linked_components, neighbour_pairs
 from list3r.instances.geometric.planes import Plane
-from list3r.instances.geometric.surfaces import Labels, Scene, Surface, hull_of
+from list3r.instances.rules.surfaces import Labels, Scene, Surface, hull_of
 
 REVEAL_M = 0.25
 """Walls up to this thick show their end faces beside doors."""

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from list3r.instances.geometric.cloud import Cloud
+from list3r.instances.geometric.cuts import Segment, Segmentation
 from list3r.instances.geometric.features import lab_of
-from list3r.instances.geometric.rules.snapping import SPILL_PX
-from list3r.instances.geometric.segments import Segment, Segmentation
 from list3r.instances.geometric.views import ChunkViews
+from list3r.instances.rules.snapping import SPILL_PX
 
 COLOR_STEP = 12.0
 """Difference of mean colours (Lab, lightness halved) from which two pieces are two things, as in `clutter`."""

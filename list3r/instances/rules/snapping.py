@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import Cloud
+from list3r.instances.geometric.cuts import Segmentation
 from list3r.instances.geometric.features import lab_of
-from list3r.instances.geometric.segments import Segmentation
 from list3r.instances.geometric.views import ChunkViews
 
 SPILL_PX = 5.0

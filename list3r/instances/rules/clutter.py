@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from list3r.instances.geometric.cloud import Float, component_numbers, linked_components, neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import lab_of
-from list3r.instances.geometric.rules.things import least_voxels, members_of
-from list3r.instances.geometric.surfaces import Labels, Scene, Surface
+from list3r.instances.rules.surfaces import Labels, Scene, Surface
+from list3r.instances.rules.things import least_voxels, members_of
 
 CROWD_M = 1.0
 """A component longer than this is no single thing that can be moved about."""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import Cloud
-from list3r.instances.geometric.planes import find_planes, plane_tolerance
-from list3r.instances.geometric.rules.clutter import split_crowds
-from list3r.instances.geometric.rules.furniture import join_bodies
-from list3r.instances.geometric.rules.sheets import find_sheets
-from list3r.instances.geometric.rules.things import (
+from list3r.instances.geometric.cuts import Segment, Segmentation
+from list3r.instances.geometric.planes import estimate_up, find_planes, plane_tolerance
+from list3r.instances.rules.clutter import split_crowds
+from list3r.instances.rules.furniture import join_bodies
+from list3r.instances.rules.sheets import find_sheets
+from list3r.instances.rules.surfaces import Labels, Scene, Surface, assign_surfaces, choose_surfaces
+from list3r.instances.rules.things import (
     adopt_fragments,
     adopt_islands,
     attach_parts,
@@ -22,38 +22,8 @@ from list3r.instances.geometric.rules.things import (
     drop_slivers,
     least_voxels,
 )
-from list3r.instances.geometric.rules.vessels import join_vessels
-from list3r.instances.geometric.surfaces import Labels, Scene, Surface, assign_surfaces, choose_surfaces, estimate_up
+from list3r.instances.rules.vessels import join_vessels
 from list3r.instances.settings import SegmentSettings
-
-
-@dataclass(frozen=True)
-class Segment:
-    """One thing of the chunk."""
-
-    kind: str
-    """surface, sheet, thing."""
-    plane: NDArray[np.float64] | None
-    """Its plane in chunk coordinates where it is flat. Shape (4,)."""
-    structure: bool
-    """A surface that bounds the room."""
-    score: float
-    """How sure it is one thing, in [0, 1]."""
-    base: NDArray[np.float64] | None = None
-    """Plane of the wall or floor that a panel lies on, chunk coordinates, n towards the cameras. Shape (4,)."""
-    named: tuple[tuple[str, float], ...] = ()
-    """Names that it may have, with their probabilities."""
-
-
-@dataclass(frozen=True)
-class Segmentation:
-    """Every voxel's thing."""
-
-    labels: Labels
-    """0 for none, s + 1 for segment s. Shape (N,)."""
-    segments: tuple[Segment, ...]
-    up: NDArray[np.float64]
-    """Upward direction, chunk frame. Shape (3,)."""
 
 
 def segment_cloud(
