@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from list3r.frames.base import SourceInfo
-from list3r.instances.geometric.cloud import Cloud, pack
+from list3r.instances.geometric.cloud import Cloud, build_cloud, pack
 from list3r.instances.geometric.planes import find_planes
 from list3r.instances.geometric.views import chunk_views, forget_views
+from list3r.instances.learned import graph as graphs
+from list3r.instances.learned import superpoints
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CloudCut, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
-from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph
+from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph, Surroundings, chunk_surface
 from list3r.instances.learned.network import Judgement, judge
+from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import ThingVerdicts, judge_things, names_of, thing_features
 from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
 from list3r.instances.registry import make_discoverer
@@ -173,6 +176,24 @@ def test_it_finds_what_stands_on_a_table() -> None:
     assert proposals.structure[floor - 1] and proposals.structure[wall - 1]
     assert len({table, mug, tin, floor}) == 4
     assert not proposals.structure[[table - 1, mug - 1, tin - 1]].any()
+
+
+def test_pieces_and_their_graph_are_the_same_however_much_is_worked_out_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frames, reconstruction = walk(SCENE)
+    views = chunk_views(frames, reconstruction, InstanceSettings())
+    shown = [views.view(p) for p in views.anchors]
+    around = Surroundings(np.array([0.0, 0.0, 1.0]), 1.0, 1.0, computed=False)
+    surface = chunk_surface(build_cloud(shown, 0.02), shown, around)
+    forget_views()
+    once = cut_pieces(surface)
+    monkeypatch.setattr(superpoints, "BLOCK", 1000)
+    monkeypatch.setattr(graphs, "MOST_IN_TABLE", 0)
+    again = cut_pieces(surface)
+    assert np.array_equal(once.labels, again.labels)
+    for a, b in zip(astuple(once.graph), astuple(again.graph), strict=True):
+        assert np.array_equal(a, b)
 
 
 def most_of(labels: np.ndarray) -> int:
