@@ -220,7 +220,7 @@ def test_what_is_said_of_the_camera_is_in_pixels_of_the_pictures_as_stored(tmp_p
             session = store.sessions.add("here", "", {}, 4)
         plan = plan_session(store, session, job, Watch())
         assert "focal length of 192 px is a guess" in camera_notes(store, session)[0]
-    assert plan.tasks[0].options.intrinsics == pytest.approx((192.0, 192.0, 79.5, 59.5))
+    assert plan.first is not None and plan.first.options.intrinsics == pytest.approx((192.0, 192.0, 79.5, 59.5))
 
 
 def test_runs_of_numbers_in_words() -> None:

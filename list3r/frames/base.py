@@ -100,6 +100,9 @@ class SourceInfo:
     """What is missing and which option supplies it, one sentence each."""
     image_size: tuple[int, int] | None = None
     """Height and width of the frames handed out, px."""
+    stored_size: tuple[int, int] | None = None
+    """Height and width of the pictures as stored, upright, where frames are made smaller; None where they may not be.
+    """
     poses_metric: bool = True
     """Whether given poses are in metres; a model of COLMAP has a unit of its own."""
     z_up: bool = False

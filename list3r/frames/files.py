@@ -7,6 +7,7 @@ import os
 import stat
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 MAX_FILE_BYTES = 512 * 2**20
 """Of one picture or array; a frame of 134 megapixels with 16 bits a pixel has 256 MiB."""
@@ -16,15 +17,28 @@ MAX_PIXELS = 2**27
 """Of one picture: 134 megapixels."""
 
 
+MAX_LIST_BYTES = 512 * 2**20
+"""Of one list that is read line by line; poses of ten hours at 100 a second have about 280 MiB."""
+
+
 def read_file(path: Path, most_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Return what an ordinary file holds. Raises `OSError` for a device, a pipe, and for one that is too large.
+    """Return what an ordinary file holds. Raises `OSError` for a device, a pipe, and for one that is too large."""
+    with open_ordinary(path, most_bytes) as file:
+        return file.read(os.fstat(file.fileno()).st_size + 1)
+
+
+def open_ordinary(path: Path, most_bytes: int = MAX_FILE_BYTES) -> BinaryIO:
+    """Open an ordinary file. Raises `OSError` for a device, a pipe, and for one that is too large.
 
     A pipe that nobody writes would keep whoever opens it waiting, and a device need never end.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:  # noqa: PTH123 - it closes the descriptor
-        check_ordinary(os.fstat(descriptor), path, most_bytes)
-        return file.read(os.fstat(descriptor).st_size + 1)
+    file = open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")  # noqa: PTH123 - it closes it
+    try:
+        check_ordinary(os.fstat(file.fileno()), path, most_bytes)
+    except OSError:
+        file.close()
+        raise
+    return file
 
 
 def check_ordinary(found: os.stat_result, path: Path, most_bytes: int = MAX_FILE_BYTES) -> None:

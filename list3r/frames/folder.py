@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.decoding.decode import clean_depth, fault_of, read_color, read_gray, read_raw_depth, used_bits
 from list3r.frames.decoding.exif import exif_focal
-from list3r.frames.layout import FolderLayout, FrameFile, pose_matrix, read_numbers
+from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
+from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.stored import stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
@@ -43,15 +44,17 @@ class FolderSource:
     def __init__(self, root: Path, layout: FolderLayout, options: SourceOptions) -> None:
         """Raises `SourceError` and `OptionError` where the first images and the cameras do not fit together."""
         self._layout, self._options = layout, options
-        rate = _rate(layout.files)
+        files = layout.files
+        rate = _rate(files.times_s)
         self._clock = rate is not None
         self._fps = rate or options.fps or DEFAULT_FPS
-        times_s = np.array([self._time_s(k, file) for k, file in enumerate(layout.files)])
+        times_s = files.times_s if self._clock else np.arange(len(files)) / self._fps
         self._chosen = select(times_s, options, root, clock=self._clock, video=False)
         self._sharpest: dict[int, int] = {}
         self.optics, notes = merge_optics(layout, options)
         optics = self.optics
-        self._has_depth = any(f.depth is not None and f.depth.is_file() for f in layout.files)
+        depths = (files[k].depth for k in files.that_hold(DEPTH))
+        self._has_depth = any(depth is not None and depth.is_file() for depth in depths)
         self._typical_raw = 0.0
         self._floats, self._bits = False, 16
         sizes = self._probe(root)
@@ -233,10 +236,14 @@ class FolderSource:
 
     def _upright(self) -> bool:
         """Whether cameras stand upright on average in a world whose z is said to point up."""
-        given = [f for f in self._layout.files if f.pose is not None or f.T_source_camera is not None]
-        some = (self._pose(f) for f in given[:: max(1, len(given) // _POSES_TRIED)])
+        some = map(self._pose, self._some_that_hold(POSE_FILE | POSE))
         ups = [-T[:3, 1] for T in some if T is not None]
         return bool(ups) and float(np.mean(ups, axis=0)[2]) > _LEAST_UPRIGHT
+
+    def _some_that_hold(self, what: int) -> list[FrameFile]:
+        """Return frames that hold something, spread over the source."""
+        given = self._layout.files.that_hold(what)
+        return [self._layout.files[k] for k in given[:: max(1, len(given) // _POSES_TRIED)]]
 
     def _depth_doubts(self) -> tuple[str, ...]:
         typical_m = self._typical_raw / self._rig.depth_scale
@@ -248,16 +255,14 @@ class FolderSource:
 
     def _pose_doubts(self) -> tuple[str, ...]:
         """Of poses that are given, spread over the source, those that are no rigid motion."""
-        given = [f for f in self._layout.files if f.pose is not None]
-        some = given[:: max(1, len(given) // _POSES_TRIED)]
+        some = self._some_that_hold(POSE_FILE)
         wrong = sum(self._pose(f) is None for f in some)
         if not wrong:
             return ()
         return (f"{wrong} of {len(some)} poses looked at are no rigid motion (mirrored, stretched or not finite)",)
 
     def _time_doubts(self) -> tuple[str, ...]:
-        times = [f.time_s for f in self._layout.files if f.time_s is not None]
-        if self._clock or len(times) < 2:
+        if self._clock or np.count_nonzero(~np.isnan(self._layout.files.times_s)) < 2:
             return ()
         return (f"the time stamps do not ascend; {self._fps:g} frames a second are assumed (--fps)",)
 
@@ -273,7 +278,7 @@ class FolderSource:
             notes = (*notes, reduced_note(rig))
         if self._bits < 16:
             notes = (*notes, f"of the 16 bits of the pictures {self._bits} are in use, which count as full brightness")
-        has_poses = any(f.pose is not None or f.T_source_camera is not None for f in layout.files)
+        has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration
         return SourceInfo(
             kind=layout.kind,
@@ -291,6 +296,7 @@ class FolderSource:
             notes=(*layout.notes, *notes),
             missing=tuple(missing),
             image_size=rig.color_size,
+            stored_size=rig.stored_size,
             camera_guess=guess,
             poses_metric=layout.poses_metric,
             z_up=layout.z_up and self._upright(),
@@ -340,7 +346,7 @@ def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
     return [files[k] for k in sorted(range(len(files)), key=lambda k: sizes[k] != usual)]
 
 
-def _listing(files: tuple[FrameFile, ...], root: Path) -> Iterator[tuple[str, int]]:
+def _listing(files: Iterable[FrameFile], root: Path) -> Iterator[tuple[str, int]]:
     above = f"{root}{os.sep}"
     for stored in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
         name = str(stored).removeprefix(above).replace(os.sep, "/") if isinstance(stored, Path) else stored.name
@@ -353,8 +359,7 @@ def _median_known(raw: NDArray[Any]) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def _rate(files: tuple[FrameFile, ...]) -> float | None:
+def _rate(times_s: NDArray[np.float64]) -> float | None:
     """Median frame rate of a source with a clock, None without."""
-    times = np.array([f.time_s for f in files if f.time_s is not None])
-    gaps = np.diff(times)
-    return float(1.0 / np.median(gaps)) if len(times) == len(files) > 1 and np.median(gaps) > 0 else None
+    usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    return 1.0 / usual_s if usual_s > 0 else None  # NaN, where a frame has no time, is no rate either

@@ -5,46 +5,27 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.frames.files import MAX_TEXT_BYTES, read_file
+from list3r.frames.files import MAX_LIST_BYTES, MAX_TEXT_BYTES, open_ordinary, read_file
+from list3r.frames.listing import FrameFiles
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
-from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.memory.errors import OptionError, SourceError
 from list3r.memory.unpacking import parse_json
 
 MAX_LENGTH_M = 1e6
 """No camera stands further from where its numbers begin; single precision is 6 cm there."""
-_MOST_LINES, _LONGEST_LINE, _MOST_NUMBERS = 2**21, 2**22, 2**23
+_MOST_LINES, _LONGEST_LINE, _MOST_NUMBERS = 2**22, 2**22, 2**23
 """Of one list: lines, characters of a line, numbers. A line of COLMAP has every feature of a picture."""
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-
-
-@dataclass(frozen=True, slots=True)
-class FrameFile:
-    """The files of one frame."""
-
-    color: Stored
-    depth: Stored | CodedArray | None = None
-    pose: Path | None = None
-    """A text file with a 4x4 pose."""
-    T_source_camera: NDArray[np.float64] | None = None
-    """A pose that was read with the listing, of the camera that `FolderLayout.poses_of` names. Shape (4, 4)."""
-    time_s: float | None = None
-    """Seconds of the source's clock, if it has one."""
-    confidence: Stored | CodedArray | None = None
-    """How sure the sensor is of each depth pixel, as whole numbers, see `FolderLayout.least_confidence`."""
-    mask: Stored | None = None
-    """Where it is 0 the picture shows nothing that counts: depth is unknown there."""
-    lens: Camera | None = None
-    """The picture's own camera, where pictures differ; what it saw is carried to the camera of the source."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +55,7 @@ class FolderLayout:
     """A folder that was recognised."""
 
     kind: str
-    files: tuple[FrameFile, ...]
+    files: FrameFiles
     optics: Optics
     poses_of: str = "color"
     """The camera whose poses are given: color or depth."""
@@ -112,18 +93,24 @@ def read_numbers(path: Path) -> list[list[float]]:
     """Rows of numbers of a text file; `#` starts a comment. Raises `SourceError` naming file and line."""
     rows = []
     count = 0
-    for number, line in enumerate(read_lines(path), start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        count += len(words)
+    for row in iter_numbers(path):
+        count += len(row)
         if count > _MOST_NUMBERS:
             raise SourceError(f"{path} holds over {_MOST_NUMBERS:,} numbers, more than a list of poses has")
-        if not words:
-            continue
+        rows.append(row)
+    return rows
+
+
+def iter_numbers(path: Path) -> Iterator[list[float]]:
+    """As `read_numbers`, row by row."""
+    for number, line in enumerate(read_lines(path), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
         try:
-            rows.append([float(word) for word in words])
+            row = [float(word) for word in words]
         except ValueError:
             raise SourceError(f"{path}: line {number} is not numbers; mend or remove it") from None
-    return rows
+        if row:
+            yield row
 
 
 def read_text(path: Path) -> str:
@@ -134,15 +121,22 @@ def read_text(path: Path) -> str:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
 
 
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file. Raises `SourceError`, also for more and longer ones than any list has."""
-    text = read_text(path)
-    if text.count("\n") > _MOST_LINES:
-        raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
-    lines = text.splitlines()
-    if max(map(len, lines), default=0) > _LONGEST_LINE:
-        raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
-    return lines
+def read_lines(path: Path, *, whole: bool = False) -> Iterator[str]:
+    """Lines of a text file, one by one; with `whole` a last one that has no end is left out.
+
+    Raises `SourceError`, also for more and longer ones than any list has.
+    """
+    try:
+        with TextIOWrapper(open_ordinary(path, MAX_LIST_BYTES), "utf-8", "replace") as file:
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE + 1), "")):
+                if number > _MOST_LINES:
+                    raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
+                if len(line) > _LONGEST_LINE:
+                    raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
+                if not whole or line.endswith("\n"):
+                    yield line.rstrip("\n")
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
 
 
 def pose_matrix(values: Iterable[float]) -> NDArray[np.float64] | None:

@@ -75,7 +75,7 @@ def precompute(
     spans = plan_chunks(info.frame_count, settings.chunks, cuts)
     notes: list[str] = []
     if force or not all(_file(out, span).exists() for span in spans):
-        camera = estimated_camera(source, options, settings, info, watch.look)
+        camera = estimated_camera(job.frames(), options, settings, watch.look)
         if camera is not None:
             options, notes = told_camera(options, camera), [*camera.notes, _said(camera)]
     opened = open_source(source, options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -71,10 +71,22 @@ class Plan:
     spans: list[ChunkSpan]
     done: set[int]
     """Numbers of the spans that an earlier run finished."""
-    tasks: list[ChunkTask]
-    """What is left to do, in order."""
+    first: ChunkTask | None = None
+    """The first chunk that is left to do; None where none is."""
+    cuts: tuple[int, ...] = ()
     whole: VideoMap | None = None
     """The map of the whole video, where one was made before its chunks."""
+
+    @property
+    def left(self) -> int:
+        """How many spans are left to do."""
+        return sum(span.index not in self.done for span in self.spans)
+
+    def tasks(self) -> Iterator[ChunkTask]:
+        """What is left to do, in order, each made when it is asked for."""
+        for span in self.spans:
+            if self.first is not None and span.index not in self.done:
+                yield replace(self.first, span=span, shot=shot_of(span, self.cuts, self.spans[-1].stop))
 
     def fresh_frames(self) -> int:
         """Frames that this run works on, each counted once."""
@@ -143,18 +155,18 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     done = {c.index for c in begun}
     wide = step == 1 and not cuts and takes_wide_steps(job.frames(), job.settings)
     shorter = map_spans(job.frames(), job.settings, spans, begun) if wide else spans
-    left = any(s.index not in done for s in shorter)
-    options, whole = _camera_and_map(store, session, job, watch, wide and left)
-    if whole is not None or not left:
+    left = next((s for s in shorter if s.index not in done), None)
+    options, whole = _camera_and_map(store, session, job, watch, wide and left is not None)
+    if whole is not None or left is None:
         spans = shorter
-    tasks = []
-    for span in spans:
-        if span.index not in done:
-            where = None if watch.debug_dir is None else str(watch.debug_dir)
-            shot = shot_of(span, cuts, count)
-            known = None if whole is None else whole.T_map_cam
-            tasks.append(ChunkTask(str(job.source), options, span, job.settings, where, shot, step, known))
-    return Plan(session, spans, done, tasks, whole)
+    left = next((s for s in spans if s.index not in done), None)
+    plan = Plan(session, spans, done, None, cuts, whole)
+    if left is None:
+        return plan
+    where = None if watch.debug_dir is None else str(watch.debug_dir)
+    known = None if whole is None else whole.T_map_cam
+    first = ChunkTask(str(job.source), options, left, job.settings, where, shot_of(left, cuts, count), step, known)
+    return replace(plan, first=first)
 
 
 def _camera_and_map(
@@ -166,7 +178,7 @@ def _camera_and_map(
     given = job.info.camera is not None
     whole = map_whole(job.frames(), job.settings) if wide and given else None
     how = with_short_windows(job.settings) if wide else job.settings
-    estimate = partial(estimated_camera, job.source, job.options, how, job.info, watch.look, whole)
+    estimate = partial(estimated_camera, job.frames(), job.options, how, watch.look, whole)
     options = with_camera(store, session, job.options, estimate)
     if wide and not given:
         whole = map_whole(open_source(job.source, options), job.settings)
@@ -187,18 +199,18 @@ def add_chunks(
     Without `library` they are only placed. `added` hears of every part that came into the memory.
     Raises `SourceError` when more than half of the frames cannot be decoded.
     """
-    if not plan.tasks:
+    if plan.first is None:
         return
-    first, session, count = plan.tasks[0], plan.session, job.info.frame_count
+    first, session, count = plan.first, plan.session, job.info.frame_count
     bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
     watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
     asked = job.run.workers
-    workers = min(usual_workers(job.settings) if asked is None else asked, len(plan.tasks))
+    workers = min(usual_workers(job.settings) if asked is None else asked, plan.left)
     with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
-        for task, results in zip(plan.tasks, pool.map(plan.tasks), strict=True):
+        for task, results in zip(plan.tasks(), pool.map(plan.tasks()), strict=True):
             found = [row for part in results for row in part.bad_frames]
             bad.update(index for index, _ in found)
             check_bad_share(len(bad), count, found[0][1] if found else "")

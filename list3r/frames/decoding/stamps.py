@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import bisect
 import math
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import av
+import numpy as np
+from numpy.typing import NDArray
 
 from list3r.frames.decoding.boxes import check_index
 from list3r.frames.files import MAX_PIXELS
@@ -34,10 +34,11 @@ _WHOLE = {"ignore_editlist": "1"}
 class Stamps:
     """The clock of one video stream."""
 
-    stamps: tuple[int, ...]
-    """Stamp of every picture in the order they are shown, ascending, in `unit` seconds; 0, 0, ... without a clock."""
-    keys: tuple[int, ...]
-    """Stamps of the key frames that decoding can begin at, ascending; empty where pictures are counted."""
+    stamps: NDArray[np.int64]
+    """Stamp of every picture in the order they are shown, ascending, in `unit` seconds; 0, 0, ... without a clock.
+    Shape (F,)."""
+    keys: NDArray[np.int64]
+    """Stamps of the key frames that decoding can begin at, ascending; empty where pictures are counted. Shape (K,)."""
     unit: Fraction
     rate: float
     """Mean frame rate that the file states."""
@@ -52,7 +53,6 @@ class Stamps:
     focal_35mm: float | None = None
     """The lens's 35 mm equivalent that phones write beside the video."""
     notes: tuple[str, ...] = ()
-    _numbers: dict[int, int] = field(default_factory=dict, repr=False)
     words: dict[str, str] = field(default_factory=dict)
     """Options that the container is to be opened with."""
 
@@ -61,17 +61,21 @@ class Stamps:
 
     def time_s(self, number: int) -> float:
         """Seconds after the first frame; pictures of one stamp share the time up to the next."""
-        since = float((self.stamps[number] - self.stamps[0]) * self.unit)
-        if len(self._numbers) in (0, len(self.stamps)):
-            return since
-        stamp = self.stamps[number]
-        first, behind = bisect.bisect_left(self.stamps, stamp), bisect.bisect_right(self.stamps, stamp)
-        gap = (
-            (self.stamps[behind] - stamp) * self.unit
-            if behind < len(self.stamps)
-            else Fraction(1) / Fraction(self.rate)
-        )
-        return since + float(gap) * (number - first) / (behind - first)
+        return float(self.times_s(number, number + 1)[0])
+
+    def times_s(self, start: int, stop: int) -> NDArray[np.float64]:
+        """As `time_s`, of frames [start, stop). Shape (stop - start,)."""
+        asked = self.stamps[start:stop]
+        since_s = self._seconds(asked - self.stamps[0])
+        first, behind = (np.searchsorted(self.stamps, asked, side=side) for side in ("left", "right"))
+        if not self.clock or np.all(behind - first == 1):
+            return since_s
+        later = self.stamps[np.minimum(behind, len(self.stamps) - 1)]
+        gap_s = np.where(behind < len(self.stamps), self._seconds(later - asked), 1.0 / self.rate)
+        return np.asarray(since_s + gap_s * (np.arange(start, start + len(asked)) - first) / (behind - first))
+
+    def _seconds(self, units: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.asarray(units * float(self.unit.numerator) / float(self.unit.denominator), np.float64)
 
     def number(self, image: av.VideoFrame, count: int, last: int = -1) -> int | None:
         """The number of a decoded picture, which is the `count`-th since decoding began and follows number `last`.
@@ -81,16 +85,19 @@ class Stamps:
         if self.counted:
             return count if count < len(self.stamps) else None
         stamp = image.dts if self.decoding else image.pts
-        found = None if stamp is None else self._numbers.get(stamp)
-        again = found is not None and found <= last and self.stamps[last + 1 : last + 2] == (stamp,)
-        return last + 1 if again else found
+        if stamp is None or not self.clock:
+            return None
+        if 0 <= last < len(self) - 1 and self.stamps[last + 1] == stamp:
+            return last + 1
+        found = int(np.searchsorted(self.stamps, stamp))
+        return found if found < len(self) and self.stamps[found] == stamp else None
 
     def key_stamps_to(self, number: int, most: int) -> list[int]:
         """Stamps of up to `most` key frames at or before a frame, the nearest first."""
         if self.counted:
             return []
-        at = bisect.bisect_right(self.keys, self.stamps[number])
-        return list(self.keys[max(0, at - most) : at][::-1])
+        at = int(np.searchsorted(self.keys, self.stamps[number], side="right"))
+        return [int(stamp) for stamp in self.keys[max(0, at - most) : at][::-1]]
 
 
 def list_stamps(path: Path) -> Stamps:
@@ -112,15 +119,17 @@ def _listed(path: Path, words: dict[str, str]) -> tuple[Stamps, float]:
         stream = picture_stream(container)
         if stream is None or any(sign in container.format.name for sign in _NOT_VIDEO):
             raise SourceError(_no_video(path, container))
-        rows, hidden = [], []
+        numbers, hidden = array("q"), array("q")
         for packet in packets(container, stream):  # none is kept: together they are the file
             if packet.size and not packet.is_discard:
-                rows.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
+                stated = (_NONE if stamp is None else stamp for stamp in (packet.pts, packet.dts))
+                numbers.extend((*stated, bool(packet.is_keyframe)))
             elif packet.size and packet.pts is not None:
                 hidden.append(packet.pts)
+        rows = np.frombuffer(numbers, np.int64).reshape(-1, 3)
         stamps = _stamps(path, rows, container, stream)
         earlier = stamps.clock and bool(hidden) and max(hidden) < stamps.stamps[0]
-        hidden_s = float((stamps.stamps[0] - min(hidden)) * stamps.unit) if earlier else 0.0
+        hidden_s = float(int(stamps.stamps[0] - min(hidden)) * stamps.unit) if earlier else 0.0
         return replace(stamps, words=words), hidden_s
 
 
@@ -159,12 +168,14 @@ def packets(container: Any, stream: Any) -> Iterator[Any]:
         return
 
 
-_Rows = list[tuple[int | None, int | None, bool]]
-"""Stamps of showing and of decoding, and whether it is a key frame, of every packet as they come."""
+_NONE = np.iinfo(np.int64).min
+"""Of a packet without a stamp, as FFmpeg writes it."""
+_Rows = NDArray[np.int64]
+"""Stamps of showing and of decoding, and whether it is a key frame, of every packet as they come. Shape (F, 3)."""
 
 
 def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> Stamps:
-    if not rows:
+    if not len(rows):
         raise SourceError(f"{path} holds no frames; is the copy complete?")
     unit = stream.time_base or Fraction(1, 1)
     rate = float(stream.average_rate or stream.base_rate or 0) or DEFAULT_FPS
@@ -174,47 +185,34 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> Stamps:
     rows, joined = _joined(rows)
     reorders = bool(stream.codec_context.has_b_frames)
     for decoding in (False, True):
-        shown = [row[int(decoding)] for row in rows]
-        if any(stamp is None for stamp in shown):
+        shown = rows[:, int(decoding)]
+        if np.any(shown == _NONE):
             continue
         # AVI has no time of showing: FFmpeg makes it up from the place in the file where the codec reorders pictures.
         counted = joined or (reorders and (decoding or (container.format.name == "avi" and _ascend(shown))))
-        known = sorted(stamp for stamp in shown if stamp is not None)
-        numbers = {stamp: k for k, stamp in reversed(list(enumerate(known)))}
-        times = Counter(known)
-        keys = sorted(row[int(decoding)] or 0 for row in rows if row[2] and times[row[int(decoding)] or 0] == 1)
+        known, keys = np.sort(shown), np.sort(shown[rows[:, 2] > 0])
+        once = np.searchsorted(known, keys, side="right") - np.searchsorted(known, keys, side="left") == 1
         if joined:
             notes = (*notes, "its clock begins anew on the way and is joined, as where files were put together")
-        return Stamps(
-            tuple(known),
-            () if counted else tuple(keys),
-            unit,
-            rate,
-            True,
-            decoding,
-            counted,
-            aspect,
-            focal,
-            notes,
-            numbers,
-        )
-    return Stamps((0,) * len(rows), (), unit, rate, False, False, True, aspect, focal, notes)
+        begins = np.zeros(0, np.int64) if counted else keys[once]
+        return Stamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)
+    none = np.zeros(0, np.int64)
+    return Stamps(np.zeros(len(rows), np.int64), none, unit, rate, False, False, True, aspect, focal, notes)
 
 
-def _ascend(stamps: Sequence[int | None]) -> bool:
-    return all(a is not None and b is not None and a < b for a, b in pairwise(stamps))
+def _ascend(stamps: NDArray[np.int64]) -> bool:
+    return bool(np.all(np.diff(stamps) > 0))
 
 
 def _joined(rows: _Rows) -> tuple[_Rows, bool]:
     """Return the rows with one clock where that of decoding steps back, as in files that were put together."""
-    steps = [b - a for (_, a, _), (_, b, _) in pairwise(rows) if a is not None and b is not None]
-    if len(steps) + 1 < len(rows) or all(step >= 0 for step in steps):
+    steps = np.diff(rows[:, 1])
+    if np.any(rows[:, 1] == _NONE) or np.all(steps >= 0):
         return rows, False
-    usual = max(1, sorted(steps)[len(steps) // 2])
-    out, shift = [rows[0]], 0
-    for (pts, dts, key), step in zip(rows[1:], steps, strict=True):
-        shift += usual - step if step < 0 else 0
-        out.append((None if pts is None else pts + shift, None if dts is None else dts + shift, key))
+    usual = max(1, int(np.sort(steps)[len(steps) // 2]))
+    shift = np.cumsum(np.where(steps < 0, usual - steps, 0), dtype=np.int64)
+    out = rows.copy()
+    out[1:, :2] += np.where(rows[1:, :2] == _NONE, 0, shift[:, None])
     return out, True
 
 
@@ -233,8 +231,8 @@ def _breaks_off(rows: _Rows, container: Any, stream: Any, unit: Fraction) -> tup
     if stream.frames and len(rows) < stream.frames:
         return (f"the file breaks off: {len(rows)} of its {stream.frames} frames are there",)
     stated = float(container.duration or 0) / float(av.time_base)
-    shown = [row[0] for row in rows if row[0] is not None]
-    there = float((max(shown) - min(shown)) * unit) if shown else stated
+    shown = rows[rows[:, 0] != _NONE, 0]
+    there = float(int(shown.max() - shown.min()) * unit) if len(shown) else stated
     if there < stated * (1 - _MISSING_SHARE) - 1.0:
         return (f"the file breaks off: {there:.1f} of its {stated:.1f} seconds are there",)
     return ()

@@ -16,13 +16,13 @@ from list3r.frames.base import Camera
 from list3r.frames.layout import (
     IMAGE_ENDINGS,
     FolderLayout,
-    FrameFile,
     Optics,
     inside,
     natural_key,
     pose_matrix,
     usual_camera,
 )
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.colmap_files import frames_are_whole, written_sizes
 from list3r.memory.errors import OptionError, SourceError
@@ -49,7 +49,9 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     lenses = {k: _lens(found.cameras[k], model) for k in sorted(cameras)}
     shared = usual_camera(list(lenses.values()))
     own = {n: lenses[posed[n].camera_id] for n in posed} if len(lenses) > 1 and options.intrinsics is None else {}
-    files = tuple(FrameFile(inside(folder, n, model), T_source_camera=poses.get(n), lens=own.get(n)) for n in names)
+    files = FrameFiles(
+        FrameFile(inside(folder, n, model), T_source_camera=poses.get(n), lens=own.get(n)) for n in names
+    )
     intrinsics = (shared.fx, shared.fy, shared.cx, shared.cy)
     notes = [
         f"camera and poses of {model.relative_to(root) if model != root else model.name}, lengths as the model has"

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from list3r.frames.layout import (
     FolderLayout,
-    FrameFile,
     Optics,
     inside,
     pose_matrix,
@@ -22,6 +21,7 @@ from list3r.frames.layout import (
     read_numbers,
     read_text,
 )
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.readers.tum import poses_at
 from list3r.memory.errors import OptionError, SourceError
@@ -47,7 +47,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     times_s = 1e-9 * np.array([time for time, _ in named], np.float64)
     truth = next((p for name in _TRUTHS if (p := base / name / "data.csv").is_file()), None)
     poses = [None] * len(named) if truth is None else _poses(truth, times_s, T_body_cam)
-    files = tuple(
+    files = FrameFiles(
         FrameFile(inside(base / "cam0" / "data", name, listing), T_source_camera=pose, time_s=float(time))
         for (_, name), time, pose in zip(named, times_s, poses, strict=True)
     )

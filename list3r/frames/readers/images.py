@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from list3r.frames.layout import (
     IMAGE_ENDINGS,
     FolderLayout,
-    FrameFile,
     Optics,
     natural_key,
     pose_matrix,
     read_calibration,
     read_numbers,
 )
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions
 
 _COLOR_FOLDERS = ("images", "rgb", "color", "colour", "image")
@@ -32,7 +32,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     depths = {p.stem: p for p in _listed(root / "depth", (".png", ".npy", ".tif", ".tiff"))} if folder != root else {}
     pose_files = {p.stem: p for p in _listed(root / "pose", (".txt",))} if folder != root else {}
     poses, notes = _poses(root, len(colors))
-    files = tuple(
+    files = FrameFiles(
         FrameFile(color, depths.get(color.stem), None if pose is not None else pose_files.get(color.stem), pose)
         for color, pose in zip(colors, poses, strict=True)
     )

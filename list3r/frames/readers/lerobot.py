@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
 from list3r.frames.layout import FolderLayout, Optics
+from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.depth_code import DepthCode, bits_of, metres_of
@@ -56,7 +57,7 @@ class LeRobotSource:
             code = DepthCode.of(filmed[depth].get("info"))
             self._depth = _DepthVideo(file, round(begins_s * fps), episode.length, code)
         stored = self._video.stored_size
-        optics, said = merge_optics(FolderLayout("lerobot", (), Optics(depth_scale=1.0)), options)
+        optics, said = merge_optics(FolderLayout("lerobot", FrameFiles(), Optics(depth_scale=1.0)), options)
         size = None if self._depth is None else self._depth.size
         self._rig = build_rig(optics, stored, size, options.max_depth_m, _side(options, depth is not None))
         used = {color} if depth is None else {color, depth}

@@ -6,7 +6,7 @@ up, pixel centres lie at whole numbers, depth is in millimetres unless `depth_un
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.base import Camera
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, natural_key, pose_matrix, read_json
+from list3r.frames.layout import FolderLayout, Optics, inside, natural_key, pose_matrix, read_json
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
 from list3r.memory.errors import OptionError, SourceError
@@ -40,7 +41,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     model = str(rows[0].get("camera_model", content.get("camera_model", ""))).upper()
     if model not in (*_PINHOLE, _FISHEYE):
         raise SourceError(f"{path} states a {model} camera; undistort the pictures first, for instance with COLMAP")
-    files = tuple(_file(root, path, row) for row in rows)
+    files = FrameFiles(_file(root, path, row) for row in rows)
     fisheye = model == _FISHEYE and options.distortion is None
     intrinsics, distortion, size, spread = _camera(path, content, rows, options, _LENS[fisheye])
     notes = ["poses and cameras of transforms.json"]
@@ -49,7 +50,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         what = "every picture is carried to their median" if carried else "their median serves all of them"
         notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: {what}")
         if carried:
-            files, distortion, fisheye = _with_lenses(files, content, rows, fisheye), (), False
+            files, distortion, fisheye = FrameFiles(_with_lenses(files, content, rows, fisheye)), (), False
     units = _units_per_metre(path, content)
     optics = Optics(intrinsics, distortion, depth_scale=units, intrinsics_size=size, fisheye=fisheye)
     if intrinsics is not None and not distortion and not fisheye:  # depth of another size has the same camera
@@ -132,7 +133,7 @@ def _camera(
 
 
 def _with_lenses(
-    files: tuple[FrameFile, ...], content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], fisheye: bool
+    files: Iterable[FrameFile], content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], fisheye: bool
 ) -> tuple[FrameFile, ...]:
     """The files, each with the camera that its frame states for pictures of a size."""
     out = []

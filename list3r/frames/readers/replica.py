@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from list3r.frames.layout import (
     IMAGE_ENDINGS,
     FolderLayout,
-    FrameFile,
     Optics,
     natural_key,
     pose_matrix,
     read_json,
     read_numbers,
 )
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.memory.errors import OptionError, SourceError
 
@@ -36,7 +36,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         return None
     depths = {n[len("depth") :].split(".")[0]: results / n for n in names if n.startswith("depth")}
     poses, notes = _poses(base / "traj.txt", colors)
-    files = tuple(
+    files = FrameFiles(
         FrameFile(results / name, depths.get(name[len("frame") :].split(".")[0]), None, pose)
         for name, pose in zip(colors, poses, strict=True)
     )

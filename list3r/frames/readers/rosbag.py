@@ -19,6 +19,7 @@ from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint
 from list3r.frames.layout import FolderLayout, Optics
+from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.bag_chunks import bound_rosbags
@@ -91,7 +92,7 @@ class BagSource:
         world = tree.world_of(color.frame)
         self._poses = tree.poses(color.frame, world, self._times_s) if world else [None] * len(pairs)
         self._chosen = select(self._times_s, options, path, clock=True, video=False)
-        merged, said = merge_optics(FolderLayout("rosbag", (), optics), options)
+        merged, said = merge_optics(FolderLayout("rosbag", FrameFiles(), optics), options)
         size = None if depth is None else read_depth(depth.first).shape
         stored = read_color(color.first).shape[:2]
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)

@@ -14,7 +14,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, natural_key, pose_matrix, read_numbers
+from list3r.frames.layout import FolderLayout, Optics, natural_key, pose_matrix, read_numbers
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.recordings.stored import CodedArray, FileSlice
 from list3r.memory.errors import SourceError
@@ -35,7 +36,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if not all((root / name).is_dir() for name in ("color", "depth", "pose", "intrinsic")):
         return None
     colors = sorted((root / "color").glob("*.jpg"), key=lambda p: natural_key(p.name))
-    files = tuple(
+    files = FrameFiles(
         FrameFile(color, root / "depth" / f"{color.stem}.png", root / "pose" / f"{color.stem}.txt") for color in colors
     )
     cameras = [_matrix_file(root / "intrinsic" / f"intrinsic_{name}.txt") for name in ("color", "depth")]
@@ -70,7 +71,7 @@ def find_file(path: Path, options: SourceOptions) -> FolderLayout:
     optics = Optics(
         optics.intrinsics, (), optics.depth_intrinsics, _rigid_or_identity(T_color_depth), units, (height, width)
     )
-    return FolderLayout("scannet", tuple(files), optics, "depth", None, tuple(notes), upright_tags=False)
+    return FolderLayout("scannet", FrameFiles(files), optics, "depth", None, tuple(notes), upright_tags=False)
 
 
 def _frames(file: BinaryIO, path: Path, count: int, size: tuple[int, int]) -> tuple[list[FrameFile], bool]:

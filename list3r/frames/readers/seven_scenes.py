@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, natural_key, read_numbers
+from list3r.frames.layout import FolderLayout, Optics, natural_key, read_numbers
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.memory.errors import SourceError
 
@@ -32,7 +33,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         return None
     names = sorted((p.name for p in folder.iterdir() if _COLOR.match(p.name)), key=natural_key)
     present = {p.name for p in folder.iterdir()}
-    files = tuple(_files(folder, name, present) for name in names)
+    files = FrameFiles(_files(folder, name, present) for name in names)
     intrinsics, note = _file_intrinsics(folder, root)
     if _is_kinect(intrinsics):
         optics = Optics(KINECT_COLOR, KINECT_DISTORTION, KINECT_DEPTH, KINECT_T_COLOR_DEPTH, 1000.0)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, inside, read_text
+from list3r.frames.layout import FolderLayout, Optics, inside, read_lines
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import SourceError
 
@@ -16,12 +18,13 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     path = root / LIST
     if not path.is_file():
         return None
-    whole, _, _ = read_text(path).rpartition("\n")
-    files: list[FrameFile] = []
-    for number, line in enumerate(whole.splitlines(), start=1):
+    return FolderLayout("live", FrameFiles(_files(root, path)), Optics(options.intrinsics))
+
+
+def _files(root: Path, path: Path) -> Iterator[FrameFile]:
+    for number, line in enumerate(read_lines(path, whole=True), start=1):
         words = line.split()
         try:
-            files.append(FrameFile(inside(root, words[1], path), time_s=float(words[0])))
+            yield FrameFile(inside(root, words[1], path), time_s=float(words[0]))
         except (IndexError, ValueError):
             raise SourceError(f"{path}: line {number} is not seconds and a name; mend or remove it") from None
-    return FolderLayout("live", tuple(files), Optics(options.intrinsics))

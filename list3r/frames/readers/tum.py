@@ -8,6 +8,10 @@ from __future__ import annotations
 
 import math
 import re
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +21,12 @@ from scipy.spatial.transform import Rotation
 from list3r.frames.layout import (
     MAX_LENGTH_M,
     FolderLayout,
-    FrameFile,
     Optics,
+    iter_numbers,
     read_calibration,
     read_lines,
-    read_numbers,
 )
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
 from list3r.memory.errors import SourceError
 
@@ -30,6 +34,9 @@ MAX_PAIR_GAP_S = 0.02
 """Colour and depth this far apart still make a frame (the benchmark's own tools)."""
 MAX_POSE_BRACKET_S = 0.1
 """Poses are interpolated over gaps up to this; over longer ones a hand does not move evenly."""
+
+_AT_A_TIME = 4096
+"""Poses that are interpolated together."""
 
 _ROS_DEFAULT: Intrinsics = (525.0, 525.0, 319.5, 239.5)
 _PUBLISHED: dict[str, tuple[Intrinsics, tuple[float, ...]]] = {
@@ -44,25 +51,25 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout, or None when the folder has another. Raises `SourceError` for lists that cannot be read."""
     if not (root / "rgb.txt").is_file():
         return None
-    color_times, color_names = _read_list(root / "rgb.txt")
+    colors = _read_list(root / "rgb.txt")
     notes: list[str] = []
     if (root / "depth.txt").is_file():
-        depth_times, depth_names = _read_list(root / "depth.txt")
-        pairs = associate(color_times, depth_times, MAX_PAIR_GAP_S)
+        depths = _read_list(root / "depth.txt")
+        pairs = associate(colors.times_s, depths.times_s, MAX_PAIR_GAP_S)
         if not len(pairs):
             raise SourceError(f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; mend depth.txt")
-        if len(pairs) < len(color_times):
-            alone = len(color_times) - len(pairs)
-            notes.append(f"{alone} of {len(color_times)} colour images have no depth image in time and are left out")
-        depths = [root / depth_names[d] for _, d in pairs]
+        if len(pairs) < len(colors):
+            alone = len(colors) - len(pairs)
+            notes.append(f"{alone} of {len(colors)} colour images have no depth image in time and are left out")
+        named: Iterator[Path | None] = (root / depths.name(d) for d in pairs[:, 1])
         picked = pairs[:, 0]
     else:
-        picked, depths = np.arange(len(color_times)), [None] * len(color_times)
-    times = color_times[picked]
+        picked, named = np.arange(len(colors)), repeat(None, len(colors))
+    times = colors.times_s[picked]
     poses = _poses(root / "groundtruth.txt", times)
-    files = tuple(
-        FrameFile(root / color_names[c], depth, None, pose, float(time))
-        for c, depth, pose, time in zip(picked, depths, poses, times, strict=True)
+    files = FrameFiles(
+        FrameFile(root / colors.name(c), depth, None, pose, float(time))
+        for c, depth, pose, time in zip(picked, named, poses, times, strict=True)
     )
     intrinsics, distortion, camera_note = _camera(root, options)
     optics = Optics(intrinsics, distortion, depth_scale=5000.0)
@@ -90,7 +97,6 @@ def poses_at(
     along the shortest arc; otherwise the nearest stamp within `MAX_PAIR_GAP_S` counts. `stamps_s` (N,) ascend,
     `poses_xyzw` (N, 7) are translations in metres and quaternions.
     """
-    rotations = Rotation.from_quat(poses_xyzw[:, 3:])
     after = np.clip(np.searchsorted(stamps_s, times_s), 1, max(1, len(stamps_s) - 1))
     after = np.minimum(after, len(stamps_s) - 1)
     before = np.maximum(after - 1, 0)
@@ -100,9 +106,10 @@ def poses_at(
     known = inside | (np.abs(stamps_s[near] - times_s) <= MAX_PAIR_GAP_S)
     w = np.where(inside & (gap > 0), (times_s - stamps_s[before]) / np.where(gap > 0, gap, 1.0), 0.0)
     first, second = np.where(inside, before, near), np.where(inside, after, near)
-    turn = (rotations[first].inv() * rotations[second]).as_rotvec()
+    rotations, later = (Rotation.from_quat(poses_xyzw[rows, 3:]) for rows in (first, second))
+    turn = (rotations.inv() * later).as_rotvec()
     matrices = np.tile(np.eye(4), (len(times_s), 1, 1))
-    matrices[:, :3, :3] = (rotations[first] * Rotation.from_rotvec(w[:, None] * turn)).as_matrix()
+    matrices[:, :3, :3] = (rotations * Rotation.from_rotvec(w[:, None] * turn)).as_matrix()
     matrices[:, :3, 3] = (1 - w[:, None]) * poses_xyzw[first, :3] + w[:, None] * poses_xyzw[second, :3]
     return [matrix if ok else None for matrix, ok in zip(matrices, known, strict=True)]
 
@@ -114,34 +121,62 @@ def _nearest(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.int64
     return np.where(np.abs(a - b[left]) <= np.abs(b[right] - a), left, right)
 
 
-def _read_list(path: Path) -> tuple[NDArray[np.float64], list[str]]:
-    """Times and file names of a list `timestamp filename`, ascending in time."""
-    rows: list[tuple[float, str]] = []
+@dataclass(frozen=True)
+class _TimedNames:
+    """A list `timestamp filename`, ascending in time."""
+
+    times_s: NDArray[np.float64]
+    names: bytes
+    """One after the other."""
+    ends: NDArray[np.int64]
+    """Where each ends. Shape (N,)."""
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def name(self, k: int) -> str:
+        """Return a name."""
+        return self.names[self.ends[k - 1] if k else 0 : self.ends[k]].decode("utf-8")
+
+
+def _read_list(path: Path) -> _TimedNames:
+    """Return a list. Raises `SourceError`."""
+    times_s, ends, names = array("d"), array("q"), bytearray()
     for number, line in enumerate(read_lines(path), start=1):
         text = line.strip()
         if not text or text.startswith("#"):
             continue
         words = text.split(maxsplit=1)
         try:
-            rows.append((float(words[0]), words[1].strip()))
+            times_s.append(float(words[0]))
+            names += words[1].strip().encode("utf-8")
         except (ValueError, IndexError):
             raise SourceError(f"{path}: line {number} is not 'timestamp filename'; mend or remove it") from None
-    if not rows:
+        ends.append(len(names))
+    if not times_s:
         raise SourceError(f"{path} names no image; is the copy complete?")
-    rows.sort()
-    return np.array([time for time, _ in rows]), [name for _, name in rows]
+    found = _TimedNames(np.frombuffer(times_s), bytes(names), np.frombuffer(ends, np.int64))
+    if np.all(np.diff(found.times_s) > 0):
+        return found
+    rows = sorted((time, found.name(k)) for k, time in enumerate(found.times_s.tolist()))
+    coded = [name.encode("utf-8") for _, name in rows]
+    return _TimedNames(np.array([time for time, _ in rows]), b"".join(coded), np.cumsum([len(n) for n in coded]))
 
 
-def _poses(path: Path, times_s: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
-    if not path.is_file():
-        return [None] * len(times_s)
-    rows = [row for row in read_numbers(path) if len(row) >= 8 and all(math.isfinite(v) for v in row[:8])]
-    rows = [row for row in rows if max(map(abs, row[1:4])) <= MAX_LENGTH_M]
-    table = np.array([row[:8] for row in rows if sum(v * v for v in row[4:8]) > 0.5]).reshape(-1, 8)
+def _poses(path: Path, times_s: NDArray[np.float64]) -> Iterator[NDArray[np.float64] | None]:
+    """Yield the pose at each time, None where there is none."""
+    numbers = array("d")
+    for row in iter_numbers(path) if path.is_file() else ():
+        if len(row) >= 8 and all(map(math.isfinite, row[:8])) and max(map(abs, row[1:4])) <= MAX_LENGTH_M:
+            numbers.extend(row[:8] if sum(v * v for v in row[4:8]) > 0.5 else ())
+    table = np.frombuffer(numbers).reshape(-1, 8)
     if not len(table):
-        return [None] * len(times_s)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    return poses_at(times_s, table[:, 0], table[:, 1:])
+        yield from repeat(None, len(times_s))
+        return
+    if np.any(np.diff(table[:, 0]) < 0):
+        table = table[np.argsort(table[:, 0], kind="stable")]
+    for first in range(0, len(times_s), _AT_A_TIME):
+        yield from poses_at(times_s[first : first + _AT_A_TIME], table[:, 0], table[:, 1:])
 
 
 def _camera(root: Path, options: SourceOptions) -> tuple[Intrinsics, tuple[float, ...], tuple[str, ...]]:

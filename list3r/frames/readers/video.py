@@ -37,7 +37,8 @@ class VideoSource:
         self._path, self._options = path, options
         self._stamps = list_stamps(path)
         self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
-        times_s = np.array([self._time_s(k) for k in range(len(self._stamps))])
+        count = len(self._stamps)
+        times_s = self._stamps.times_s(0, count) if self._stamps.clock else np.arange(count) / self._fps
         self._chosen = select(times_s, options, path, clock=self._stamps.clock, video=True)
         self._upright, self._rig = self._first()
         self._info = self._describe()
@@ -192,6 +193,7 @@ class VideoSource:
             notes=tuple(notes),
             missing=tuple(missing),
             image_size=rig.color_size,
+            stored_size=rig.stored_size,
             camera_guess=None if guess is None else centred_camera(guess, rig),
         )
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import SourceInfo
+from list3r.frames.base import FrameSource
 from list3r.frames.options import SourceOptions
-from list3r.frames.source import open_source
 from list3r.memory.records import SessionCamera
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
@@ -43,10 +41,9 @@ def with_camera(
 
 
 def estimated_camera(
-    source: str | Path,
+    source: FrameSource,
     options: SourceOptions,
     settings: BuildSettings,
-    info: SourceInfo,
     look: Callable[[str, int, int], None] | None = None,
     whole: VideoMap | None = None,
 ) -> SessionCamera | None:
@@ -55,17 +52,18 @@ def estimated_camera(
     `look` hears ("camera", windows of the video done, in all). Where the focal length is given and the `whole` video
     is mapped, that map tells the rest.
     """
-    name = entry(settings.reconstruction).calibration
+    name, info = entry(settings.reconstruction).calibration, source.info
     told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
     if not name or (info.camera is not None and told):
         return None
     with threadpool_limits(1):
         progress = None if look is None else (lambda done, total: look("camera", done, total))
         module = import_module(f"list3r.reconstruction.{name}")
-        opened, size = open_source(source, options), _stored_size(source, options)
-        stored_px = max(size) / max(opened.info.image_size or size)
+        size = info.stored_size or info.image_size
+        assert size is not None
+        stored_px = max(size) / max(info.image_size or size)
         if whole is None:
-            found = module.calibrate(opened, settings.models.sfm, progress, stored_px=stored_px)
+            found = module.calibrate(source, settings.models.sfm, progress, stored_px=stored_px)
         else:
             found = module.calibrate_by_map(info.camera, whole.keyframes, settings.models.sfm, stored_px)
     full = found.camera.resized(*size)
@@ -91,10 +89,3 @@ def camera_notes(store: Store, session: int) -> tuple[str, ...]:
     """What the user should know of the camera that was estimated."""
     known = store.sessions.get(session).camera
     return () if known is None else known.notes
-
-
-def _stored_size(source: str | Path, options: SourceOptions) -> tuple[int, int]:
-    """(height, width) of pictures as stored, which may be larger than the frames handed out."""
-    whole = open_source(source, replace(options, max_side=0)).info
-    assert whole.image_size is not None
-    return whole.image_size

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_numbers
+from list3r.frames.layout import FolderLayout, Optics, read_numbers
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.readers.tum import poses_at
 from list3r.memory.errors import OptionError, SourceError
@@ -29,7 +30,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     times_s = np.array([_time_s(p) for p in colors])
     if not len(colors) or np.isnan(times_s).any():
         raise SourceError(f"{root / 'lowres_wide'} holds no pictures named SCAN_SECONDS.png; is the copy complete?")
-    files = tuple(
+    files = FrameFiles(
         FrameFile(
             color,
             _there(root / "lowres_depth" / color.name),

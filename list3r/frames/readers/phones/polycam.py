@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, pose_matrix, read_json
+from list3r.frames.layout import FolderLayout, Optics, pose_matrix, read_json
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit
 from list3r.memory.errors import OptionError, SourceError
@@ -34,7 +35,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if not len(known):
         raise SourceError(f"{cameras} states the camera of no picture; is the copy complete?")
     fx, fy, cx, cy, width, height = np.median(known, axis=0).tolist()
-    files = tuple(
+    files = FrameFiles(
         FrameFile(
             color,
             _there(base / "depth" / f"{color.stem}.png"),

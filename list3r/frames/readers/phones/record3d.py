@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_TEXT_BYTES
-from list3r.frames.layout import FolderLayout, FrameFile, Optics, read_json
+from list3r.frames.layout import FolderLayout, Optics, read_json
+from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
 from list3r.frames.recordings.stored import CodedArray, Stored, ZipMember
@@ -96,7 +97,7 @@ def _layout(
         notes.append(f"{lost} of {len(numbers)} frames come without a pose")
     return FolderLayout(
         "record3d",
-        tuple(files),
+        FrameFiles(files),
         optics,
         "color",
         intrinsics,

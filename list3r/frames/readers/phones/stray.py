@@ -6,6 +6,7 @@ camera for pictures as stored, poses camera-to-world with OpenCV's axes already,
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def _matrix(path: Path) -> Intrinsics:
 def _odometry(path: Path) -> dict[int, NDArray[np.float64]]:
     """Poses by frame number. Raises `SourceError` for rows that are no numbers."""
     poses: dict[int, NDArray[np.float64]] = {}
-    for number, line in enumerate(read_lines(path)[1:], start=2):
+    for number, line in enumerate(islice(read_lines(path), 1, None), start=2):
         words = [word.strip() for word in line.split(",")]
         if len(words) < 9:
             continue
