@@ -71,12 +71,18 @@ def wait_for(feed: StreamFeed) -> FeedState:
     return feed.state()
 
 
+def admitted(feed: StreamFeed) -> FeedState:
+    wait_for(feed)
+    assert feed.admit() and not feed.admit()
+    feed.close()
+    return feed.state()
+
+
 def test_a_lost_connection_is_made_again_and_leaves_a_cut(tmp_path: Path) -> None:
     told: list[str] = []
     with served(pictures(24), cut_after=9) as address:
         feed = StreamFeed(address, tmp_path / "f", QUICK, None, told.append)
-        state = wait_for(feed)
-        feed.close()
+        state = admitted(feed)
     assert state.ended and state.reconnects >= 2 and len(told) >= 2
     assert state.count == state.received and 15 <= state.count <= 24
     assert len(state.cuts) >= 1 and all(0 < c < state.count for c in state.cuts)
@@ -86,13 +92,22 @@ def test_a_lost_connection_is_made_again_and_leaves_a_cut(tmp_path: Path) -> Non
     assert all(a < b for a, b in pairwise(times))
 
 
-def test_what_cannot_wait_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_the_newest_wait_and_the_others_are_dropped_and_counted(tmp_path: Path) -> None:
     with served(pictures(30)) as address:
         settings = LiveSettings(most_waiting=10, retry_s=0.5, pause_s=0.05, silence_s=1.0)
         feed = StreamFeed(address, tmp_path / "f", settings, None, lambda line: None)
+        while feed.state().received < 5:
+            time.sleep(0.005)
+        assert feed.admit()
+        first = feed.state().count
         state = wait_for(feed)
-        feed.close()
-    assert state.count == 10 and state.dropped == state.received - 10 > 0
+        assert (state.count, state.waiting) == (first, 10)
+        state = admitted(feed)
+    assert (state.count, state.waiting) == (first + 10, 0) and state.cuts == (first,)
+    assert state.dropped == state.received - state.count > 0
+    assert len(list((tmp_path / "f/rgb").iterdir())) == state.count
+    newest = next(open_source(tmp_path / "f").read(state.count - 1, state.count))
+    assert int(newest.color[0, 0, 0]) == pytest.approx(8 * 29 % 250, abs=3)  # type: ignore[union-attr]
 
 
 def test_chunks_are_those_of_a_plan_once_all_is_there() -> None:

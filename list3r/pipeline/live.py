@@ -74,7 +74,6 @@ class LiveSession:
             if part.posed.any():
                 target.keep()
         self.done, self.stop = self.done + 1, max(self.stop, span.stop)
-        self.feed.taken(self.stop)
         late_s = time.monotonic() - self.feed.arrived_s(span.stop - 1)
         self.latencies_s = (*self.latencies_s, round(late_s, 2))
 
@@ -199,6 +198,7 @@ def _feed(source: str, spool: Path, options: SourceOptions, how: LiveSettings, w
 def _await(feed: Feed, count: int, how: LiveSettings, interrupted: threading.Event, source: str | Path) -> None:
     """Wait until so many frames are there, or all that come. Raises `SourceError` where none does."""
     while True:
+        feed.admit()
         state = feed.state()
         if state.count >= count or (state.ended and state.count):
             return
@@ -228,10 +228,10 @@ def _begun(store: Store, feed: Feed, job: Job, options: SourceOptions, watch: Wa
     begun = replace(options, start=0, stop=max(_FIRST_FRAMES, feed.state().count))
     first = replace(job, options=begun, source=feed.folder)
     step = settled_step(store, session, first, watch)
-    told = with_camera(
-        store, session, begun, lambda: estimated_camera(feed.folder, begun, job.settings, job.info, watch.look)
-    )
+    told = with_camera(store, session, begun, lambda: estimated_camera(first.frames(), begun, job.settings, watch.look))
     whole = replace(told, start=options.start, stop=options.stop)
+    chunks = job.settings.chunks.times(step)
+    feed.hold(2 * chunks.length - chunks.overlap)
     return LiveSession(store, session, job, feed, whole, step)
 
 
@@ -244,17 +244,17 @@ def _follow(ours: LiveSession, target: Target, how: LiveSettings, interrupted: t
             if span is not None:
                 ours.add(span, pool, target)
                 watch.show(ours.stop, state.count)
-            elif state.ended:
-                return
-            else:
+            elif not ours.feed.admit():
+                if state.ended:
+                    return
                 time.sleep(how.poll_s)
     ours.feed.close()
 
 
 def _report(ours: LiveSession, state: FeedState, started: float) -> BuildReport:
     spans = ready_spans(state, ours.job.settings.chunks.times(ours.step))[: ours.done]
-    report = build_report(ours.store, Plan(ours.session, spans, set(), []), started)
-    waiting = max(0, state.count - ours.stop)
+    report = build_report(ours.store, Plan(ours.session, spans, set()), started)
+    waiting = max(0, state.count + state.waiting - ours.stop)
     live = LiveReport(
         received=state.received,
         thinned=state.thinned,

@@ -12,8 +12,8 @@ from typing import Protocol
 class LiveSettings:
     """How a live source is followed."""
 
-    most_waiting: int = 300
-    """Frames that wait for the chunks before them; what comes beyond is dropped until there is room again."""
+    most_waiting: int | None = None
+    """Frames of a stream that wait while a chunk is worked on; of more the oldest are dropped. None: two chunks."""
     retry_s: float = 30.0
     """A lost connection is tried again for so long after its last picture; then the session ends."""
     pause_s: float = 0.5
@@ -41,7 +41,9 @@ class FeedState:
     thinned: int = 0
     """Frames that came sooner than is asked for."""
     dropped: int = 0
-    """Frames that came while too many were waiting."""
+    """Frames that newer ones took the place of, because too many were waiting."""
+    waiting: int = 0
+    """Frames that have come and are not let in."""
     reconnects: int = 0
     reason: str = ""
     """Why it ended, for people."""
@@ -59,8 +61,12 @@ class Feed(Protocol):
         """What has come so far."""
         ...
 
-    def taken(self, position: int) -> None:
-        """Say that frames before a position are worked off."""
+    def admit(self) -> bool:
+        """Let in the frames that wait, because nothing is left to do; whether there were any."""
+        ...
+
+    def hold(self, frames: int) -> None:
+        """Say how many frames may wait, unless the settings do."""
         ...
 
     def arrived_s(self, position: int) -> float:

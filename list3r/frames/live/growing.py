@@ -43,7 +43,11 @@ class FolderFeed:
         self._state = replace(self._state, count=count, ended=ended, received=self._found, reason=reason)
         return self._state
 
-    def taken(self, position: int) -> None:
+    def admit(self) -> bool:
+        """Frames of a folder do not wait to be let in."""
+        return False
+
+    def hold(self, frames: int) -> None:
         """Nothing is dropped from a folder."""
 
     def arrived_s(self, position: int) -> float:

@@ -1,15 +1,18 @@
 """A webcam or a network stream: its pictures are kept in a folder as they come, until the chunks have used them.
 
-What comes while too many frames wait is dropped and counted, whole stretches rather than every other frame, because
-the camera can be followed through a stretch. A lost connection is tried again.
+While a chunk is worked on the newest pictures wait, and those before them are dropped and counted: whole stretches
+rather than every other frame, because the camera can be followed through a stretch (decision 0091). A lost connection
+is tried again.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import urlsplit, urlunsplit
 
@@ -40,6 +43,20 @@ def without_secrets(source: str) -> str:
     return urlunsplit((parts.scheme, host, parts.path, "", ""))
 
 
+_MOST_WAITING = 300
+"""Before it is known how long chunks are."""
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A frame that is not let in."""
+
+    name: str
+    came_s: float
+    gap: bool
+    """Whether frames are missing before it."""
+
+
 class StreamFeed:
     """A `Feed` of a stream; a thread takes its pictures in."""
 
@@ -49,7 +66,8 @@ class StreamFeed:
         self._least_gap_s = 0.0 if fps is None else 0.9 / fps
         self._lock = threading.Lock()
         self._state = FeedState(0, (), False)
-        self._taken, self._gap, self._arrived = 0, False, list[float]()
+        self._waiting, self._most = deque[_Waiting](), settings.most_waiting or _MOST_WAITING
+        self._gap, self._last_s, self._arrived = False, -math.inf, list[float]()
         self._stop = threading.Event()
         (folder / "rgb").mkdir(parents=True)
         self._thread = threading.Thread(target=self._run, daemon=True, name="stream")
@@ -60,10 +78,23 @@ class StreamFeed:
         with self._lock:
             return self._state
 
-    def taken(self, position: int) -> None:
-        """Say that frames before a position are worked off."""
+    def hold(self, frames: int) -> None:
+        """Say how many frames may wait, unless the settings do."""
         with self._lock:
-            self._taken = max(self._taken, position)
+            self._most = self._settings.most_waiting or frames
+
+    def admit(self) -> bool:
+        """Let in the frames that wait, because nothing is left to do; whether there were any."""
+        with self._lock, (self.folder / LIST).open("a", encoding="ascii") as file:
+            before = self._state
+            cuts, begun_s = before.cuts, (self._arrived or [w.came_s for w in self._waiting] or [0.0])[0]
+            for number, frame in enumerate(self._waiting, start=before.count):
+                cuts += (number,) if frame.gap and number else ()
+                file.write(f"{frame.came_s - begun_s:.6f} {frame.name}\n")
+            self._arrived += [frame.came_s for frame in self._waiting]
+            self._waiting.clear()
+            self._state = replace(before, count=len(self._arrived), cuts=cuts, waiting=0)
+            return self._state.count > before.count
 
     def arrived_s(self, position: int) -> float:
         """When a frame came, seconds of `time.monotonic`."""
@@ -134,24 +165,21 @@ class StreamFeed:
                 yield np.asarray(image.to_ndarray(format="rgb24"), np.uint8), finite
 
     def _keep(self, image: NDArray[np.uint8], now: float) -> None:
-        """Write a picture, unless too many wait or it comes too soon after the last one."""
+        """Write a picture, unless it comes too soon after the last one; of too many that wait the oldest goes."""
+        received, thinned, dropped = self._state.received + 1, self._state.thinned, self._state.dropped
+        soon = not self._gap and now - self._last_s < self._least_gap_s
+        frame = _Waiting(f"rgb/{received:08d}.jpg", now, self._gap)
+        if soon:
+            thinned += 1
+        else:
+            (self.folder / frame.name).write_bytes(jpeg(image))
+            self._last_s, self._gap = now, False
         with self._lock:
-            number, waiting = self._state.count, self._state.count - self._taken
-            received = self._state.received + 1
-            if self._arrived and not self._gap and now - self._arrived[-1] < self._least_gap_s:
-                self._state = replace(self._state, received=received, thinned=self._state.thinned + 1)
-                return
-            if waiting >= self._settings.most_waiting:
-                self._gap = True
-                self._state = replace(self._state, received=received, dropped=self._state.dropped + 1)
-                return
-        name = f"rgb/{number:08d}.jpg"
-        (self.folder / name).write_bytes(jpeg(image))
-        begun = self._arrived[0] if self._arrived else now
-        with (self.folder / LIST).open("a", encoding="ascii") as file:
-            file.write(f"{now - begun:.6f} {name}\n")
-        with self._lock:
-            self._arrived.append(now)
-            cuts = (*self._state.cuts, number) if self._gap and number else self._state.cuts
-            self._gap = False
-            self._state = replace(self._state, count=number + 1, cuts=cuts, received=received)
+            if not soon:
+                self._waiting.append(frame)
+            while len(self._waiting) > self._most:
+                (self.folder / self._waiting.popleft().name).unlink(missing_ok=True)
+                self._waiting[0] = replace(self._waiting[0], gap=True)
+                dropped += 1
+            waiting = len(self._waiting)
+            self._state = replace(self._state, received=received, thinned=thinned, dropped=dropped, waiting=waiting)
