@@ -4,7 +4,8 @@ python benchmarks/bags.py --gigabytes 1 --json benchmarks/results/bags.json
 
 Raw pictures and depth of 640 x 480 with cameras and `/tf`, interleaved by time, are written by `rosbags` as mcap and as
 db3. A process of its own opens the recording and reads all frames; the disk's own speed is that of reading the file's
-bytes just before (it may lie in the system's cache both times).
+bytes just before (it may lie in the system's cache both times). Speeds by processor time say what the reader costs on
+a machine that is busy with other work.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ READ = """
 import resource, sys, time
 from list3r.frames.base import Frame
 from list3r.frames.source import open_source
-started = time.monotonic()
+started, begun = time.monotonic(), time.process_time()
 source = open_source(sys.argv[1])
-opened, first = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+opened, listed, first = time.monotonic(), time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 count = sum(isinstance(f, Frame) for f in source.read(0, source.info.frame_count))
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print(opened - started, time.monotonic() - opened, first / 1024, peak / 1024, count)
+cpu = listed - begun, time.process_time() - listed
+print(opened - started, time.monotonic() - opened, *cpu, first / 1024, peak / 1024, count)
 """
 
 
@@ -102,11 +104,20 @@ def read(path: Path) -> dict[str, Any]:
                 pass
     plain_s = time.monotonic() - started
     out = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True).stdout
-    opened_s, read_s, opened_mb, peak_mb, frames = (float(v) for v in out.split())
+    opened_s, read_s, opened_cpu_s, read_cpu_s, opened_mb, peak_mb, frames = (float(v) for v in out.split())
+    begun = time.process_time()
+    for file in path.iterdir():
+        with file.open("rb") as data:
+            while data.read(2**22):
+                pass
+    plain_cpu_s = time.process_time() - begun
     return {
         "gigabytes": round(size / 1e9, 3),
         "frames": int(frames),
         "bytes_mb_s": round(size / 1e6 / plain_s),
+        "bytes_cpu_mb_s": round(size / 1e6 / plain_cpu_s),
+        "list_cpu_mb_s": round(size / 1e6 / opened_cpu_s),
+        "read_cpu_mb_s": round(size / 1e6 / read_cpu_s),
         "list_s": round(opened_s, 1),
         "list_mb_s": round(size / 1e6 / opened_s),
         "read_s": round(read_s, 1),

@@ -54,8 +54,17 @@ def bound_rosbags() -> None:
     if zstd is not None:
         known["zstd"] = bounded(zstd.ZstdDecompressor)
         second.zstd = _Zstd(zstd, known["zstd"])  # type: ignore[assignment, attr-defined]
+    storage_mcap.read_exact = _read_exact  # type: ignore[assignment]
     for table in (first.decompressors, storage_mcap.DECOMPRESSORS):
         table.update({name: unpack for name, unpack in known.items() if name in table})
+
+
+def _read_exact(file: BinaryIO, size: int) -> bytes:
+    """Return so many bytes. Raises `ValueError` for more than any record has, before it asks for them."""
+    data = file.read(size) if size <= MOST_BYTES else b""
+    if len(data) != size:
+        raise ValueError(f"a record states {size} bytes, and {len(data)} are there")
+    return data
 
 
 class _Zstd:
