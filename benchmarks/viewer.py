@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
+import resource
 import tempfile
 import time
 from pathlib import Path
@@ -24,10 +25,16 @@ import list3r
 
 if TYPE_CHECKING:
     from list3r.viewer.app import Viewer
+    from list3r.viewer.clouds import PageClouds
     from tests.browser import Browser
 
 TURNED_S = 20.0
-COUNT_FRAMES = "window.drawn = []; (function next(at) { window.drawn.push(at); requestAnimationFrame(next) })(0)"
+COUNT_FRAMES = """
+const clear = WebGL2RenderingContext.prototype.clear;
+WebGL2RenderingContext.prototype.clear = function(...words) { window.drew = true; return clear.apply(this, words) };
+(function next(at) { if (window.drew) window.drawn.push(at); window.drew = false; requestAnimationFrame(next) })(0)
+"""
+"""Notes the times of the frames in which the scene was drawn."""
 
 
 def main() -> None:
@@ -49,6 +56,7 @@ def main() -> None:
             began = time.process_time()
             viewer = Viewer(memory, ViewerSettings(0))
             told["start_cpu_s"] = round(time.process_time() - began, 1)
+            told["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
             page = Browser(Path(folder) / "profile")
             try:
                 told |= measure(page, viewer, words.picture)
@@ -66,9 +74,14 @@ def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, An
     page.wait(lambda: "Click a thing, or search for one." in page.text(), 300)
     page.wait(viewer.server.get_clients, 300)
     loaded = time.monotonic() - began
-    time.sleep(20.0)  # the points come after the page
-    told = {"load_s": round(loaded, 1), "overview_points": len(viewer._layers.shown.points), **turn(page)}
+    page.wait(lambda: [p for p in viewer._pages.values() if p.settled], 300)
+    (points,) = viewer._pages.values()
+    told = {"load_s": round(loaded, 1), "shown_s": round(time.monotonic() - began, 1)}
+    told |= {"page_draws_points_a_s": round(1 / (points.seconds_a_point or 1e-9)), "at_rest": drawn(points, "/fine/")}
+    page.run(f"window.drawn = []; {COUNT_FRAMES}")
+    told |= {"moving": drawn(points, "/coarse/"), **turn(page)}
     print(told, flush=True)
+    time.sleep(5.0)
     began = time.monotonic()
     page.fill("Find", "Stuhl")
     page.press("Search")
@@ -80,9 +93,14 @@ def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, An
     return {**told, "console_errors": page.errors}
 
 
+def drawn(points: PageClouds, level: str) -> int:
+    """How many points one level of the page has."""
+    return sum(len(n.points) for name, n in points._nodes.items() if name.startswith(level) and hasattr(n, "points"))
+
+
 def turn(page: Browser) -> dict[str, float]:
     """Turn the camera with the mouse; frames a second, the longest wait for one and what a frame costs."""
-    page.run(COUNT_FRAMES)
+    page.run("window.drawn = []")
     used, began, step = cpu_seconds(page), time.monotonic(), 0
     page.call("Input.dispatchMouseEvent", type="mousePressed", x=400, y=400, button="left", clickCount=1)
     while time.monotonic() - began < TURNED_S or (page.run("window.drawn.length") < 5 and step < 1000):
@@ -98,6 +116,7 @@ def turn(page: Browser) -> dict[str, float]:
         "median_frame_ms": round(gaps[len(gaps) // 2]),
         "longest_frame_ms": round(gaps[-1]),
         "cpu_s_a_frame": round(spent / len(gaps), 3),
+        "cores_used": round(spent / lasted, 2),
         "load_average": round(os.getloadavg()[0], 1),
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 
 import list3r
 from list3r.cli.app import run
+from list3r.memory.geometry import OrientedBox
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.store.store import Store
 from tests.conftest import small_picture, write_small_room
@@ -27,7 +29,8 @@ from websockets.sync.client import connect
 
 from list3r.viewer.app import Viewer, ViewerSettings
 from list3r.viewer.beside import SideBySide
-from list3r.viewer.layers import LayerSettings
+from list3r.viewer.box_lines import thin_lines
+from list3r.viewer.clouds import FINE, CloudSettings
 from list3r.viewer.link import ViewState
 from list3r.viewer.world import (
     COLOR_MODES,
@@ -74,31 +77,40 @@ def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---------------------------------------------------------------------------------------------- what is shown
 
 
-def cloud_of(counts: list[int]) -> ShownCloud:
-    owner = np.repeat(np.arange(len(counts)), counts)
-    rank = np.concatenate([np.arange(n) for n in counts]) if counts else np.zeros(0, int)
-    return ShownCloud(np.zeros((len(owner), 3), np.float32), np.zeros((len(owner), 3), np.uint8), owner, rank)
-
-
 @given(st.lists(st.integers(1, 200), min_size=1, max_size=12), st.integers(1, 500))
 def test_the_overview_keeps_its_bound_and_small_things(counts: list[int], most: int) -> None:
-    kept = overview(cloud_of(counts), most)
-    of_each = [int(kept[np.repeat(np.arange(len(counts)), counts) == n].sum()) for n in range(len(counts))]
-    assert kept.sum() <= max(most, 0) + len(counts)
+    had = np.array(counts)
+    of_each = overview(had, most)
+    assert of_each.sum() <= max(most, 0) + len(counts) and (of_each <= had).all()
     if sum(counts) <= most:
-        assert kept.all()
-    shares = [k / n for k, n in zip(of_each, counts, strict=True)]
+        assert (of_each == had).all()
+    shares = of_each / had
     order = np.argsort(counts)
-    assert all(shares[a] >= shares[b] - 1 / counts[a] - 1 / counts[b] for a, b in itertools.pairwise(order))
+    assert (
+        all(shares[a] >= shares[b] - 1 / counts[a] - 1 / counts[b] for a, b in itertools.pairwise(order))
+        and of_each.all()
+    )
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=8))
+def test_a_part_of_a_cloud_has_the_points_asked_for(ranges: list[tuple[int, int]]) -> None:
+    counts = np.full(len(ranges), 9)
+    points = np.arange(27 * len(ranges), dtype=np.float32).reshape(-1, 3)
+    cloud = ShownCloud(points, points.astype(np.uint8), 5 + np.arange(len(ranges)), counts)
+    low, high = np.array(ranges).T
+    part = cloud.part(low, high)
+    wanted = [points[9 * k + a : 9 * k + b] for k, (a, b) in enumerate(ranges)]
+    assert (part.points == np.concatenate(wanted)).all() and len(part.owner) == len(part.points)
+    assert (cloud.of(5, 4).points == points[:4]).all() and (cloud.of(5, 4).owner == 5).all()
 
 
 def test_what_is_near_comes_in_full(room: Path) -> None:
     with list3r.open(room) as memory:
         world = read_world(memory, [])
-    hidden = ~overview(world.cloud, 600)
+    hidden = world.cloud.counts - overview(world.cloud.counts, 600)
     chosen = close_by(world, hidden, np.array([2.0, 1.0, 0.5]), 500)
-    assert set(world.cloud.owner[chosen].tolist()) >= {CHAIR} and chosen.sum() <= 500
-    assert not (chosen & ~hidden).any()
+    assert chosen[world.cloud.ids == CHAIR] > 0 and chosen.sum() <= 500
+    assert (chosen <= hidden).all()
 
 
 def test_a_ray_meets_what_is_first(room: Path) -> None:
@@ -107,7 +119,7 @@ def test_a_ray_meets_what_is_first(room: Path) -> None:
     above_mug = np.array([1.8, 0.1, 3.0])
     met = pick(world, world.cloud, above_mug, np.array([0.0, 0.0, -1.0]))
     assert met is not None and met[0] == MUG and met[1][2] == pytest.approx(0.82, abs=0.02)
-    bare = pick(world, world.cloud.part(np.zeros(len(world.cloud.owner), bool)), above_mug, np.array([0.0, 0.0, -1.0]))
+    bare = pick(world, world.cloud.of(0, 0), above_mug, np.array([0.0, 0.0, -1.0]))
     assert bare is not None and bare[0] == MUG and bare[1][2] == pytest.approx(0.82)
     assert pick(world, world.cloud, above_mug, np.array([0.0, 0.0, 1.0])) is None
 
@@ -221,7 +233,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path: Path) -> None:
     path = write_room(tmp_path / "room.l3r")
     with list3r.open(path, writable=True) as memory:
-        viewer = Viewer(memory, ViewerSettings(0, LayerSettings(overview_points=1000)))
+        viewer = Viewer(memory, ViewerSettings(0, clouds=CloudSettings(overview_points=1000)))
         try:
             browser.open(viewer.address)
             browser.says("Click a thing, or search for one.")
@@ -305,3 +317,37 @@ def test_the_slider_goes_back_in_time(browser: Browser, two_sessions: Path) -> N
             assert browser.errors == []
         finally:
             viewer.stop()
+
+
+def test_a_slow_page_draws_less_while_its_camera_moves(browser: Browser, room: Path) -> None:
+    with list3r.open(room) as memory:
+        viewer = Viewer(memory, ViewerSettings(0, clouds=CloudSettings(never_slow_points=0, moving_s=0.0, pause_s=3.0)))
+        try:
+            browser.open(viewer.address)
+            browser.wait(lambda: [p.seconds_a_point for p in viewer._pages.values()] not in ([], [None]))
+            (page,) = viewer._pages.values()
+            browser.wait(lambda: page._moving is False)
+            page.seconds_a_point = 1e-4
+            viewer.show(colors="instance")
+            assert page.slow and page.most_points == 5000 and page._nodes[FINE].visible
+            (client,) = viewer.server.get_clients().values()
+            client.camera.position = client.camera.position + 1.0
+            browser.wait(lambda: not page._nodes[FINE].visible)
+            assert page._nodes["/coarse"].visible
+            browser.wait(lambda: page._nodes[FINE].visible)
+            assert not page._nodes["/coarse"].visible and browser.errors == []
+        finally:
+            viewer.stop()
+
+
+def test_thin_lines_are_the_edges_of_the_boxes() -> None:
+    corners = np.array([OrientedBox(np.full(3, float(k)), np.ones(3), np.eye(3)).corners() for k in range(3)])
+    data = thin_lines(corners.astype(np.float32), np.full((3, 3), 40, np.uint8))
+    length = int.from_bytes(data[12:16], "little")
+    told, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+    assert len(data) == int.from_bytes(data[8:12], "little") and len(body) % 4 == 0
+    first, _, last = (v["byteOffset"] for v in told["bufferViews"])
+    points = np.frombuffer(body, np.float32, 72, first).reshape(-1, 3)
+    edges = np.frombuffer(body, np.uint32, 72, last).reshape(-1, 2)
+    assert np.allclose(np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1), 1.0)
+    assert len(np.unique(np.sort(edges, axis=1), axis=0)) == 36

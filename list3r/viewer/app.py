@@ -15,17 +15,18 @@ from numpy.typing import NDArray
 from list3r.api import SceneMemory
 from list3r.api import open as open_scene
 from list3r.memory.errors import List3rError
-from list3r.viewer.layers import Layers, LayerSettings, unit_of
+from list3r.viewer.clouds import CloudSettings, PageClouds, Shown
+from list3r.viewer.layers import Layers, LayerSettings
 from list3r.viewer.link import ViewState
 from list3r.viewer.panel import Panel
 from list3r.viewer.serving import HOST, quiet, start_server
 from list3r.viewer.told import described
-from list3r.viewer.world import ShownWorld, pick, read_path, read_world
+from list3r.viewer.world import ShownCloud, ShownWorld, overview, pick, read_path, read_world
 
 _PICTURE_PX = 200
 """Small crops are enlarged to about this width."""
-_MOVED_SHARE = 0.1
-"""The camera must move by this share of its distance to what it looks at before detail is drawn anew."""
+_PICKED_POINTS = 1_500_000
+"""A click meets these, whatever the page draws."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class ViewerSettings:
     port: int = 8741
     """The next free one where it is taken."""
     layers: LayerSettings = field(default_factory=LayerSettings)
+    clouds: CloudSettings = field(default_factory=CloudSettings)
 
 
 class Viewer:
@@ -45,12 +47,13 @@ class Viewer:
         self._lock = threading.RLock()
         self._asked: list[ViewState] = []
         self._measuring: list[tuple[int, NDArray[np.float64]]] | None = None
-        self._detail_at: NDArray[np.float64] | None = None
-        self._drawn_world: ShownWorld | None = None
-        self._drawn: tuple[object, ...] = ()
+        self._pages: dict[int, PageClouds] = {}
+        self._drawn: Shown | None = None
         self.state = ViewState()
         self.path = read_path(memory)
         self.world = self._read()
+        self.picked: ShownCloud = self.world.cloud
+        """The points that a click can meet."""
         self.server = start_server(self.settings.port, f"list3r {memory.path.name}", self._page_opened)
         self._layers = Layers(self.server, self.settings.layers)
         self.server.scene.set_up_direction("+z")
@@ -58,6 +61,7 @@ class Viewer:
         self.panel = Panel(self.server, self)
         self.server.scene.on_click()(self._clicked)
         self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._gone)
         self.draw()
 
     @property
@@ -104,11 +108,7 @@ class Viewer:
     def draw(self) -> None:
         """Draw everything and say what is selected."""
         with self._lock, self.server.atomic():
-            s, world, unit = self.state, self.world, unit_of(self.world)
-            drawn = (s.colors, s.structure, s.points)
-            if world is not self._drawn_world or drawn != self._drawn:
-                self._layers.points(world, s.colors, structure=s.structure, visible=s.points)
-                self._drawn_world, self._drawn, self._detail_at = world, drawn, None
+            s, world, unit = self.state, self.world, self.world.unit
             self._layers.highlight(world, s.colors, s.selected, visible=s.points)
             self._layers.boxes(world, s.colors, s.selected, structure=s.structure, visible=s.boxes)
             self._layers.labels(world, s.selected, visible=s.labels)
@@ -119,7 +119,18 @@ class Viewer:
                 self._tell(s.selected)
             else:
                 self.panel.tell("Click a thing, or search for one.", None)
+        self._draw_points()
         self.server.gui.configure_theme(dark_mode=self.state.dark, show_share_button=False, show_logo=False)
+
+    def _draw_points(self) -> None:
+        s = self.state
+        shown = Shown(self.world, s.colors, s.structure, s.points, s.boxes)
+        if not shown.same(self._drawn):
+            self._drawn = shown
+            counts = shown.allowed()
+            self.picked = self.world.cloud.part(np.zeros_like(counts), overview(counts, _PICKED_POINTS))
+            for page in list(self._pages.values()):
+                page.draw(shown)
 
     def _tell(self, instance_id: int) -> None:
         relations = list(self.memory.relations(subject=instance_id))
@@ -168,7 +179,7 @@ class Viewer:
             rgb = None if picture is None else self.memory.pixels(picture)[::2, ::2]
             camera = self.memory.camera(frame=int(self.path.frame[k]), session=int(self.path.session[k]))
             height, width = camera.image_size
-            self._layers.camera(self.path, k, rgb, (camera.intrinsics[1], width, height), unit_of(self.world))
+            self._layers.camera(self.path, k, rgb, (camera.intrinsics[1], width, height), self.world.unit)
 
     def edit(self, change: Callable[[], Any]) -> None:
         """Run one edit and show what it did, or why it was refused."""
@@ -198,21 +209,18 @@ class Viewer:
     def _connected(self, client: viser.ClientHandle) -> None:
         if self._asked:
             self.show(**vars(self._asked.pop()))
-        client.camera.on_update(self._camera_moved)
+        page = self._pages[client.client_id] = PageClouds(client, self.settings.clouds)
+        client.camera.on_update(page.moved)
+        if self._drawn is not None:
+            page.draw(self._drawn)
 
-    def _camera_moved(self, camera: viser.CameraHandle) -> None:
-        with self._lock:
-            place = np.asarray(camera.position, np.float64)
-            reach = float(np.linalg.norm(place - np.asarray(camera.look_at)))
-            far = self._detail_at is None or np.linalg.norm(place - self._detail_at) > _MOVED_SHARE * reach
-            if far and self.state.points:
-                self._detail_at = place
-                self._layers.detail(self.world, self.state.colors, place)
+    def _gone(self, client: viser.ClientHandle) -> None:
+        self._pages.pop(client.client_id, None)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64)
         with self._lock:
-            met = pick(self.world, self._layers.shown, origin, direction / np.linalg.norm(direction))
+            met = pick(self.world, self.picked, origin, direction / np.linalg.norm(direction))
         if self._measuring is None:
             self.select(None if met is None else met[0])
         elif met is not None:

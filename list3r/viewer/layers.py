@@ -1,8 +1,8 @@
-"""What stands in the 3D scene: points, boxes, labels, path, and lines of the selected instance."""
+"""What stands in the 3D scene of all pages: boxes, labels, path, and lines of the selected instance."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +10,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
+from list3r.memory.geometry import quat_wxyz_from_rotation
 from list3r.memory.records import Instance, Relation
-from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownCloud, ShownWorld, close_by, color_of, colors, overview
+from list3r.viewer.box_lines import box_lines
+from list3r.viewer.clouds import FINE
+from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, color_of, colors
 
-_EDGES = np.array([(a, a ^ bit) for a in range(8) for bit in (1, 2, 4) if a < a ^ bit])
-"""Pairs of corners of `OrientedBox.corners` that an edge joins."""
 _INK = (255, 200, 0)
 _MEASURED = (230, 40, 90)
 
@@ -24,10 +24,6 @@ _MEASURED = (230, 40, 90)
 class LayerSettings:
     """How much is drawn."""
 
-    overview_points: int = 1_500_000
-    """Points that are always there."""
-    detail_points: int = 1_500_000
-    """Points that come besides near the camera."""
     selected_points: int = 100_000
     """Points of the selected thing that are tinted, at most."""
     most_labels: int = 60
@@ -41,60 +37,29 @@ class Layers:
     def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
         self._scene, self._settings = server.scene, settings
         self._nodes: dict[str, list[Any]] = {}
-        self.shown = ShownCloud(
-            np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64), np.zeros(0, np.int64)
-        )
-        """The points that can be picked."""
 
     def clear(self, layer: str) -> None:
         """Take a layer away."""
         for node in self._nodes.pop(layer, []):
             node.remove()
 
-    def points(self, world: ShownWorld, mode: str, *, structure: bool, visible: bool) -> None:
-        """Draw the overview of the points."""
-        cloud = world.cloud
-        solid = {n for n, i in world.instances.items() if structure or i.structure is None}
-        allowed = np.isin(cloud.owner, list(solid))
-        cloud = cloud.part(allowed)
-        self.shown = (
-            cloud.part(overview(cloud, self._settings.overview_points))
-            if visible
-            else cloud.part(np.zeros(len(cloud.points), bool))
-        )
-        self._draw_cloud("points", world, self.shown, mode, None)
-        self.clear("detail")
-
-    def detail(self, world: ShownWorld, mode: str, place: NDArray[np.float64]) -> None:
-        """Draw the points that the overview leaves out of the instances near a place; structure is not among them."""
-        hidden = ~overview(world.cloud, self._settings.overview_points)
-        solid = [n for n, i in world.instances.items() if i.structure is None]
-        hidden &= np.isin(world.cloud.owner, solid)
-        if hidden.any():
-            chosen = close_by(world, hidden, place, self._settings.detail_points)
-            self._draw_cloud("detail", world, world.cloud.part(chosen), mode, None)
-
     def highlight(self, world: ShownWorld, mode: str, selected: int | None, *, visible: bool) -> None:
         """Draw the points of the selected instance once more, tinted and larger, so that the others can stay."""
         self.clear("selected")
-        if selected is not None and visible:
-            mine = (world.cloud.owner == selected) & (world.cloud.rank < self._settings.selected_points)
-            self._draw_cloud("selected", world, world.cloud.part(mine), mode, selected)
-
-    def _draw_cloud(self, layer: str, world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None) -> None:
-        self.clear(layer)
-        if not len(cloud.points):
+        if selected is None or not visible:
             return
-        middle = cloud.points.mean(axis=0)
-        node = self._scene.add_point_cloud(
-            f"/{layer}",
-            cloud.points - middle,
-            colors(world, cloud, mode, selected),
-            point_size=(0.012 if selected is None else 0.016) * unit_of(world),
-            point_shape="circle",
-            position=middle.astype(np.float64),
-        )
-        self._nodes[layer] = [node]
+        cloud = world.cloud.of(selected, self._settings.selected_points)
+        if len(cloud.points):
+            middle = cloud.points.mean(axis=0)
+            node = self._scene.add_point_cloud(
+                f"{FINE}/selected",
+                cloud.points - middle,
+                colors(world, cloud, mode, selected),
+                point_size=0.016 * world.unit,
+                point_shape="circle",
+                position=middle.astype(np.float64),
+            )
+            self._nodes["selected"] = [node]
 
     def boxes(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
         """Draw the oriented boxes; only that of the selected instance unless all are visible."""
@@ -104,7 +69,7 @@ class Layers:
         ]
         if things:
             ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in things]
-            node = _box_lines(self._scene, "/boxes", [i.box for i in things], ink, 1.5)
+            node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in things], ink)
             self._nodes["boxes"] = [node]
 
     def labels(self, world: ShownWorld, selected: int | None, *, visible: bool) -> None:
@@ -116,7 +81,7 @@ class Layers:
             chosen = [*chosen, world.instances[selected]] if selected is not None else chosen
         self._nodes["labels"] = [
             self._scene.add_label(
-                f"/labels/{i.id}", f"{i.id} {world.name(i.id)}", position=_top(i), anchor="bottom-center",
+                f"{FINE}/labels/{i.id}", f"{i.id} {world.name(i.id)}", position=_top(i), anchor="bottom-center",
                 font_screen_scale=1.2 if i.id == selected else 0.6,
             )
             for i in chosen
@@ -187,7 +152,7 @@ class Layers:
         moved = [c for c in world.changes.values() if c.event.kind == "moved" and c.event.from_box and c.event.to_box]
         ways = [(c.event.from_box.center, c.event.to_box.center) for c in moved if c.event.from_box and c.event.to_box]
         if ways:
-            unit = unit_of(world)
+            unit = world.unit
             nodes.append(
                 self._scene.add_arrows(
                     "/changes/moved", np.array(ways, np.float32), CHANGE_COLORS["moved"], shaft_radius=0.01 * unit,
@@ -197,7 +162,7 @@ class Layers:
         before = [(c.event.from_box, CHANGE_COLORS[c.event.kind]) for c in world.changes.values() if c.event.from_box]
         if before:
             boxes, ink = [b for b, _ in before if b is not None], [color for _, color in before]
-            nodes.append(_box_lines(self._scene, "/changes/before", boxes, ink, 1.5))
+            nodes.append(box_lines(self._scene, "/changes/before", boxes, ink))
         self._nodes["changes"] = nodes
 
     def measured(self, ends: Sequence[NDArray[np.float64]], text: str) -> None:
@@ -213,22 +178,5 @@ class Layers:
             self._nodes["measured"] = [self._scene.add_label("/measured/text", text, position=ends[0])]
 
 
-def unit_of(world: ShownWorld) -> float:
-    """Return what a metre is about in world units: 1 where things lie apart as in a home, else a fifth of how far."""
-    centers = np.array([i.center for i in world.instances.values()]).reshape(-1, 3)
-    extent = float(np.ptp(centers, axis=0).max()) if len(centers) > 1 else 5.0
-    return 1.0 if 1.0 < extent < 100.0 else max(extent, 1e-9) / 5.0
-
-
 def _top(instance: Instance) -> NDArray[np.float64]:
     return np.array([*instance.center[:2], instance.aabb[1, 2]])
-
-
-def _box_lines(
-    scene: Any, name: str, boxes: Sequence[OrientedBox], ink: Iterable[tuple[int, int, int]], width: float
-) -> Any:
-    lines = np.concatenate([b.corners()[_EDGES] for b in boxes]).astype(np.float32)
-    shades = np.repeat(np.array(list(ink), np.uint8), len(_EDGES), axis=0)
-    return scene.add_line_segments(
-        name, lines, np.repeat(shades[:, None], 2, axis=1), thickness=width, thickness_units="screen"
-    )

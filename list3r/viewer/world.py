@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,20 +22,35 @@ _BESIDE = 0.008
 
 @dataclass(frozen=True)
 class ShownCloud:
-    """Surface points of many instances, of each in random order, so that any first part of them is a coarser cloud."""
+    """Surface points of many instances, one after the other; those of each in random order, so that any first part of
+    them is a coarser cloud. 15 bytes a point, so that tens of millions fit.
+    """
 
     points: NDArray[np.float32]
     """World. Shape (N, 3)."""
     rgb: NDArray[np.uint8]
     """Shape (N, 3)."""
-    owner: NDArray[np.int64]
-    """Id of the instance of each point. Shape (N,)."""
-    rank: NDArray[np.int64]
-    """Number of each point among those of its instance. Shape (N,)."""
+    ids: NDArray[np.int64]
+    """Ids of the instances. Shape (K,)."""
+    counts: NDArray[np.int64]
+    """How many of the points are each instance's. Shape (K,)."""
 
-    def part(self, keep: NDArray[np.bool_]) -> ShownCloud:
-        """Return some of the points."""
-        return ShownCloud(self.points[keep], self.rgb[keep], self.owner[keep], self.rank[keep])
+    @property
+    def owner(self) -> NDArray[np.int64]:
+        """Id of the instance of each point. Shape (N,)."""
+        return np.repeat(self.ids, self.counts)
+
+    def part(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> ShownCloud:
+        """Return the points `low` to `high` of each instance. Both shape (K,)."""
+        counts = np.maximum(high - low, 0)
+        first = np.cumsum(self.counts) - self.counts + low
+        place = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+        return ShownCloud(self.points[place], self.rgb[place], self.ids, counts)
+
+    def of(self, instance_id: int, most: int) -> ShownCloud:
+        """Return the first points of one instance."""
+        high = np.where(self.ids == instance_id, np.minimum(self.counts, most), 0)
+        return self.part(np.zeros_like(high), high)
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,8 @@ class ShownWorld:
     cloud: ShownCloud
     changes: dict[int, Changed]
     """The newest change of each instance."""
+    unit: float
+    """What a metre is about in world units."""
 
     def name(self, instance_id: int) -> str:
         """Return what an instance is called."""
@@ -73,25 +89,30 @@ class ShownWorld:
 def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
     """Return the present world of a memory; `changes` are those to colour."""
     shown = [i for i in memory.instances(structure=None) if i.state != "removed" and np.isfinite(i.aabb).all()]
-    parts = [_points(memory, i) for i in shown]
-    cloud = ShownCloud(
-        np.concatenate([np.zeros((0, 3), np.float32), *(p.points for p in parts)]),
-        np.concatenate([np.zeros((0, 3), np.uint8), *(p.rgb for p in parts)]),
-        np.concatenate([np.zeros(0, np.int64), *(p.owner for p in parts)]),
-        np.concatenate([np.zeros(0, np.int64), *(p.rank for p in parts)]),
-    )
+    cloud = _cloud(memory, [i.id for i in shown])
     newest: dict[int, Changed] = {}
     for change in changes:
         newest.setdefault(change.instance.id, change)
-    return ShownWorld({i.id: i for i in shown}, cloud, newest)
+    return ShownWorld({i.id: i for i in shown}, cloud, newest, 1.0 if memory.units == "m" else _unit(shown))
 
 
-def _points(memory: SceneMemory, instance: Instance) -> ShownCloud:
-    support = memory.support(instance.id)
-    finite = np.flatnonzero(np.isfinite(support.points).all(axis=1))
-    order = np.random.default_rng(instance.id).permutation(finite)
-    owner = np.full(len(order), instance.id, np.int64)
-    return ShownCloud(support.points[order].astype(np.float32), support.rgb[order], owner, np.arange(len(order)))
+def _unit(instances: list[Instance]) -> float:
+    """What a metre is about where lengths are relative: 1 where things are as far apart as in a home, else a fifth."""
+    centers = np.array([i.center for i in instances]).reshape(-1, 3)
+    extent = float(np.ptp(centers, axis=0).max()) if len(centers) > 1 else 5.0
+    return 1.0 if 1.0 < extent < 100.0 else max(extent, 1e-9) / 5.0
+
+
+def _cloud(memory: SceneMemory, ids: list[int]) -> ShownCloud:
+    points, rgb = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
+    for n in ids:
+        support = memory.support(n)
+        finite = np.flatnonzero(np.isfinite(support.points).all(axis=1))
+        order = np.random.default_rng(n).permutation(finite)
+        points.append(support.points[order].astype(np.float32))
+        rgb.append(support.rgb[order])
+    counts = np.array([len(p) for p in points[1:]], np.int64)
+    return ShownCloud(np.concatenate(points), np.concatenate(rgb), np.array(ids, np.int64), counts)
 
 
 def read_path(memory: SceneMemory) -> CameraPath:
@@ -109,32 +130,30 @@ def read_path(memory: SceneMemory) -> CameraPath:
 # ---------------------------------------------------------------------------------------------- level of detail
 
 
-def overview(cloud: ShownCloud, most: int) -> NDArray[np.bool_]:
-    """Return which points to show from afar, at most about `most`: of each instance as many as the square root of
-    what it has allows, so that small things keep theirs. Shape (N,).
+def overview(counts: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return how many points of each instance to show from afar, at most about `most` in all: as many as the square
+    root of what it has allows, so that small things keep theirs. Shape (K,).
     """
-    if len(cloud.points) <= most:
-        return np.ones(len(cloud.points), bool)
-    _, place, counts = np.unique(cloud.owner, return_inverse=True, return_counts=True)
+    if counts.sum() <= most:
+        return counts
     low, high = 0.0, float(most)
     for _ in range(50):
         middle = (low + high) / 2
         low, high = (middle, high) if np.minimum(counts, middle * np.sqrt(counts)).sum() <= most else (low, middle)
-    return np.asarray(cloud.rank < np.minimum(counts, low * np.sqrt(counts))[place])
+    return np.asarray(np.ceil(np.minimum(counts, low * np.sqrt(counts))).astype(np.int64))
 
 
-def close_by(world: ShownWorld, hidden: NDArray[np.bool_], place: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
-    """Return which hidden points to show besides: those of the instances nearest to a place, at most `most`."""
-    boxes = {n: i.aabb for n, i in world.instances.items()}
-    gap = {n: float(np.linalg.norm(np.maximum(0.0, np.maximum(b[0] - place, place - b[1])))) for n, b in boxes.items()}
-    wanted, count = [], 0
-    sizes = dict(zip(*(x.tolist() for x in np.unique(world.cloud.owner[hidden], return_counts=True)), strict=True))
-    for n in sorted(sizes, key=lambda n: gap.get(n, np.inf)):
-        if count + sizes[n] > most:
-            break
-        wanted.append(n)
-        count += sizes[n]
-    return np.asarray(hidden & np.isin(world.cloud.owner, wanted))
+def close_by(world: ShownWorld, hidden: NDArray[np.int64], place: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Return how many hidden points of each instance to show besides: those of the instances nearest to a place, at
+    most `most` in all; `hidden` is how many each has. Shape (K,).
+    """
+    boxes = np.array([world.instances[n].aabb for n in world.cloud.ids.tolist()]).reshape(-1, 2, 3)
+    gap = np.linalg.norm(np.maximum(0.0, np.maximum(boxes[:, 0] - place, place - boxes[:, 1])), axis=1)
+    order = np.argsort(gap, kind="stable")
+    before = np.cumsum(hidden[order]) - hidden[order]
+    chosen = np.zeros_like(hidden)
+    chosen[order] = np.clip(most - before, 0, hidden[order])
+    return chosen
 
 
 # ---------------------------------------------------------------------------------------------- colours
@@ -142,7 +161,11 @@ def close_by(world: ShownWorld, hidden: NDArray[np.bool_], place: NDArray[np.flo
 
 def colors(world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None) -> NDArray[np.uint8]:
     """Return the colour of each point. Shape (N, 3)."""
-    out = cloud.rgb.copy() if mode == "own colour" else _by_owner(cloud.owner, lambda n: color_of(world, n, mode))
+    if mode == "own colour":
+        out = cloud.rgb.copy()
+    else:
+        each = np.array([color_of(world, n, mode) for n in cloud.ids.tolist()], np.uint8).reshape(-1, 3)
+        out = np.repeat(each, cloud.counts, axis=0)
     if selected is not None:
         mine = cloud.owner == selected
         out[mine] = np.round(0.5 * out[mine] + 0.5 * np.array(_SELECTED)).astype(np.uint8)
@@ -156,11 +179,6 @@ def color_of(world: ShownWorld, instance_id: int, mode: str) -> tuple[int, int, 
         return _UNCHANGED if change is None else CHANGE_COLORS.get(change.event.kind, _UNCHANGED)
     structure = world.instances[instance_id].structure is not None
     return structure_color(instance_id) if structure else instance_color(instance_id)
-
-
-def _by_owner(owner: NDArray[np.int64], color: Callable[[int], tuple[int, int, int]]) -> NDArray[np.uint8]:
-    ids, place = np.unique(owner, return_inverse=True)
-    return np.array([color(int(n)) for n in ids], np.uint8).reshape(-1, 3)[place]
 
 
 # ---------------------------------------------------------------------------------------------- picking
@@ -179,15 +197,16 @@ def pick(
     aside = np.sqrt(np.maximum((step**2).sum(axis=1) - depth**2, 0.0))
     near = np.flatnonzero((depth > 0) & (aside < _BESIDE * depth))
     first = int(near[np.argmin(depth[near])]) if len(near) else -1
-    if first >= 0 and world.instances[int(shown.owner[first])].structure is None:
-        return int(shown.owner[first]), shown.points[first].astype(np.float64)
+    owner = int(shown.ids[np.searchsorted(np.cumsum(shown.counts), first, side="right")]) if first >= 0 else -1
+    if first >= 0 and world.instances[owner].structure is None:
+        return owner, shown.points[first].astype(np.float64)
     reach = float(depth[first]) if first >= 0 else np.inf
     things = [i for i in world.instances.values() if i.structure is None or first < 0]
     hits = [(t, i.id) for i in things if (t := _box_hit(i, origin, direction)) is not None and t < reach]
     if hits:
         t, n = min(hits)
         return n, origin + t * direction
-    return None if first < 0 else (int(shown.owner[first]), shown.points[first].astype(np.float64))
+    return None if first < 0 else (owner, shown.points[first].astype(np.float64))
 
 
 def _box_hit(instance: Instance, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> float | None:

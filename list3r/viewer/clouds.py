@@ -1,0 +1,238 @@
+"""The points that one page draws: as many at rest as it draws in half a second, fewer while its camera moves."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from list3r.viewer.box_lines import box_lines
+from list3r.viewer.world import ShownCloud, ShownWorld, close_by, color_of, colors, overview
+
+FINE = "/fine"
+"""What stands below this node is hidden while the camera of a slow page moves."""
+_BOX = 25
+"""A box of thin lines takes as long to draw as this many points."""
+_POINT_M, _COARSE_M = 0.012, 0.03
+_MOVED_SHARE = 0.1
+"""The camera must move by this share of its distance to what it looks at before detail is drawn anew."""
+
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """How many points are drawn."""
+
+    overview_points: int = 1_500_000
+    """Points that are always there, at most."""
+    detail_points: int = 1_500_000
+    """Points that come besides near the camera, at most."""
+    rest_s: float = 0.5
+    """All that is drawn while the camera rests takes a page no longer than this."""
+    moving_s: float = 0.04
+    """The points and boxes that are drawn while it moves take no longer than this; the page itself comes on top."""
+    probe_points: tuple[int, ...] = (30_000, 300_000)
+    """Points whose drawing is timed; a graphics card takes a millisecond or two for the most of them."""
+    probe_s: float = 0.05
+    """What takes longer is not timed with more points."""
+    never_slow_points: int = 20_000
+    """Memories with fewer points are drawn in full without timing."""
+    pause_s: float = 1.0
+    """A slow page's camera rests when it has not moved for this long; its fine pictures take up to `rest_s`."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What of a world is drawn."""
+
+    world: ShownWorld = field(compare=False)
+    mode: str
+    structure: bool
+    points: bool
+    boxes: bool
+
+    def same(self, other: Shown | None) -> bool:
+        """Whether another shows the same of the same world."""
+        return other is not None and other.world is self.world and other == self
+
+    def allowed(self) -> NDArray[np.int64]:
+        """Return how many points of each instance may be drawn. Shape (K,)."""
+        things, ids = self.world.instances, self.world.cloud.ids.tolist()
+        solid = np.array([self.points and (self.structure or things[n].structure is None) for n in ids], bool)
+        return np.where(solid, self.world.cloud.counts, 0)
+
+
+class PageClouds:
+    """The points of one page, drawn in its own part of the scene, so that each page gets what it can draw."""
+
+    def __init__(self, client: viser.ClientHandle, settings: CloudSettings) -> None:
+        self._client, self._settings = client, settings
+        self._lock = threading.RLock()
+        self._nodes: dict[str, Any] = {}
+        self._shown: Shown | None = None
+        self._detail_at: NDArray[np.float64] | None = None
+        self._last_move = 0.0
+        self._moving = False
+        self.seconds_a_point: float | None = None
+        """As measured on the page; None where it was not, and then all is drawn."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether the page shows what it shows at rest."""
+        with self._lock:
+            return FINE in self._nodes and not self._moving
+
+    @property
+    def most_points(self) -> float:
+        """How many points the page can show at rest."""
+        return np.inf if self.seconds_a_point is None else self._settings.rest_s / max(self.seconds_a_point, 1e-12)
+
+    def draw(self, shown: Shown) -> None:
+        """Draw a world; the first time, what the page takes to draw is measured."""
+        with self._lock:
+            before, self._shown = self._shown, shown
+            if before is None and shown.world.cloud.counts.sum() > self._settings.never_slow_points:
+                self.seconds_a_point = self._measured(shown.world.cloud)
+            if before is None or not shown.same(replace(before, boxes=shown.boxes)):
+                self._clear("/fine/detail")
+                self._cloud("/fine/points", self._part(self._overview()), "circle", _POINT_M)
+                self._detail_at = None
+                self._draw_detail()
+            self._draw_coarse()
+            self._switch(fine=not self._moving)
+
+    def moved(self, _: object) -> None:
+        """Draw coarsely until the camera, which has moved, rests; then in detail near it."""
+        self._last_move = time.monotonic()
+        if not self._moving and self._lock.acquire(blocking=False):
+            try:
+                self._moving = True
+                self._switch(fine=False)
+                threading.Thread(target=self._until_rest, daemon=True).start()
+            finally:
+                self._lock.release()
+
+    # ------------------------------------------------------------------ levels
+
+    @property
+    def slow(self) -> bool:
+        """Whether all points take the page longer than a moving picture may."""
+        if self._shown is None or self.seconds_a_point is None:
+            return False
+        most = min(int(self._shown.world.cloud.counts.sum()), self._settings.overview_points)
+        return most * self.seconds_a_point > self._settings.moving_s
+
+    def _overview(self) -> NDArray[np.int64]:
+        """How many points of each instance are there at rest. Shape (K,)."""
+        assert self._shown is not None
+        counts = self._shown.allowed()
+        most = min(self._settings.overview_points, self.most_points)
+        return counts if counts.sum() <= most else overview(counts, int(min(most, max(self.most_points / 2, 1))))
+
+    def _part(self, high: NDArray[np.int64]) -> ShownCloud:
+        assert self._shown is not None
+        return self._shown.world.cloud.part(np.zeros_like(high), high)
+
+    def _draw_coarse(self) -> None:
+        self._clear("/coarse/points")
+        self._clear("/coarse/boxes")
+        if not self.slow or self._shown is None or self.seconds_a_point is None:
+            return
+        world, budget = self._shown.world, self._settings.moving_s / self.seconds_a_point
+        things = [i for i in world.instances.values() if self._shown.structure or i.structure is None]
+        things = sorted(things, key=lambda i: -i.observations)[: int(budget / 2 / _BOX)] if self._shown.boxes else []
+        if things:
+            ink = [color_of(world, i.id, self._shown.mode) for i in things]
+            self._nodes["/coarse/boxes"] = box_lines(
+                self._client.scene, "/coarse/boxes", [i.box for i in things], ink, thick=0
+            )
+        left = int(budget - _BOX * len(things))
+        self._cloud("/coarse/points", self._part(overview(self._shown.allowed(), left)), "square", _COARSE_M)
+
+    def _draw_detail(self) -> None:
+        """Draw points that the overview leaves out, of the instances near the camera; structure is not among them."""
+        if self._shown is None or not self._shown.points:
+            return
+        camera, low = self._client.camera, self._overview()
+        place = np.asarray(camera.position, np.float64)
+        reach = float(np.linalg.norm(place - np.asarray(camera.look_at)))
+        if self._detail_at is not None and np.linalg.norm(place - self._detail_at) <= _MOVED_SHARE * reach:
+            return
+        self._detail_at, world = place, self._shown.world
+        things = np.array([world.instances[n].structure is None for n in world.cloud.ids.tolist()], bool)
+        hidden = np.where(things, world.cloud.counts - low, 0)
+        most = min(self._settings.detail_points, self.most_points - low.sum())
+        self._clear("/fine/detail")
+        if hidden.any() and most > 0:
+            cloud = world.cloud.part(low, low + close_by(world, hidden, place, int(most)))
+            self._cloud("/fine/detail", cloud, "circle", _POINT_M)
+
+    # ------------------------------------------------------------------ the page
+
+    def _until_rest(self) -> None:
+        pause = self._settings.pause_s if self.slow else 0.1
+        while time.monotonic() - self._last_move < pause:
+            time.sleep(0.05)
+        with self._lock:
+            self._moving = False
+            self._draw_detail()
+            self._switch(fine=True)
+
+    def _switch(self, *, fine: bool) -> None:
+        """Show one of the two levels; a page that is not slow has the fine one only."""
+        with self._client.atomic():
+            if FINE not in self._nodes:
+                self._nodes[FINE] = self._client.scene.add_frame(FINE, show_axes=False)
+                self._nodes["/coarse"] = self._client.scene.add_frame("/coarse", show_axes=False)
+            self._nodes[FINE].visible = fine or not self.slow
+            self._nodes["/coarse"].visible = not fine and self.slow
+
+    def _measured(self, cloud: ShownCloud) -> float | None:
+        """Seconds that the page takes to draw a point: that of a picture with many, less that of one without. Few are
+        timed first, so that a slow page is not asked for more.
+        """
+        without = self._fastest()
+        seconds = None
+        for most in self._settings.probe_points:
+            probe = self._part(overview(cloud.counts, most))
+            self._cloud("/fine/points", probe, "circle", _POINT_M)
+            taken = self._fastest()
+            if without is None or taken is None:
+                return None
+            seconds = max(taken - without, 0.0) / max(len(probe.points), 1)
+            if taken - without > self._settings.probe_s:
+                break
+        return seconds
+
+    def _fastest(self) -> float | None:
+        """The shortest time of a few small pictures, in seconds; None where the page gives none."""
+        times = []
+        for _ in range(3):
+            began = time.perf_counter()
+            try:
+                self._client.get_render(200, 320, timeout=60.0)
+            except (TimeoutError, RuntimeError):
+                return None
+            times.append(time.perf_counter() - began)
+        return min(times[1:])
+
+    def _cloud(self, name: str, cloud: ShownCloud, shape: Any, size_m: float) -> None:
+        self._clear(name)
+        if self._shown is not None and len(cloud.points):
+            middle = cloud.points.mean(axis=0)
+            self._nodes[name] = self._client.scene.add_point_cloud(
+                name,
+                cloud.points - middle,
+                colors(self._shown.world, cloud, self._shown.mode, None),
+                point_size=size_m * self._shown.world.unit,
+                point_shape=shape,
+                position=middle.astype(np.float64),
+            )
+
+    def _clear(self, name: str) -> None:
+        if name in self._nodes:
+            self._nodes.pop(name).remove()
