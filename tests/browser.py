@@ -19,7 +19,8 @@ from websockets.sync.client import connect
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 _FLAGS = (
     "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run"
-    " --disable-background-networking --disable-component-update --disable-sync --mute-audio"
+    " --disable-background-networking --disable-component-update --disable-sync --mute-audio --disable-gpu-watchdog"
+    " --disable-backgrounding-occluded-windows --disable-renderer-backgrounding --disable-background-timer-throttling"
     " --remote-debugging-port=0 --window-size=1280,800 --disable-features=BackForwardCache"
 ).split()
 

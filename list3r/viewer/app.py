@@ -61,7 +61,6 @@ class Viewer:
         self.panel = Panel(self.server, self)
         self.server.scene.on_click()(self._clicked)
         self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._gone)
         self.draw()
 
     @property
@@ -129,6 +128,8 @@ class Viewer:
             self._drawn = shown
             counts = shown.allowed()
             self.picked = self.world.cloud.part(np.zeros_like(counts), overview(counts, _PICKED_POINTS))
+            open_pages = self.server.get_clients()
+            self._pages = {n: page for n, page in self._pages.items() if n in open_pages}
             for page in list(self._pages.values()):
                 page.draw(shown)
 
@@ -161,8 +162,8 @@ class Viewer:
             for client in self.server.get_clients().values():
                 away = client.camera.position - client.camera.look_at
                 away = away / max(float(np.linalg.norm(away)), 1e-9)
+                client.camera.position = i.center + 3.0 * reach * away  # takes what is looked at along
                 client.camera.look_at = i.center
-                client.camera.position = i.center + 3.0 * reach * away
 
     def measure(self) -> None:
         """Measure between the next two clicks."""
@@ -213,9 +214,6 @@ class Viewer:
         client.camera.on_update(page.moved)
         if self._drawn is not None:
             page.draw(self._drawn)
-
-    def _gone(self, client: viser.ClientHandle) -> None:
-        self._pages.pop(client.client_id, None)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64)
