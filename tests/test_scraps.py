@@ -11,7 +11,7 @@ import pytest
 
 import list3r
 from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.library.scraps import derive_scraps
+from list3r.memory.maintenance.scraps import derive_scraps
 from list3r.memory.records import FIRST_SCRAP, ChunkResult, LocalInstance
 from list3r.memory.store.store import Store
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, Piece

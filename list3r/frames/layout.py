@@ -128,15 +128,19 @@ def read_lines(path: Path, *, whole: bool = False) -> Iterator[str]:
     """
     try:
         with TextIOWrapper(open_ordinary(path, MAX_LIST_BYTES), "utf-8", "replace") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE + 1), "")):
-                if number > _MOST_LINES:
-                    raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
-                if len(line) > _LONGEST_LINE:
-                    raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
-                if not whole or line.endswith("\n"):
-                    yield line.rstrip("\n")
+            yield from (line.rstrip("\n") for line in _bounded(path, file) if not whole or line.endswith("\n"))
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
+
+
+def _bounded(path: Path, file: TextIOWrapper) -> Iterator[str]:
+    """Lines with their ends, as long as they are no more and no longer than those of any list."""
+    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE + 1), "")):
+        if number > _MOST_LINES:
+            raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
+        if len(line) > _LONGEST_LINE:
+            raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
+        yield line
 
 
 def pose_matrix(values: Iterable[float]) -> NDArray[np.float64] | None:

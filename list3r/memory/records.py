@@ -330,7 +330,7 @@ class BestView:
 
 
 FIRST_SCRAP = 1_000_000_000
-"""From this on ids are those of scraps, see `library.scraps`."""
+"""From this on ids are those of scraps, see `maintenance.scraps`."""
 
 
 @dataclass(frozen=True)

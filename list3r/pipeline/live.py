@@ -244,10 +244,11 @@ def _follow(ours: LiveSession, target: Target, how: LiveSettings, interrupted: t
             if span is not None:
                 ours.add(span, pool, target)
                 watch.show(ours.stop, state.count)
-            elif not ours.feed.admit():
-                if state.ended:
-                    return
-                time.sleep(how.poll_s)
+                continue
+            admitted = ours.feed.admit()
+            if not admitted and state.ended:
+                return
+            time.sleep(0.0 if admitted else how.poll_s)
     ours.feed.close()
 
 

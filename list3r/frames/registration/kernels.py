@@ -51,23 +51,33 @@ def close_gaps(out: Floats, origin: NDArray[np.int32], fine: Floats, jump: float
     neighbours on one surface, with depth known between them. A true hole or an edge is left as it is. `out` and
     `origin` are those of `project`, shape (H, W); `fine` is the depth image they come from, shape (h, w).
     """
-    height, width = out.shape
-    steep, filled = np.float32(1 + 2 * jump), out.copy()
-    for row in range(height):
-        for column in range(width):
-            here = out[row, column]
-            for down, right in ((0, 1), (1, 0)):
-                if row - down < 0 or row + down >= height or column - right < 0 or column + right >= width:
-                    continue
-                before, after = out[row - down, column - right], out[row + down, column + right]
-                if not (before > 0 and after > 0) or (here != 0 and here <= steep * max(before, after)):
-                    continue
-                a, b = origin[row - down, column - right], origin[row + down, column + right]
-                if _one_surface(a, b, fine, jump, noise):
-                    value = np.float32(0.5) * (before + after)
-                    if filled[row, column] == 0 or filled[row, column] > value:
-                        filled[row, column] = value
+    filled = out.copy()
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            filled[row, column] = _closed(out, origin, fine, (row, column), (jump, noise))
     return filled
+
+
+@compiled
+def _closed(
+    out: Floats, origin: NDArray[np.int32], fine: Floats, at: tuple[int, int], limits: tuple[float, float]
+) -> np.float32:
+    """Depth of one pixel: its own, or the nearest that opposite neighbours give it."""
+    (row, column), (jump, noise) = at, limits
+    height, width = out.shape
+    steep, here = np.float32(1 + 2 * jump), out[row, column]
+    value = here
+    for down, right in ((0, 1), (1, 0)):
+        if row - down < 0 or row + down >= height or column - right < 0 or column + right >= width:
+            continue
+        before, after = out[row - down, column - right], out[row + down, column + right]
+        if not (before > 0 and after > 0) or (here != 0 and here <= steep * max(before, after)):
+            continue
+        between = np.float32(0.5) * (before + after)
+        a, b = origin[row - down, column - right], origin[row + down, column + right]
+        if (value == 0 or value > between) and _one_surface(a, b, fine, jump, noise):
+            value = between
+    return np.float32(value)
 
 
 @compiled

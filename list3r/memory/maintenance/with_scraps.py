@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from list3r.memory.library.rules import WORLD
-from list3r.memory.library.scraps import derive_scraps
+from list3r.memory.maintenance.scraps import derive_scraps
 from list3r.memory.maintenance.shown import put_before, store_shown
 from list3r.memory.records import Observation
 from list3r.memory.store.store import Store
