@@ -15,7 +15,6 @@ from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.reconstruction.base import backproject
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.registration import KnownFeatures
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import sense
@@ -182,15 +181,3 @@ def test_a_second_of_the_kitchen(shared_data: Path) -> None:
     error = umeyama(a, b, with_scale=False).apply(a) - b
     assert result.posed.all()
     assert np.sqrt((error**2).sum(axis=1).mean()) < 0.01
-
-
-def test_features_contradict_a_pose_that_slid_and_none_that_fits_their_errors() -> None:
-    rng = np.random.default_rng(3)
-    points = np.column_stack([rng.uniform(-1, 1, (24, 2)), rng.uniform(1.8, 2.2, 24)]).astype(np.float32)
-    focal, noise_px = 150.0, 0.7
-    rays = points[:, :2] / points[:, 2:] + rng.normal(0, noise_px / focal, (24, 2))
-    features = KnownFeatures(points, rays.astype(np.float32))
-    alone, slid = np.eye(4), np.eye(4)
-    slid[0, 3] = 0.12
-    assert features.contradiction(alone, alone, focal) < 22.5
-    assert features.contradiction(slid, alone, focal) > 100

@@ -36,9 +36,6 @@ class VerificationSettings:
     registration: RegistrationSettings = field(
         default_factory=lambda: RegistrationSettings(photometric_weight=0.0, gate_m=0.15, iterations=20)
     )
-    most_contradiction: float = 22.5
-    """Squared deviations by which features may pull the pose away that surfaces gave it (chi-square of six freedoms at
-    0.999); beyond that they hold it."""
     least_overlap: float = 0.25
     """Least share of a side's surface that the other side sees."""
     least_agreement: float = 0.8
@@ -145,14 +142,7 @@ def _refine(
     )
     agree = off < gate
     anchors = KnownFeatures(a[agree], b[agree, :2] / b[agree, 2:])
-    words = (side_u.samples, side_v.view, T, settings.registration, settings.noise)
-    found = register(*words, anchors)
-    focal = side_v.view.camera.fx
-    if found is None or anchors.contradiction(found.T_model_cam, T, focal) < settings.most_contradiction:
-        return found
-    # Depth errs alike over a neighbourhood: all pairs together tell as much as one for each cell of the picture.
-    pairs = max(len(side_u.samples.points) / settings.errors.cells, 1.0)
-    return register(*words, replace(anchors, pairs=pairs))
+    return register(side_u.samples, side_v.view, T, settings.registration, settings.noise, anchors)
 
 
 def _check(source: _Side, target: _Side, T_target_source: Pose, settings: VerificationSettings) -> _Check:

@@ -57,38 +57,20 @@ class KnownFeatures:
     """Model coordinates, metres. Shape (N, 3)."""
     rays_xy: Floats
     """Where the view sees them, x / z and y / z. Shape (N, 2)."""
-    pairs: float = 1.0
-    """So many pairs of surface points tell as much as one feature: their errors are not independent."""
 
     def normal_equations(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NormalEquations:
         """Return those of the reprojection errors, in pixels of the view."""
-        slope, error = self._errors(T_model_cam, focal_px)
-        information, gradient = _normal_equations(slope, error, spread(error, 0.05))
-        return self.pairs * information, self.pairs * gradient
-
-    def contradiction(self, T_model_cam: NDArray[np.float64], alone: NDArray[np.float64], focal_px: float) -> float:
-        """Return how far a pose lies from where they pull it: squared deviations, chi-square of six freedoms.
-
-        Their own deviation is that about `alone` (4, 4), the pose which they give without surfaces.
-        """
-        deviation = spread(self._errors(alone, focal_px)[1], 0.05)
-        slope, error = self._errors(T_model_cam, focal_px)
-        information, gradient = _normal_equations(slope, error, deviation)
-        step, *_ = np.linalg.lstsq(information, gradient, rcond=1e-9)
-        return float(gradient @ step)
-
-    def _errors(self, T_model_cam: NDArray[np.float64], focal_px: float) -> tuple[Floats, Floats]:
-        """Return slopes and errors, two for each feature, px. Shapes (2 N, 6), (2 N,)."""
         R = T_model_cam[:3, :3]
         p = ((self.points - T_model_cam[:3, 3]) @ R).astype(np.float32)
         inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
         error: Floats = np.asarray((p[:, :2] * inverse_z - self.rays_xy) * focal_px, np.float32)
+        scale = 1.4826 * float(np.median(np.abs(error))) + 0.05
         slope_cam = np.zeros((len(p), 2, 3), np.float32)
         slope_cam[:, 0, 0] = slope_cam[:, 1, 1] = inverse_z[:, 0]
         slope_cam[:, :, 2] = -p[:, :2] * inverse_z * inverse_z
         slope_model = (np.float32(focal_px) * slope_cam @ R.T.astype(np.float32)).reshape(-1, 3)
         slope = -np.concatenate([slope_model, _cross(np.repeat(self.points, 2, axis=0), slope_model)], axis=1)
-        return np.asarray(slope, np.float32), error.ravel()
+        return _normal_equations(slope, error.ravel(), scale)
 
     def information(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
         """Return what they tell of the pose found. Shape (6, 6)."""
