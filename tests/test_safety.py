@@ -84,7 +84,7 @@ def test_a_killed_update_and_killed_edits_lose_nothing(safety: ModuleType, tmp_p
 
 
 def test_readers_in_other_processes_see_whole_transactions(safety: ModuleType, make_memory: Make) -> None:
-    report = safety.write_and_read(make_memory(), 6.0, readers=1)
+    report = safety.write_and_read(make_memory(), 6.0, readers=3)
     assert report["problems"] == []
     assert report["transactions"] > 0 and report["snapshots"] > 0
 

@@ -28,6 +28,8 @@ _WRITER_CACHE_KIB = 16384
 """and one that writes, which touches little at a time."""
 _READERS_WAIT_S = 8.0
 """How long a new writer waits until nobody is amid a reading; those that begin while it writes are not in its way."""
+_DRAIN_S = 0.1
+"""For so long no reader is let in, and then for so long all are, while it waits."""
 _WAIT_S = 30.0
 """How long one process waits for what another holds only for a moment."""
 
@@ -178,10 +180,12 @@ def _umask() -> int:
 def use_write_ahead_log(path: Path, database: sqlite3.Connection) -> None:
     """Readers may hold the file for a moment as the journal changes; that is waited for.
 
-    Raises `MemoryFileError` naming who reads and does not let go.
+    While SQLite waits it lets no new reader in, so that those who read without a pause do not keep a writer out; in
+    between all may read, since one of them may have stopped for good. Raises `MemoryFileError` naming who does not
+    let go.
     """
     end = time.monotonic() + _READERS_WAIT_S
-    database.execute("PRAGMA busy_timeout=0").fetchall()
+    database.execute(f"PRAGMA busy_timeout={round(1000 * _DRAIN_S)}").fetchall()
     while True:
         try:
             database.execute("PRAGMA journal_mode=WAL").fetchall()
@@ -193,7 +197,7 @@ def use_write_ahead_log(path: Path, database: sqlite3.Connection) -> None:
                 raise MemoryFileError(
                     f"{path} is being read by {_readers(path.resolve())} and cannot be written until that lets go of it"
                 ) from error
-            time.sleep(0.01)
+            time.sleep(_DRAIN_S)
     database.execute(f"PRAGMA busy_timeout={round(1000 * _WAIT_S)}").fetchall()
     database.execute("PRAGMA synchronous=NORMAL")
     database.execute(f"PRAGMA cache_size=-{_WRITER_CACHE_KIB}")
