@@ -19,7 +19,7 @@ from list3r.memory.library.labels import apply_labels, put_votes
 from list3r.memory.library.rules import WORLD, ConsolidationSettings
 from list3r.memory.maintenance import edits
 from list3r.memory.overlap import summaries
-from list3r.memory.records import ChunkResult, FrameSamples, Votes
+from list3r.memory.records import ChunkResult, FrameSamples, LocalLibrary, Votes
 from list3r.memory.store.store import Store
 
 GROW = ConsolidationSettings(whole_chunks=0)
@@ -389,3 +389,15 @@ def test_what_moves_is_followed_while_the_library_grows(tmp_path: Path) -> None:
         consolidate(store, settings=GROW)
     check(store)
     store.close()
+
+
+def test_a_chunk_whose_features_have_another_length_is_merged_by_its_surfaces(walks: ModuleType, store: Store) -> None:
+    for index in range(3):
+        add(store, visit(walks, index, index))
+    before = len(store.instances.all())
+    other = visit(walks, 3, 1)
+    shorter = tuple(dataclasses.replace(n, feature=n.feature[:16]) for n in other.library.instances)
+    add(store, dataclasses.replace(other, library=LocalLibrary(shorter, other.library.cannot_link, "other@1/16")))
+    add(store, visit(walks, 4, 2))
+    assert len(store.instances.all()) == before
+    check(store)

@@ -90,6 +90,7 @@ SOME = {
     "aliases": "UPDATE aliases SET instance = id",
     "memory gravity: value": "UPDATE memory SET value = '\"sideways\"' WHERE key = 'gravity'",
     "edges 1:2:loop:0:3: scores": "UPDATE edges SET scores = '{\"s_det\": {}}'",
+    "local_instances 1:5: feature": "UPDATE local_instances SET feature = zeroblob(20) WHERE local_id = 5",
 }
 
 
@@ -110,6 +111,7 @@ def test_a_lie_is_one_line_that_names_table_and_row(
         store.ids.aliases()
         assert store.facts.gravity
         store.edges.all()
+        store.local_instances.nodes()
 
 
 def test_an_edit_refuses_overlaps_of_local_instances_that_are_gone(

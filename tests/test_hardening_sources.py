@@ -11,6 +11,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -18,8 +19,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from list3r.cli.app import run
+from list3r.frames import layout
 from list3r.frames.decoding.decode import read_color, read_raw_depth
 from list3r.frames.files import too_many_pixels
 from list3r.frames.recordings import bag_chunks, stored
@@ -298,3 +302,19 @@ def test_bombs_take_no_memory(tmp_path: Path) -> None:
 
     told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, preexec_fn=limit)
     assert told.returncode == 2 and "megapixels" in told.stderr, told.stderr
+
+
+@given(st.text("ab\r\né", max_size=60), st.booleans())
+def test_lists_are_read_or_refused_by_the_number_and_length_of_their_lines(text: str, whole: bool) -> None:
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        patch.setattr(layout, "_MOST_LINES", 9)
+        patch.setattr(layout, "_LONGEST_LINE", 8)
+        path = Path(folder) / "list.txt"
+        path.write_bytes(text.encode())
+        ended = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        lines = ended[:-1] if whole or not ended[-1] else ended
+        if len(ended) - 1 > 9 or max(map(len, ended)) > 8:
+            with pytest.raises(SourceError, match=r"over 9 lines|line of over"):
+                list(layout.read_lines(path, whole=whole))
+        else:
+            assert list(layout.read_lines(path, whole=whole)) == lines

@@ -128,19 +128,25 @@ def read_lines(path: Path, *, whole: bool = False) -> Iterator[str]:
     """
     try:
         with TextIOWrapper(open_ordinary(path, MAX_LIST_BYTES), "utf-8", "replace") as file:
-            yield from (line.rstrip("\n") for line in _bounded(path, file) if not whole or line.endswith("\n"))
+            _check_lines(path, file)
+            yield from (line.rstrip("\n") for line in file if not whole or line.endswith("\n"))
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _bounded(path: Path, file: TextIOWrapper) -> Iterator[str]:
-    """Lines with their ends, as long as they are no more and no longer than those of any list."""
-    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE + 1), "")):
-        if number > _MOST_LINES:
+def _check_lines(path: Path, file: TextIOWrapper) -> None:
+    """Raise `SourceError` for more and longer lines than any list has, counted before one is taken out."""
+    count = unended = 0
+    for block in iter(lambda: file.read(_LONGEST_LINE), ""):
+        first, last = block.find("\n"), block.rfind("\n")
+        count += block.count("\n")
+        unended += len(block) if first < 0 else first
+        if count > _MOST_LINES:
             raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
-        if len(line) > _LONGEST_LINE:
+        if unended > _LONGEST_LINE:
             raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
-        yield line
+        unended = unended if first < 0 else len(block) - 1 - last
+    file.seek(0)
 
 
 def pose_matrix(values: Iterable[float]) -> NDArray[np.float64] | None:

@@ -81,6 +81,10 @@ _LENGTH = Rule(f"{_ANY.condition} AND {{}} >= 0", "a number from 0 on")
 _CHUNK, _LOCAL, _FRAME = _integer(0), _integer(-1), _integer(0)
 _SIM3 = _checked("list3r_sim3", "a similarity")
 _ARCHIVE = Rule("typeof({}) = 'blob'", "arrays")
+_FIRST_FEATURE = (
+    "SELECT length(o.feature) / 4 * 4 FROM local_instances o WHERE o.chunk_id = local_instances.chunk_id"
+    " ORDER BY o.local_id LIMIT 1"
+)
 
 RULES: Mapping[str, Mapping[str, Rule]] = {
     "memory": {
@@ -152,7 +156,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "stability": _ANY,
         "structure": _FLAG,
         "plane": _maybe(_checked("list3r_plane", "four finite numbers")),
-        "feature": _bytes(4, "numbers"),
+        "feature": Rule(f"typeof({{}}) = 'blob' AND length({{}}) = ({_FIRST_FEATURE})", "as long as the chunk's first"),
         "track": _ARCHIVE,
         "dynamic": _FLAG,
         "motion": _maybe(_ARCHIVE),

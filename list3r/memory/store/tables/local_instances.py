@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -166,10 +166,15 @@ class LocalInstances:
         self._supports.add(chunk_id, instance.local_id, instance.support)
 
     def nodes(self, chunk_ids: Sequence[int] | None = None, *, scraps: bool = False) -> list[LocalNode]:
-        """Return local instances, or the `scraps`, without masks, of some chunks or of all, by (chunk, local id)."""
-        if chunk_ids is None:
-            return self._nodes.all("scrap = ?", (scraps,))
-        return self._nodes.all(f"scrap = ? AND chunk_id IN ({','.join('?' * len(chunk_ids))})", (scraps, *chunk_ids))
+        """Return local instances, or the `scraps`, without masks, of some chunks or of all, by (chunk, local id).
+
+        A feature of another length than the first one of the memory, of another embedding space, is given as zeros.
+        """
+        which = "" if chunk_ids is None else f" AND chunk_id IN ({','.join('?' * len(chunk_ids))})"
+        found = self._nodes.all(f"scrap = ?{which}", (scraps, *(chunk_ids or ())))
+        query = "SELECT length(feature) / 4 FROM local_instances ORDER BY chunk_id, local_id LIMIT 1"
+        blank = np.zeros(self._connection.rows(query)[0][0] if found else 0, np.float32)
+        return [n if len(n.feature) == len(blank) else replace(n, feature=blank) for n in found]
 
     def scraps(self) -> list[tuple[int, int]]:
         """Return (chunk id, local id) of all scraps, in order."""
