@@ -126,6 +126,20 @@ def test_an_edit_refuses_overlaps_of_local_instances_that_are_gone(
     assert "local" in capsys.readouterr().err
 
 
+def test_an_edit_refuses_overlaps_of_a_chunk_that_is_redundant(
+    hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sqlite3.connect(rich) as database:
+        database.execute("DELETE FROM members")
+        hostile.lies.sign(database)
+    assert run(["merge", str(rich), "2", "5"]) == 2
+    assert "chunk 2" in capsys.readouterr().err
+    assert run(["verify", str(rich)]) == 1
+    assert "overlaps: chunk 2 is redundant" in capsys.readouterr().out
+    repair(rich)
+    assert run(["merge", str(rich), "2", "5"]) == 0
+
+
 def test_a_label_that_is_no_text_is_mended(hostile: SimpleNamespace, rich: Path) -> None:
     with sqlite3.connect(rich) as database:
         database.execute(SOME["instances 3: label"])

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
+from pathlib import Path
 
 import numpy as np
 
@@ -65,16 +66,30 @@ class PairCache(LruCache[tuple[int, int], _LinkedPair]):
         super().__init__(_KEPT)
 
 
+class _Chunks(dict[int, SettledRow]):
+    """Settled chunks by id. Raises `MemoryFileError` for one that a file speaks of and does not have."""
+
+    def __init__(self, path: Path, rows: Mapping[int, SettledRow]) -> None:
+        super().__init__(rows)
+        self._path = path
+
+    def __missing__(self, chunk_id: int) -> SettledRow:
+        raise MemoryFileError(
+            f"{self._path} speaks of chunk {chunk_id}, which is not placed or said to add nothing; "
+            f"run `list3r verify {self._path}`, `list3r repair {self._path}` saves what is sound"
+        )
+
+
 class Region:
     """The chunks of a memory as one derivation sees them."""
 
     def __init__(self, store: Store, summaries: Summaries, world: World, settings: ConsolidationSettings) -> None:
         self.store, self.world, self.settings = store, world, settings
         self.summaries = summaries
-        self.settled = store.library.settled.all()
+        self.settled = _Chunks(store.path, store.library.settled.all())
         """The settled chunks by id."""
         redundant = store.library.redundant.chunks()
-        self.rows = {k: r for k, r in self.settled.items() if k not in redundant}
+        self.rows = _Chunks(store.path, {k: r for k, r in self.settled.items() if k not in redundant})
         """Those of them that are not redundant."""
         if self.settled and not self.rows:
             file = store.path
@@ -147,7 +162,8 @@ class Region:
 
     def enter(self, chunk_id: int) -> None:
         """Take in a chunk that is not redundant any more."""
-        self.rows = dict(sorted({**self.rows, chunk_id: self.settled[chunk_id]}.items()))
+        rows = {**self.rows, chunk_id: self.settled[chunk_id]}
+        self.rows = _Chunks(self.store.path, dict(sorted(rows.items())))
         self._extents = None
 
     def components(self, keys: Iterable[Key]) -> dict[int, int]:

@@ -341,6 +341,11 @@ def bad_references(database: sqlite3.Connection, name: str) -> Iterator[str]:
             f"SELECT chunk_id, frame_index FROM keyframes k WHERE NOT EXISTS ({inside} AND frame_index <= last_frame)"
         )
         yield from (f"keyframes {u}:{n}: it is no frame of its chunk" for u, n in database.execute(query))
+    if name == "overlaps":
+        chunks = "SELECT u AS chunk_id FROM overlaps UNION SELECT v FROM overlaps"
+        alone = "SELECT chunk_id FROM redundant EXCEPT SELECT chunk_id FROM members"
+        for (chunk_id,) in database.execute(f"{chunks} INTERSECT SELECT * FROM ({alone})"):
+            yield f"overlaps: chunk {chunk_id} is redundant, and meets none"
     if name == "aliases":
         yield from _circles(dict(database.execute("SELECT id, instance FROM aliases").fetchall()))
 
