@@ -32,7 +32,7 @@ from list3r.memory.store.read_checks import ReadChecks
 from list3r.memory.store.store import Store
 
 LONGEST_S = 10.0
-"""Processor time of a command; the clock may show `WAITING_S` on a busy machine, in which a wait is seen."""
+"""Processor time of a command; one that waits for something else than a processor for `WAITING_S` hangs too."""
 WAITING_S = 120.0
 SERVING_S = 10.0
 COSTLY = ("simready", "prompt", "report", "plan", "usd")
@@ -213,6 +213,14 @@ def _forget_peak() -> None:
         file.write("5")
 
 
+def _ready_s() -> float:
+    """Return how long this process had a processor or stood in line for one, where the system tells it."""
+    with contextlib.suppress(OSError):
+        had, stood = Path("/proc/self/schedstat").read_text().split()[:2]
+        return (int(had) + int(stood)) / 1e9
+    return 0.0
+
+
 def _place(error: BaseException) -> str:
     where = traceback.extract_tb(error.__traceback__)[-1]
     return f"{Path(where.filename).name}:{where.lineno}"
@@ -220,16 +228,24 @@ def _place(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def _alarm(longest_s: float | None, serves: bool) -> Iterator[None]:
+    started, ready = time.monotonic(), _ready_s()
+
     def ring(*_: object) -> None:
         raise _TooLongError
 
+    def look(*_: object) -> None:
+        waited_s = time.monotonic() - started - (_ready_s() - ready)
+        if waited_s >= WAITING_S - 1.0:
+            ring()
+        signal.setitimer(signal.ITIMER_REAL, WAITING_S - waited_s)
+
     def interrupt(*_: object) -> None:
-        signal.signal(signal.SIGALRM, ring)
+        signal.signal(signal.SIGALRM, look)
         signal.setitimer(signal.ITIMER_REAL, WAITING_S)
         raise KeyboardInterrupt
 
     before = {signal.SIGPROF: signal.signal(signal.SIGPROF, ring)}
-    before[signal.SIGALRM] = signal.signal(signal.SIGALRM, interrupt if serves else ring)
+    before[signal.SIGALRM] = signal.signal(signal.SIGALRM, interrupt if serves else look)
     signal.setitimer(signal.ITIMER_PROF, longest_s or LONGEST_S)
     signal.setitimer(signal.ITIMER_REAL, SERVING_S if serves else WAITING_S)
     try:
