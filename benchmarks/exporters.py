@@ -3,13 +3,15 @@
 python benchmarks/exporters.py --instances 0,1,1000,100000 --json benchmarks/results/exporters.json
 
 The memories are made up: things of 60 points with labels in several scripts, six to a table, in rooms side by side, all
-written through the store's verbs; they have no stored pictures. Each export is the program in a process of its own.
+written through the store's verbs; every chunk keeps ten pictures, the first of which shows its things. Each export is
+the program in a process of its own. `plan.svg` among the formats is the plan as SVG.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import io
 import json
 import os
 import subprocess
@@ -20,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import write_json
+from machine import STARTED_AT, write_json
+from PIL import Image
 
 from list3r.exporters.registry import FORMATS
 from list3r.memory.geometry import OrientedBox, Sim3
@@ -28,6 +31,7 @@ from list3r.memory.records import (
     ChunkResult,
     FrameSamples,
     Instance,
+    Keyframe,
     LocalInstance,
     LocalLibrary,
     MaskTrack,
@@ -46,7 +50,7 @@ OPTIONS = {"simready": ("--density", "300")}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--instances", default="0,1,1000,100000")
-    parser.add_argument("--formats", default=",".join(FORMATS))
+    parser.add_argument("--formats", default=",".join([*FORMATS, "plan.svg"]))
     parser.add_argument("--limit", type=float, default=600.0, help="Processor seconds of one export, at most.")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     words = parser.parse_args()
@@ -68,16 +72,17 @@ def main() -> None:
 
 def is_here(name: str) -> bool:
     """Tell whether the package that a format takes is installed."""
-    package = FORMATS[name].package
+    package = FORMATS[name.split(".")[0]].package
     return not package or importlib.util.find_spec(package) is not None
 
 
 def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, Any]:
     """Export in a process of its own; its processor seconds, peak memory and what it wrote."""
     folder.mkdir()
-    suffixes = FORMATS[name].suffixes
-    out = folder / f"out{suffixes[0] if suffixes else ''}"
-    command = [sys.executable, "-m", "list3r", "export", str(memory), "--to", name, "--out", str(out)]
+    to, _, ending = name.partition(".")
+    suffix = f".{ending}" if ending else (*FORMATS[to].suffixes, "")[0]
+    out = folder / f"out{suffix}"
+    command = [sys.executable, "-m", "list3r", "export", str(memory), "--to", to, "--out", str(out)]
     began = time.monotonic()
     process = subprocess.Popen([*command, *OPTIONS.get(name, ())], stdout=subprocess.DEVNULL, preexec_fn=_limit(limit))
     _, status, used = os.wait4(process.pid, 0)
@@ -85,6 +90,7 @@ def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, An
     files = [p for p in folder.rglob("*") if p.is_file()]
     row: dict[str, Any] = {
         "format": name,
+        "commit": STARTED_AT,
         "done": process.returncode == 0,
         "cpu_s": round(used.ru_utime + used.ru_stime, 2),
         "wall_s": round(time.monotonic() - began, 1),
@@ -174,6 +180,24 @@ def local_thing(k: int, i: Instance, frame: int, rng: np.random.Generator) -> Lo
     return LocalInstance(k, track, np.eye(1, 16, k % 16, dtype=np.float32)[0], support, stability=0.9)
 
 
+def picture(frame: int) -> Keyframe:
+    """A keyframe kept for its picture alone."""
+    pixels = np.random.default_rng(frame).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    jpeg = io.BytesIO()
+    Image.fromarray(pixels).resize((64, 48)).save(jpeg, "JPEG")
+    return Keyframe(
+        frame_index=frame,
+        T_chunk_cam=np.eye(4),
+        descriptor=np.zeros(8, np.float32),
+        keypoints_xy=np.zeros((0, 2), np.float32),
+        keypoint_descriptors=np.zeros((0, 32), np.uint8),
+        points_cam=np.zeros((0, 3), np.float32),
+        depth_small=np.zeros((0, 0), np.float32),
+        camera_small=(1.0, 1.0, 0.0, 0.0),
+        jpeg=jpeg.getvalue(),
+    )
+
+
 def chunk_of(index: int, local: tuple[LocalInstance, ...]) -> ChunkResult:
     """A chunk of ten frames, the camera at rest."""
     frames = np.arange(10 * index, 10 * index + 10)
@@ -197,7 +221,7 @@ def chunk_of(index: int, local: tuple[LocalInstance, ...]) -> ChunkResult:
         intrinsics=(60.0, 60.0, 32.0, 24.0),
         image_size=(48, 64),
         scale_kind="metric",
-        keyframes=(),
+        keyframes=tuple(picture(int(f)) for f in frames),
         samples=nothing,
         library=LocalLibrary(local, np.zeros((0, 2), np.int32), "made@1/16"),
     )

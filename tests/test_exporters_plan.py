@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from list3r.exporters.components import read_components
-from list3r.exporters.plan.colors import PALETTE, plan_colors
+from list3r.exporters.plan.colors import PALETTE, nearest_before, plan_colors
 from list3r.exporters.plan.frame import PlanFrame, choose_rotation
 from list3r.exporters.plan.labels import TagTarget, crossings, place_tags
 from list3r.exporters.plan.layout import PlanSettings, choose_layout
@@ -144,3 +144,14 @@ def test_a_vector_plan_says_what_the_picture_says(make_memory: Callable[..., Pat
     assert "room.l3r" in texts and "Übel <b> & \\x07" in texts and {"2", "3", "4", "5"} <= set(texts)
     images = list(page.iter("{http://www.w3.org/2000/svg}image"))
     assert [i.get("href", "")[:22] for i in images] == ["data:image/png;base64,"]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1400), st.integers(0, 2**32 - 1))
+def test_the_nearest_before_are_those_that_are_found_one_by_one(count: int, seed: int) -> None:
+    xy = np.random.default_rng(seed).normal(size=(count, 2))
+    found = nearest_before(xy, 6)
+    assert len(found) == count
+    for k in range(0, count, 37):
+        away = np.linalg.norm(xy[:k] - xy[k], axis=1)
+        assert found[k] == np.argsort(away, kind="stable")[:6].tolist()

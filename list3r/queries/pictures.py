@@ -15,7 +15,7 @@ from list3r.memory.masks import FULL_SIDE_PX, decode_mask, shown_surface
 from list3r.memory.records import ChunkRow, Instance, MaskTrack, Observation
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance
-from list3r.queries.views.camera import camera_of_frame
+from list3r.queries.views.camera import PosedCamera, cameras_of_frames
 from list3r.queries.views.visibility import in_front, look
 
 Box = tuple[float, float, float, float]
@@ -235,36 +235,61 @@ def _views(store: Store, o: Observation, settings: PictureSettings) -> list[_Vie
 
 
 def _projected(store: Store, instance: Instance, settings: PictureSettings) -> InstancePicture:
-    best: tuple[float, KeyframePicture, Box, float] | None = None
-    for picture in _looking_at(store, instance, settings.projected_frames):
-        camera = camera_of_frame(store, picture.frame_index, picture.session_id)
+    best: tuple[float, PosedCamera, int, Box, float] | None = None
+    for camera, chunk_id in store.derived.of(_PictureCameras).towards(store, instance, settings.projected_frames):
         for s in look(store, camera, in_front(store, camera, None)):
             worth = s.visible * s.inside * min(1.0, s.picture**0.5)
             if s.instance.id == instance.id and (best is None or worth > best[0]):
-                best = worth, picture, s.box_xyxy, s.visible
+                best = worth, camera, chunk_id, s.box_xyxy, s.visible
     if best is None:
         raise OptionError(
             f"no stored picture of {store.path} shows instance {instance.id}; "
             "pictures are kept by a build without --no-pictures"
         )
-    _, picture, box, visible = best
-    return InstancePicture(
-        instance.id, picture.session_id, picture.frame_index, keyframe_rgb(store, picture), box, None, visible
-    )
+    _, camera, chunk_id, box, visible = best
+    assert camera.frame is not None
+    rgb = decode_picture(store.keyframes.get(chunk_id, camera.frame.frame_index).jpeg)
+    return InstancePicture(instance.id, camera.session_id, camera.frame.frame_index, rgb, box, None, visible)
 
 
-def _looking_at(store: Store, instance: Instance, most: int) -> list[KeyframePicture]:
-    """Return keyframes of its component whose picture holds its centre, those in which it is largest first."""
-    poses = {(f.session_id, f.frame_index): S for f, S in store.trajectory.poses()}
-    lenses = {c.chunk_id: c.intrinsics for c in store.chunks.all()}
-    near = []
-    for p in keyframe_pictures(store):
-        S_world_cam = poses.get((p.session_id, p.frame_index))
-        if p.component != instance.component or S_world_cam is None:
-            continue
-        x, y, z = S_world_cam.inverse().apply(instance.center[None])[0]
-        fx, fy, cx, cy = lenses[p.chunk_id]
-        height, width = p.image_size
-        if z > 0 and 0 <= fx * x / z + cx < width and 0 <= fy * y / z + cy < height:
-            near.append((float(z), p.session_id, p.frame_index, p))
-    return [p for *_, p in sorted(near, key=lambda n: n[:3])[:most]]
+class _PictureCameras:
+    """The cameras of posed keyframes whose picture is stored, kept while the memory stays as it is."""
+
+    def __init__(self) -> None:
+        self._stamp: tuple[int, int, bool] | None = None
+        self._cameras: list[tuple[PosedCamera, int]] = []
+        """In the order of session and frame, with the chunk that keeps the picture."""
+        self._T_cam_world = np.zeros((0, 4, 4))
+        self._lenses = np.zeros((0, 4))
+        """fx, fy, cx, cy, px."""
+        self._sizes = np.zeros((0, 2))
+        """Height and width, px."""
+        self._components = np.zeros(0, np.int64)
+
+    def towards(self, store: Store, instance: Instance, most: int) -> list[tuple[PosedCamera, int]]:
+        """Return those of its component whose picture holds an instance's centre, the nearest first."""
+        if self._stamp != store.connection.stamp():
+            self._read(store)
+        x, y, z = (self._T_cam_world[:, :3, :3] @ instance.center + self._T_cam_world[:, :3, 3]).T
+        ahead = (z > 0) & (self._components == instance.component)
+        fx, fy, cx, cy = self._lenses.T
+        height, width = self._sizes.T
+        depth = np.where(ahead, z, 1.0)
+        u, v = fx * x / depth + cx, fy * y / depth + cy
+        chosen = np.flatnonzero(ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height))
+        nearest = chosen[np.argsort(z[chosen], kind="stable")[:most]]
+        return [self._cameras[k] for k in nearest.tolist()]
+
+    def _read(self, store: Store) -> None:
+        self._stamp = store.connection.stamp()
+        keeper: dict[tuple[int, int], int] = {}
+        for chunk in store.chunks.all():
+            for frame in store.keyframes.with_picture(chunk.chunk_id):
+                keeper.setdefault((chunk.session_id, frame), chunk.chunk_id)
+        cameras = cameras_of_frames(store, keeper) if keeper else []
+        self._cameras = [(c, keeper[c.session_id, c.frame.frame_index]) for c in cameras if c.frame is not None]
+        poses = np.array([c.T_world_cam for c in cameras]).reshape(-1, 4, 4)
+        self._T_cam_world = np.linalg.inv(poses)
+        self._lenses = np.array([c.intrinsics for c in cameras]).reshape(-1, 4)
+        self._sizes = np.array([c.image_size for c in cameras]).reshape(-1, 2)
+        self._components = np.array([c.component for c in cameras], np.int64)

@@ -77,8 +77,14 @@ def export(
     sizes = {str(path): path.stat().st_size for path in written}
     if json:
         print_answer({"format": to, "path": path, "bytes": size} for path, size in sizes.items())
+    elif find_format(to).folder:
+        say(f"{out}  {len(sizes)} file{'s' * (len(sizes) != 1)}, {_told(sum(sizes.values()))}")
     else:
-        say(*(f"{path}  {size / 1e6:.2f} MB" for path, size in sizes.items()))
+        say(*(f"{path}  {_told(size)}" for path, size in sizes.items()))
+
+
+def _told(size: int) -> str:
+    return f"{size / 1e6:.2f} MB" if size >= 1e4 else f"{size / 1e3:.1f} kB"
 
 
 def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:

@@ -21,6 +21,8 @@ PALETTE: tuple[Color, ...] = (
 )
 """After Okabe and Ito (2008), without black and yellow, which paper and ink take."""
 _NEIGHBOURS = 6
+_TOGETHER = 512
+"""So many places are compared with each other directly, and with those before them through one tree."""
 
 
 def plan_colors(centers: Mapping[int, NDArray[np.float64]]) -> dict[int, Color]:
@@ -31,12 +33,27 @@ def plan_colors(centers: Mapping[int, NDArray[np.float64]]) -> dict[int, Color]:
     ids = sorted(centers)
     if not ids:
         return {}
-    xy = np.array([centers[n] for n in ids], dtype=np.float64)
+    near = nearest_before(np.array([centers[n] for n in ids], dtype=np.float64), _NEIGHBOURS)
     chosen: list[int] = []
     for k, instance_id in enumerate(ids):
-        away = np.linalg.norm(xy[:k] - xy[k], axis=1)
-        near = np.argsort(away, kind="stable")
-        used = {chosen[n] for n in near[:_NEIGHBOURS].tolist()}
+        used = {chosen[n] for n in near[k]}
         wish = [(instance_id + step) % len(PALETTE) for step in range(len(PALETTE))]
         chosen.append(next(c for c in wish if c not in used))
     return {n: PALETTE[c] for n, c in zip(ids, chosen, strict=True)}
+
+
+def nearest_before(xy: NDArray[np.float64], count: int) -> list[list[int]]:
+    """Return for each place (N, 2) which of those before it are nearest, at most `count`, in time near to linear."""
+    from scipy.spatial import cKDTree
+
+    out: list[list[int]] = []
+    for start in range(0, len(xy), _TOGETHER):
+        block = xy[start : start + _TOGETHER]
+        known = np.zeros((len(block), 0), np.int64)
+        if start:
+            known = np.asarray(cKDTree(xy[:start]).query(block, k=list(range(1, min(count, start) + 1)))[1])
+        for k in range(len(block)):
+            among = np.concatenate([known[k], np.arange(start, start + k)])
+            away = np.linalg.norm(xy[among] - block[k], axis=1)
+            out.append(among[np.argsort(away, kind="stable")[:count]].tolist())
+    return out

@@ -38,8 +38,9 @@ def draw_picture(sheet: Sheet, component: Component, supports: dict[int, Support
 
 def draw_boxes(sheet: Sheet, things: list[Instance], tagged: set[int]) -> None:
     """Draw oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
-    for instance in sorted(things, key=lambda i: (-_area(sheet.footprint(i)), i.id)):
-        color, outline = sheet.color(instance.id), sheet.footprint(instance)
+    outlines = {i.id: sheet.footprint(i) for i in things}
+    for instance in sorted(things, key=lambda i: (-_area(outlines[i.id]), i.id)):
+        color, outline = sheet.color(instance.id), outlines[instance.id]
         if instance.id not in tagged:
             sheet.draw.line([*outline, outline[0], outline[1]], fill=(*color, 110), width=OVERSAMPLING)
             continue

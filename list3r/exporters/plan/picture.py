@@ -53,7 +53,8 @@ def plan_image(store: Store, component: Component, settings: PlanSettings | None
 
 
 def _drawn(store: Store, component: Component, settings: PlanSettings, *, vector: bool) -> Sheet:
-    limits = (settings.points_per_instance, settings.points_per_structure)
+    share = settings.points_of_instances // max(len(component.instances), 1)
+    limits = (min(settings.points_per_instance, max(share, 1)), settings.points_per_structure)
     supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
     things = [i for i in component.instances if not i.structure and has_box(i)]
     tagged = seen_most(things, settings.max_tags)

@@ -46,7 +46,7 @@ def write_report(memory: SceneMemory, path: str | Path, settings: ReportSettings
     with replacing(path) as temporary:
         instances = memory.instances(structure=None)
         data = {
-            "about": _about(memory),
+            "about": _about(memory) | {"most_crops": settings.crops},
             "instances": [_instance(i) for i in instances],
             "relations": _relations(memory, instances),
             "changes": [_change(c) for c in memory.changes()],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +54,13 @@ def camera_of_frame(store: Store, frame: int, session: int | None = None) -> Pos
         hint = "no frame has one" if near is None else f"the nearest that has one is {near.frame_index}"
         raise OptionError(f"frame {frame} has no pose in {store.path}; {hint}")
     return _camera(store, found[0])
+
+
+def cameras_of_frames(store: Store, frames: Container[tuple[int, int]]) -> list[PosedCamera]:
+    """Return the cameras of those of some frames (session id, Frame.index) that have a pose, in their order."""
+    chunks = {c.chunk_id: c for c in store.chunks.all()}
+    rows = (f for f in store.frames.all() if f.state == "posed" and (f.session_id, f.frame_index) in frames)
+    return [_camera_in(chunks[f.chunk_id], f) for f in rows if f.chunk_id in chunks]
 
 
 def camera_at_time(store: Store, time_s: float, session: int | None = None) -> PosedCamera:
@@ -108,7 +115,10 @@ def _checked_session(store: Store, session: int | None) -> int | None:
 
 
 def _camera(store: Store, frame: FrameRow) -> PosedCamera:
-    chunk = _chunk_of(store.chunks.all(frame.session_id), frame)
+    return _camera_in(_chunk_of(store.chunks.all(frame.session_id), frame), frame)
+
+
+def _camera_in(chunk: ChunkRow, frame: FrameRow) -> PosedCamera:
     S_world_cam = chunk.S_world_chunk @ Sim3.from_matrix(frame.T_chunk_cam)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = S_world_cam.rotation, S_world_cam.translation
