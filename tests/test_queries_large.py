@@ -7,12 +7,14 @@ import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance, Relation
+from list3r.memory.store.read_checks import unbelieved
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.match import Match
@@ -199,10 +201,27 @@ def test_find_in_a_large_damaged_file_answers_as_in_a_sound_one_or_refuses(
         with contextlib.closing(sqlite3.connect(path)) as database, database:
             database.execute(damage, (n,))
         with Store.open(path) as damaged:
-            for text in texts:
+            for text in texts * 2:
                 try:
                     assert plain(find(damaged, text)) == wanted[text], (n, text)
                 except MemoryFileError as error:
                     assert "repair" in str(error)
                     refused += 1
     assert refused
+
+
+def test_rows_that_find_ranks_in_a_large_file_are_checked_once(store: Store, large: pytest.MonkeyPatch) -> None:
+    large.setattr(gather, "EVERYTHING", 0)
+    large.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
+    large.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
+    checked: list[int] = []
+
+    def count(*asked: Any) -> list[Any]:
+        checked.append(len(asked[2]))
+        return unbelieved(*asked)
+
+    large.setattr("list3r.memory.store.connection.unbelieved", count)
+    with Store.open(store.path) as again:
+        first, ranked = plain(find(again, "red box")), sum(checked)
+        checked.clear()
+        assert plain(find(again, "red box")) == first and sum(checked) == 5 < ranked

@@ -354,12 +354,18 @@ class Connection:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
         if self._checks.by_part(table):
             written = frozenset[int]() if self._sums is None else self._sums.touched(table)
+            asked = [row for row in rows if int(row[0]) >> 4 not in written]
             try:
-                bad = unbelieved(self._database, table, [row for row in rows if int(row[0]) >> 4 not in written])
+                bad = unbelieved(self._database, table, asked)
             except FAILURES as error:
                 raise MemoryFileError(explained(self.path, error)) from error
             self.refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
+            self._checks.keep_sound(table, (row[0] for row in asked))
         return rows
+
+    def rows_unchecked(self, table: str, ids: Iterable[int]) -> list[int]:
+        """Those of some ids whose rows were not checked yet, of a table that is checked row by row."""
+        return self._checks.unchecked(table, ids)
 
     def sound(self, table: str, keys: Iterable[int]) -> None:
         """Check what rows with these first keys stand in, where the table is not checked as a whole."""

@@ -27,6 +27,8 @@ MOST_ROWS = 50_000
 FAILURES = (sqlite3.Error, UnicodeError)
 """What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
 GEOMETRY_BYTES = 24 * 8
+_KEPT_ROWS = 500_000
+"""Of one table, that are known to be sound; 50 MB."""
 _PARTS = 500
 """Parts of the sums that are asked for in one statement."""
 BOXES = "instance_boxes"
@@ -60,6 +62,7 @@ class ReadChecks:
         self._busy = False
         self._known = {*summed_tables(), BOXES, WORDS} - (set() if whole else _large(database))
         self._sound_parts: set[tuple[str, int]] = set()
+        self._sound_rows: dict[str, set[int]] = {}
         database.set_authorizer(self._note)
 
     def by_part(self, table: str) -> bool:
@@ -94,6 +97,18 @@ class ReadChecks:
             fresh = {(table, summed_tables()[table].part_of_first(int(k))) for k in keys} - self._sound_parts
             self.damage = self._found(sorted(fresh))
         return self.damage
+
+    def keep_sound(self, table: str, ids: Iterable[int]) -> None:
+        """Remember rows that were checked one by one."""
+        kept = self._sound_rows.setdefault(table, set())
+        if len(kept) > _KEPT_ROWS:
+            kept.clear()
+        kept.update(ids)
+
+    def unchecked(self, table: str, ids: Iterable[int]) -> list[int]:
+        """Those of some ids whose rows were not checked one by one."""
+        kept = self._sound_rows.get(table, set[int]())
+        return [n for n in ids if n not in kept]
 
     def _found(self, names: Sequence[str] | Sequence[tuple[str, int]]) -> str | None:
         """The first damage of tables, or of parts of tables."""
@@ -178,14 +193,21 @@ def bad_words(database: sqlite3.Connection) -> Iterator[str]:
 def unbelieved(database: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
     """Ids of those of some whole rows of a table, the id first, that its checksums do not know."""
     parts = sorted({int(row[0]) >> 4 for row in rows})
-    known: dict[int, list[bytes]] = {}
+    known: dict[int, bytes] = {}
     for start in range(0, len(parts), _PARTS):
         some = parts[start : start + _PARTS]
         query = f"SELECT part, crcs FROM sums WHERE name = ? AND part IN ({','.join('?' * len(some))})"
         for part, crcs in database.execute(query, (table, *some)):
-            held = crcs if isinstance(crcs, bytes) else b""
-            known[part] = [held[k : k + 4] for k in range(0, len(held) - 4, 4)]
-    return [row[0] for row in rows if row_crc(row) not in known.get(int(row[0]) >> 4, ())]
+            known[part] = crcs[: -4 - len(crcs) % 4] if isinstance(crcs, bytes) else b""
+    return [row[0] for row in rows if not _among(row_crc(row), known.get(int(row[0]) >> 4, b""))]
+
+
+def _among(crc: bytes, crcs: bytes) -> bool:
+    """Whether a sum is one of those of a part."""
+    at = crcs.find(crc)
+    while at % 4 and at > 0:
+        at = crcs.find(crc, at + 1)
+    return at >= 0
 
 
 def any_text(text: bytes) -> str:

@@ -77,19 +77,22 @@ class Table(Generic[R]):
             what = f"{', '.join(column.names)} of a row of {self._name} cannot be read ({error})"
             raise MemoryFileError(f"{what}; run `list3r verify` on the file") from error
 
-    def columns_among(self, names: Sequence[str], column: str, values: Iterable[int]) -> Iterator[tuple[Any, ...]]:
-        """Yield some columns, as they are stored, of the rows whose column is one of some integers, in no order.
+    def columns_of(self, names: Sequence[str], ids: Iterable[int]) -> Iterator[tuple[Any, ...]]:
+        """Yield some columns, as they are stored, of the rows with some ids, in no order.
 
-        Only these are read where the table is checked as a whole; else whole rows are, and checked one by one.
+        Where the table is not checked as a whole, a row is read whole and checked when it is first asked for.
         """
-        whole = self._checked and self._connection.by_part(self._name)
-        read = self._columns.names if whole else names
-        place = [read.index(name) for name in names]
-        query = f"SELECT {', '.join(read)} FROM {self._source} WHERE {column} IN ({{}})"
-        for part, marks in batches(values):
-            rows = self._connection.rows(query.format(marks), part)
-            for row in self._connection.believed(self._name, rows) if whole else rows:
-                yield tuple(row[k] for k in place)
+        wanted = list(ids)
+        by_part = self._checked and self._connection.by_part(self._name)
+        fresh = self._connection.rows_unchecked(self._name, wanted) if by_part else []
+        place = [self._columns.names.index(name) for name in names]
+        whole = f"SELECT {', '.join(self._columns.names)} FROM {self._source} WHERE id IN ({{}})"
+        for part, marks in batches(fresh):
+            rows = self._connection.believed(self._name, self._connection.rows(whole.format(marks), part))
+            yield from (tuple(row[k] for k in place) for row in rows)
+        query = f"SELECT {', '.join(names)} FROM {self._source} WHERE id IN ({{}})"
+        for part, marks in batches(set(wanted).difference(fresh) if fresh else wanted):
+            yield from self._connection.rows(query.format(marks), part)
 
     def add(self, record: R, **more: Value) -> int:
         """Insert a record; the number of its row. `more` are columns that are none of its fields or override them."""

@@ -117,7 +117,7 @@ class Instances:
         """Return confidence, state and structure of some instances, by id: what answers are ordered by, before those
         are read that are given.
         """
-        rows = self._rows.columns_among(("id", "confidence", "state", "structure"), "id", ids)
+        rows = self._rows.columns_of(("id", "confidence", "state", "structure"), ids)
         return {n: (float(confidence), state, structure) for n, confidence, state, structure in rows}
 
     def states(self) -> dict[int, tuple[str, int]]:
