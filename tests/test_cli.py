@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import list3r
-from list3r.cli.app import commands
+from list3r.cli.app import GROUPS, MODULES, commands
 from list3r.exporters.registry import FORMATS
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
@@ -67,6 +67,11 @@ COMMANDS = (
 def test_every_command_has_help_with_an_example(command: str) -> None:
     text = run(*command.split("."), "--help")
     assert f"Example: list3r {command.replace('.', ' ')}" in text
+
+
+def test_every_command_stands_in_one_group_of_the_help() -> None:
+    grouped = [name for names in GROUPS.values() for name in names]
+    assert sorted(grouped) == sorted(name for names in MODULES.values() for name in names)
 
 
 def test_the_readme_names_every_command() -> None:

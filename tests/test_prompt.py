@@ -19,6 +19,7 @@ from list3r.api import SceneMemory
 from list3r.cli.app import run
 from list3r.exporters.prompt.cognitive_map import cognitive_maps
 from list3r.exporters.prompt.coverage import cover
+from list3r.exporters.prompt.pack import PackSettings, write_prompt
 from list3r.exporters.prompt.tokens import count_tokens
 from list3r.memory.errors import ExportError, OptionError
 from list3r.memory.store.store import Store
@@ -183,6 +184,16 @@ def test_the_pack_is_whole(memory: SceneMemory, tmp_path: Path) -> None:
     assert told["views"] == [{"file": "views/session1_frame000000.jpg", "instances": [2, 3, 4, 5]}]
     assert told["without_picture"] == [] and told["tokens"] <= 900
     assert Image.open(tmp_path / "pack/views/session1_frame000000.jpg").width >= 960
+
+
+def test_grids_of_many_things_hold_those_that_have_a_row(memory: SceneMemory, tmp_path: Path) -> None:
+    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90, things_on_grids=1))
+    maps = json.loads((tmp_path / "pack/cognitive_map.json").read_text())
+    listed = json.loads((tmp_path / "pack/list3r-prompt.json").read_text())["listed"]
+    things = [i.id for i in memory.instances()]
+    held = [n for n in listed if n in things]
+    assert maps["left_out"] == len(things) - len(held) > 0
+    assert all(list(map(int, grid["instances"])) == sorted(held) for grid in maps["grids"])
 
 
 def test_a_pack_is_replaced_and_other_folders_are_not(memory: SceneMemory, tmp_path: Path) -> None:

@@ -47,9 +47,9 @@ MODULES: dict[str, tuple[str, ...]] = {
 """The commands that each module of this folder adds; it is imported when one of them is asked for, or the help."""
 GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
-    "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config"),
+    "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config", "serve"),
     "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
-    "Export": ("export",),
+    "Hand over": ("export", "catalog"),
     "Measure": ("eval",),
     "Keep": ("verify", "repair", "doctor", "models"),
 }
@@ -62,8 +62,7 @@ class GroupedCommands(typer.core.TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
         commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        others = tuple(n for n in commands if not any(n in names for names in GROUPS.values()))
-        for title, names in (*GROUPS.items(), ("Other", others)):
+        for title, names in GROUPS.items():
             rows = [(n, c.get_short_help_str(limit=300)) for n in names if (c := commands.get(n)) is not None]
             if rows:
                 with formatter.section(title):

@@ -35,6 +35,8 @@ class PackSettings:
     """Budget of the text."""
     question: str | None = None
     """What its words name comes first."""
+    things_on_grids: int = 2000
+    """In a memory of more things the grids of the cognitive map hold only those that have a row in the text."""
     least_visible: float = 0.3
     """Share of an instance that must show for a view to count for it."""
     least_side_px: float = 12.0
@@ -54,7 +56,9 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
     listed = [n for n in prompt.listed if n in things]
     with replacing_folder(folder, "prompt") as temporary:
         (temporary / "scene.md").write_text(prompt.text, encoding="utf-8")
-        maps = cognitive_maps(instances, memory.units)
+        gridded = things if len(things) <= settings.things_on_grids else set(listed)
+        maps = cognitive_maps([i for i in instances if i.id in gridded], memory.units)
+        maps["left_out"] = len(things) - len(gridded)
         (temporary / "cognitive_map.json").write_text(json.dumps(maps, indent=1) + "\n", encoding="utf-8")
         memory.export("plan", temporary / "map.png")
         views = _write_views(memory, temporary / "views", listed, settings)
