@@ -17,7 +17,8 @@ import pytest
 import list3r
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.frames.live.feed import FeedState, LiveSettings
-from list3r.frames.live.stream import StreamFeed, is_stream, without_secrets
+from list3r.frames.live.spooled import StreamFeed
+from list3r.frames.live.stream import NetworkStream, is_stream, without_secrets
 from list3r.frames.source import open_source
 from list3r.frames.writers.pictures import jpeg
 from list3r.memory.errors import OptionError, SourceError
@@ -81,7 +82,7 @@ def admitted(feed: StreamFeed) -> FeedState:
 def test_a_lost_connection_is_made_again_and_leaves_a_cut(tmp_path: Path) -> None:
     told: list[str] = []
     with served(pictures(24), cut_after=9) as address:
-        feed = StreamFeed(address, tmp_path / "f", QUICK, None, told.append)
+        feed = StreamFeed(NetworkStream(address), tmp_path / "f", QUICK, None, told.append)
         state = admitted(feed)
     assert state.ended and state.reconnects >= 2 and len(told) >= 2
     assert state.count == state.received and 15 <= state.count <= 24
@@ -95,7 +96,7 @@ def test_a_lost_connection_is_made_again_and_leaves_a_cut(tmp_path: Path) -> Non
 def test_the_newest_wait_and_the_others_are_dropped_and_counted(tmp_path: Path) -> None:
     with served(pictures(30)) as address:
         settings = LiveSettings(most_waiting=10, retry_s=0.5, pause_s=0.05, silence_s=1.0)
-        feed = StreamFeed(address, tmp_path / "f", settings, None, lambda line: None)
+        feed = StreamFeed(NetworkStream(address), tmp_path / "f", settings, None, lambda line: None)
         while feed.state().received < 5:
             time.sleep(0.005)
         assert feed.admit()

@@ -22,7 +22,8 @@ from list3r.frames.base import SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, plan_chunks
 from list3r.frames.live.feed import Feed, FeedState, LiveSettings
 from list3r.frames.live.growing import FolderFeed
-from list3r.frames.live.stream import StreamFeed, is_stream, without_secrets
+from list3r.frames.live.spooled import StreamFeed
+from list3r.frames.live.stream import is_stream, open_camera, without_secrets
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError, TrackingError
 from list3r.memory.store.store import Store
@@ -187,7 +188,8 @@ def _feed(source: str, spool: Path, options: SourceOptions, how: LiveSettings, w
         raise OptionError(f"{spool} is left of a stream before; look at what is in it (a folder of images), remove it")
     if not spool.parent.is_dir():
         raise MemoryFileError(f"the folder {spool.parent} does not exist; create it first")
-    feed = StreamFeed(source, spool, how, options.fps, lambda line: watch.tell((line,)))
+    camera = open_camera(source, lambda line: watch.tell((line,)))
+    feed = StreamFeed(camera, spool, how, options.fps, lambda line: watch.tell((line,)))
     try:
         yield feed
     finally:

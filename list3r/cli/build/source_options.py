@@ -14,7 +14,7 @@ SourceArgument = Annotated[
     str,
     typer.Argument(
         metavar="SOURCE",
-        help="A video file, a folder of frames; build: also a webcam (/dev/video0) or the URL of a stream.",
+        help="A video file, a folder of frames; build: also a webcam (/dev/video0), a stream's URL, record3d:.",
         show_default=False,
     ),
 ]

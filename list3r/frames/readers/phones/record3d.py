@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 import re
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from list3r.frames.files import MAX_TEXT_BYTES
 from list3r.frames.layout import FolderLayout, Optics, read_json
 from list3r.frames.listing import FrameFile, FrameFiles
-from list3r.frames.options import SourceOptions, check_intrinsics
+from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
 from list3r.frames.recordings.stored import CodedArray, Stored, ZipMember
 from list3r.memory.errors import OptionError, SourceError
@@ -28,20 +29,83 @@ from list3r.memory.unpacking import open_archive, parse_json
 
 LEAST_CONFIDENCE = 2
 """Only what the sensor is most sure of (stored 0, 1, 2); lesser depth lies along edges."""
+METADATA = "metadata"
 _PICTURE = re.compile(r"rgbd/(\d{1,9})\.jpg")
 _MOST_METADATA = MAX_TEXT_BYTES
-_MOST_DEPTH_PIXELS = 2**19
+_LEAST_TURN = 1e-4
+"""Of a first pose that says more than that the recording begins there; nobody holds a phone as exactly level."""
+_AT_START = pose_of_arkit(np.eye(4))[:3, :3]
+_NOT_UPRIGHT = "poses begin at the first picture and do not say which way is up: floors and walls will"
+MOST_DEPTH_PIXELS = 2**19
 """Of one depth image; phones have up to 640x480."""
-_VARIES = 0.01
+VARIES = 0.01
 """Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
+
+
+@dataclass(frozen=True)
+class PhoneCamera:
+    """What a recording states of its camera; depth and pictures share their view."""
+
+    size: tuple[int, int]
+    """(height, width) of the pictures that `intrinsics` are of."""
+    depth_size: tuple[int, int] | None
+    intrinsics: Intrinsics
+
+    @classmethod
+    def of(cls, where: Path, content: Mapping[str, Any]) -> Self:
+        """Return what the metadata of a recording state. Raises `SourceError`."""
+        try:
+            k = [float(v) for v in content["K"]]
+            size = int(content["h"]), int(content["w"])
+            depth = (int(content["dh"]), int(content["dw"])) if "dw" in content else None
+            intrinsics = check_intrinsics([k[0], k[4], k[6], k[7]])  # column by column
+        except (KeyError, TypeError, ValueError, IndexError, OptionError):
+            raise SourceError(f"{where}: its metadata states no camera K with w and h; export it again") from None
+        if min(size) < 1 or (depth is not None and not 0 < depth[0] * depth[1] <= MOST_DEPTH_PIXELS):
+            raise SourceError(f"{where}: its metadata states pictures of {size[1]}x{size[0]} and depth of {depth}")
+        return cls(size, depth, intrinsics)
+
+    def coded(self, stem: str, stored: Callable[[str], Stored]) -> list[tuple[str, CodedArray | None]]:
+        """Return the endings of depth and confidence of a frame, and its files of these endings."""
+        kinds, size = ((".depth", "<f4"), (".conf", "|u1")), self.depth_size
+        return [(e, None if size is None else CodedArray(stored(stem + e), "lzfse", dtype, size)) for e, dtype in kinds]
+
+    def layout(
+        self,
+        kind: str,
+        files: Iterable[FrameFile],
+        first_pose: NDArray[np.float64] | None,
+        with_depth: bool,
+        options: SourceOptions,
+        notes: Sequence[str],
+    ) -> FolderLayout:
+        """Return the layout of frames of this camera."""
+        given = options.intrinsics or self.intrinsics
+        if with_depth:
+            optics = Optics(given, (), self.intrinsics, np.eye(4), 1.0, self.size, self.size)
+        else:
+            optics = Optics(given, intrinsics_size=self.size)
+        up = first_pose is not None and not np.allclose(first_pose[:3, :3], _AT_START, rtol=0.0, atol=_LEAST_TURN)
+        return FolderLayout(
+            kind,
+            FrameFiles(files),
+            optics,
+            "color",
+            self.intrinsics,
+            (*notes, *(() if up or first_pose is None else (_NOT_UPRIGHT,))),
+            least_confidence=LEAST_CONFIDENCE,
+            z_up=up,
+            poses_drift=True,
+            upright_tags=False,
+        )
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout of an unpacked recording, or None for another folder."""
-    if not ((root / "metadata").is_file() and (root / "rgbd").is_dir()):
+    if not ((root / METADATA).is_file() and (root / "rgbd").is_dir()):
         return None
     present = {f"rgbd/{p.name}" for p in (root / "rgbd").iterdir()}
-    return _layout(root, read_json(root / "metadata"), present, lambda name: root / name, options)
+    return _layout(root, read_json(root / METADATA), present, lambda name: root / name, options)
 
 
 def find_file(path: Path, options: SourceOptions) -> FolderLayout:
@@ -70,67 +134,40 @@ def _layout(
     numbers = sorted(int(found[1]) for found in named if found)
     if not numbers:
         raise SourceError(f"{where} holds no pictures rgbd/N.jpg; was the upload finished?")
-    width, height, depth_size, intrinsics = _cameras(where, content)
+    camera = PhoneCamera.of(where, content)
     poses, times = _poses(content), content.get("frameTimestamps")
     fps = content.get("fps")
     files, with_depth = [], False
     for k in numbers:
         depth, confidence = (
-            CodedArray(stored(f"rgbd/{k}.{end}"), "lzfse", dtype, depth_size)
-            if depth_size is not None and f"rgbd/{k}.{end}" in present
-            else None
-            for end, dtype in (("depth", "<f4"), ("conf", "|u1"))
+            coded if coded is not None and f"rgbd/{k}{ending}" in present else None
+            for ending, coded in camera.coded(f"rgbd/{k}", stored)
         )
         with_depth = with_depth or depth is not None
         pose = poses[k] if k < len(poses) else None
         files.append(FrameFile(stored(f"rgbd/{k}.jpg"), depth, None, pose, _time(times, k, fps), confidence))
-    size = (height, width)
-    optics = Optics(options.intrinsics or intrinsics, (), intrinsics, np.eye(4), 1.0, size, size)
-    if not with_depth:
-        optics = Optics(options.intrinsics or intrinsics, intrinsics_size=size)
     notes = ["camera and poses of Record3D (ARKit)"]
     spread = _focal_spread(content)
-    if spread > _VARIES:
+    if spread > VARIES:
         notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: one camera serves all of them")
     lost = sum(p is None for p in poses) + max(0, len(numbers) - len(poses))
     if lost:
         notes.append(f"{lost} of {len(numbers)} frames come without a pose")
-    return FolderLayout(
-        "record3d",
-        FrameFiles(files),
-        optics,
-        "color",
-        intrinsics,
-        tuple(notes),
-        least_confidence=LEAST_CONFIDENCE,
-        z_up=True,
-        poses_drift=True,
-        upright_tags=False,
-    )
-
-
-def _cameras(where: Path, content: Mapping[str, Any]) -> tuple[int, int, tuple[int, int] | None, Any]:
-    """Width and height of pictures, (height, width) of depth, and fx, fy, cx, cy. Raises `SourceError`."""
-    try:
-        k = [float(v) for v in content["K"]]
-        width, height = int(content["w"]), int(content["h"])
-        depth = (int(content["dh"]), int(content["dw"])) if "dw" in content else None
-        intrinsics = check_intrinsics([k[0], k[4], k[6], k[7]])  # column by column
-    except (KeyError, TypeError, ValueError, IndexError, OptionError):
-        raise SourceError(f"{where}: its metadata states no camera K with w and h; export it again") from None
-    if width < 1 or height < 1 or (depth is not None and not 0 < depth[0] * depth[1] <= _MOST_DEPTH_PIXELS):
-        raise SourceError(f"{where}: its metadata states pictures of {width}x{height} and depth of {depth}")
-    return width, height, depth, intrinsics
+    first = next((p for p in poses if p is not None), None)
+    return camera.layout("record3d", files, first, with_depth, options, notes)
 
 
 def _poses(content: Mapping[str, Any]) -> list[NDArray[np.float64] | None]:
     rows = content.get("poses")
-    out: list[NDArray[np.float64] | None] = []
-    for row in rows if isinstance(rows, list) else []:
-        good = isinstance(row, list) and len(row) == 7 and all(isinstance(v, int | float) for v in row)
-        T_world_arkit = pose_of_quaternion(row[4:], row[:4]) if good else None
-        out.append(None if T_world_arkit is None else pose_of_arkit(T_world_arkit))
-    return out
+    return [pose_of_row(row) for row in rows] if isinstance(rows, list) else []
+
+
+def pose_of_row(row: object) -> NDArray[np.float64] | None:
+    """Return the pose of qx qy qz qw tx ty tz, z up. Shape (4, 4). None where they are no such numbers."""
+    if not (isinstance(row, list) and len(row) == 7 and all(isinstance(v, int | float) for v in row)):
+        return None
+    T_world_arkit = pose_of_quaternion(row[4:], row[:4])
+    return None if T_world_arkit is None else pose_of_arkit(T_world_arkit)
 
 
 def _time(times: object, k: int, fps: object) -> float | None:
