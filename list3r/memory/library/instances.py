@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -88,8 +89,8 @@ class DerivedInstance:
     geometry: InstanceGeometry
     feature: NDArray[np.float32]
     """Unit length. Shape (D,)."""
-    frames: tuple[tuple[int, int], ...]
-    """(session id, Frame.index) of every frame in which it is seen, in order."""
+    frames: NDArray[np.int64]
+    """Session id and Frame.index of every frame in which it is seen, in order. Shape (F, 2)."""
     best_view: BestView | None
     certainty: float
     """How sure it is that it exists as one instance, before it is asked who else should have seen it."""
@@ -127,7 +128,7 @@ class Members:
 
 
 class InstanceCache(LruCache[tuple[object, ...], DerivedInstance]):
-    """Instances as they were derived from their members."""
+    """Instances as they were derived from their members, by a digest of those: their names grow with the chunks."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT)
@@ -138,11 +139,7 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
     """Return an instance, derived from its members unless it was just so before."""
     m, cache = members, store.derived.of(InstanceCache)
     shown_by = m.of(m.shown_by)
-    poses = tuple(
-        (store.chunks.checksum(k), m.chunks[k][1].as_matrix().tobytes()) for k in sorted({k for k, _ in m.group})
-    )
-    cuts = b"".join(np.packbits(x.dropped[slice(*x.span)]).tobytes() for x in shown_by)
-    key = (instance_id, m.component, m.upright, tuple(m.group), tuple(m.shown_by), poses, cuts, m.mover, settings)
+    key = (instance_id, m.component, m.upright, _digest(store, m, shown_by), m.mover, settings)
     kept = cache.get(key)
     if kept is not None:
         return kept
@@ -154,6 +151,20 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
             found, geometry=now.geometry, anchor=now.anchor, shape=now.shape, dynamic=True, resting=m.mover.resting
         )
     return cache.put(key, replace(found, geometry=replace(found.geometry, stamp=next(cache.stamps))))
+
+
+def _digest(store: Store, members: Members, shown_by: Sequence[Member]) -> bytes:
+    """Return what tells apart all that an instance is derived from: who its members are, where their chunks lie, and
+    which of their points belong to something else.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for keys in (members.group, members.shown_by):
+        digest.update(np.array([(len(keys), -1), *keys], np.int64).tobytes())
+    for k in sorted({k for k, _ in members.group}):
+        digest.update(np.int64(store.chunks.checksum(k)).tobytes() + members.chunks[k][1].as_matrix().tobytes())
+    for member in shown_by:
+        digest.update(np.packbits(member.dropped[slice(*member.span)]).tobytes())
+    return digest.digest()
 
 
 def derive_instance(
@@ -178,7 +189,7 @@ def derive_instance(
     points, rgb = points[keep], rgb[keep]
     keep = without_strays(points)
     points, rgb = points[keep], rgb[keep]
-    frames = sorted({(m.shapes.session_id, int(f)) for m in members for f in m.shapes.frames[m.at]})
+    frames = _frames(members)
     counts = np.array([len(m.shapes.frames[m.at]) for m in members], dtype=np.float64)
     stability = float(np.average([m.shapes.stability[m.at] for m in members], weights=np.maximum(counts, 1)))
     feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
@@ -199,7 +210,14 @@ def derive_instance(
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(geometry, unit_feature, tuple(frames), view, certainty, anchor, shape, colors)
+    return DerivedInstance(geometry, unit_feature, frames, view, certainty, anchor, shape, colors)
+
+
+def _frames(members: Sequence[Member]) -> NDArray[np.int64]:
+    """Return session id and index of the frames that show any of the members, in order. Shape (F, 2)."""
+    seen = [(m.shapes.session_id, np.asarray(m.shapes.frames[m.at], np.int64)) for m in members]
+    pairs = np.concatenate([np.column_stack([np.full(len(f), session), f]) for session, f in seen])
+    return np.unique(pairs, axis=0)
 
 
 def _metre(members: Sequence[Member]) -> float:

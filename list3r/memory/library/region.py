@@ -28,7 +28,7 @@ from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.library import SettledRow
 
-_KEPT = 6000
+_KEPT = 3000
 """Pairs of chunks whose links are kept: a walk that stays in one room comes to the same pairs again. They take some
 3 kB each."""
 

@@ -45,7 +45,7 @@ def record_of(
 ) -> Instance:
     """Return the record of an instance, where its chunks are settled."""
     geometry: InstanceGeometry = found.geometry
-    seen = [times[f] for f in found.frames if f in times] or [0.0]
+    seen = [times[s, f] for s, f in found.frames.tolist() if (s, f) in times] or [0.0]
     name, rgb = main_color(found.swatches, world.light)
     return Instance(
         id=geometry.id,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,9 @@ from list3r.memory.overlap.summaries import cameras_of, chunk_summaries, sample_
 from list3r.memory.records import UpEstimate
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
+
+_MOST_NUMBERS = 1 << 19
+"""Of directions with planes or cameras at a time; 4 MiB."""
 
 
 @dataclass(frozen=True)
@@ -117,18 +120,29 @@ def gravity_from_planes(
 def _camera_allows(up: Array, S_graph_cam: Sim3, mean_up: Array, s: GravitySettings) -> Array:
     """Return which directions the cameras' tilt and roll allow. Shape (C, 3) -> (C,)."""
     level_axis = S_graph_cam.rotation[:, :, 0]
-    roll = np.degrees(np.median(np.abs(np.arcsin(np.clip(up @ level_axis.T, -1, 1))), axis=1))
+    across = [np.median(np.abs(some @ level_axis.T), axis=1) for some in _blocks(up, len(level_axis))]
+    roll = np.degrees(np.arcsin(np.clip(np.concatenate(across), 0, 1)))
     tilt = np.degrees(np.arccos(np.clip(up @ mean_up, -1, 1)))
     return np.asarray((roll <= s.max_roll_deg) & (tilt <= s.max_camera_tilt_deg))
 
 
 def _votes(candidates: Array, normals: Array, areas: Array, s: GravitySettings) -> Array:
     """Return the area that is level with respect to each candidate, plus half of what is upright. Shape (C,)."""
-    along = np.abs(candidates @ normals.T)
-    width = np.radians(s.level_deg)
-    level = np.exp(-0.5 * (np.arccos(np.clip(along, 0, 1)) / (width / 2)) ** 2)
-    upright = np.exp(-0.5 * (np.arcsin(np.clip(along, 0, 1)) / (width / 2)) ** 2)
-    return np.asarray((level + 0.5 * upright) @ np.sqrt(areas))
+    votes, width = [], np.radians(s.level_deg) / 2
+    for some in _blocks(candidates, len(normals)):
+        off = np.arccos(np.clip(np.abs(some @ normals.T), 0, 1))
+        level, upright = (np.exp(-0.5 * (angle / width) ** 2) for angle in (off, np.pi / 2 - off))
+        votes.append((level + 0.5 * upright) @ np.sqrt(areas))
+    return np.concatenate(votes)
+
+
+def _blocks(directions: Array, against: int) -> Iterator[Array]:
+    """Yield directions (C, 3) in parts, so that each of a part with all of those `against` are no more numbers than
+    memory has room for, however long the recording is.
+    """
+    step = max(1, _MOST_NUMBERS // max(1, against))
+    for start in range(0, max(1, len(directions)), step):
+        yield directions[start : start + step]
 
 
 def _refine(up: Array, normals: Array, areas: Array, s: GravitySettings) -> Array:
