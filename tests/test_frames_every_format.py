@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import re
 import zipfile
@@ -46,6 +47,21 @@ def write_spool(root: Path) -> Path:
     return root
 
 
+def write_phone_spool(root: Path) -> Path:
+    """What is kept of Record3D over USB."""
+    with zipfile.ZipFile(recordings.write_record3d(root / "whole")) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    (root / "whole/walk.r3d").unlink()
+    (root / "whole").rmdir()
+    said = json.loads(members.pop("metadata"))
+    for name, data in members.items():
+        recordings.put(root / name.replace("rgbd/", "rgb/"), data)
+    rows = [f"{k / 15:.6f} rgb/{k}.jpg {' '.join(map(str, pose))}\n" for k, pose in enumerate(said["poses"])]
+    recordings.put(root / "frames.txt", "".join(rows))
+    recordings.put(root / "metadata", json.dumps({key: said[key] for key in ("w", "h", "dw", "dh", "K")}))
+    return root
+
+
 FORMATS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "record3d": (recordings.write_record3d, "lzfse"),
     "stray": (recordings.write_stray, ""),
@@ -69,6 +85,7 @@ FORMATS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "images": (write_images, ""),
     "video": (write_film, ""),
     "live": (write_spool, ""),
+    "live record3d": (write_phone_spool, "lzfse"),
 }
 """By kind, and what else tells the writer: a recording of that format, and the package that it takes."""
 WITHOUT_WRITER = {"aria": "no package writes the streams of Aria glasses; tests/test_frames_aria.py holds its parts"}

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from list3r.frames.base import BadFrame, Frame
+from list3r.frames.base import BadFrame, Frame, missing_parts
+from list3r.frames.inspection import SourceReport
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import List3rError, SourceError
@@ -348,3 +350,25 @@ def test_poses_of_a_body_are_carried_to_its_camera(tmp_path: Path) -> None:
     put(path / "mav0/cam0/sensor.yaml", "intrinsics: [1, 2]\n")
     with pytest.raises(SourceError, match="four numbers fx,fy,cx,cy"):
         open_source(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (write_record3d, ("in metres, of a camera of its own, at its place", "--poses prior", "metric, by the depth")),
+        (write_euroc, ("none", "--poses given", "metric, by the poses")),
+        (write_colmap, ("none", "--poses given", "relative, in the unit of the poses")),
+    ],
+)
+def test_what_build_makes_of_a_source_is_said(
+    write: Callable[[Path], Path], said: tuple[str, ...], tmp_path: Path
+) -> None:
+    lines = SourceReport(open_source(write(tmp_path / "walk")).info).lines()
+    told = [next(line for line in lines if line.startswith(name)) for name in ("depth", "poses", "scale")]
+    assert all(part in line for part, line in zip(said, told, strict=True)), told
+
+
+def test_what_is_needed_is_told_from_what_would_help() -> None:
+    assert missing_parts(depth=True, camera=True) == []
+    assert "give --intrinsics" in missing_parts(depth=True, camera=False)[0]
+    assert "build estimates them" in missing_parts(depth=False, camera=False)[1]

@@ -16,9 +16,10 @@ import pytest
 
 import list3r
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+from list3r.frames.live.addresses import is_stream, without_secrets
 from list3r.frames.live.feed import FeedState, LiveSettings
 from list3r.frames.live.spooled import StreamFeed
-from list3r.frames.live.stream import NetworkStream, is_stream, without_secrets
+from list3r.frames.live.stream import NetworkStream
 from list3r.frames.source import open_source
 from list3r.frames.writers.pictures import jpeg
 from list3r.memory.errors import OptionError, SourceError
@@ -181,6 +182,13 @@ def _chunks_by(memory: Path) -> int:
             pass
         time.sleep(0.1)
     return 0
+
+
+@pytest.mark.parametrize("source", ["rtsp://me:secret@cam.local/a?token=secret", "record3d:secret", "/dev/video9"])
+def test_what_has_no_frames_of_its_own_is_not_inspected(source: str) -> None:
+    with pytest.raises(SourceError, match="list3r build") as error:
+        open_source(source)
+    assert "secret" not in str(error.value)
 
 
 def test_what_is_no_live_source_is_refused(tmp_path: Path) -> None:

@@ -11,9 +11,10 @@ import pytest
 
 import list3r
 from list3r.frames.base import BadFrame, Frame
+from list3r.frames.live.addresses import is_stream, without_secrets
 from list3r.frames.live.feed import FeedState, LiveSettings
 from list3r.frames.live.spooled import StreamFeed
-from list3r.frames.live.stream import is_stream, open_camera, without_secrets
+from list3r.frames.live.stream import open_camera
 from list3r.frames.live.usbmux import ADDRESS
 from list3r.frames.source import open_source
 from list3r.memory.errors import SourceError

@@ -113,6 +113,15 @@ class SourceInfo:
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 
 
+def missing_parts(*, depth: bool, camera: bool) -> list[str]:
+    """Return what a source lacks of depth and the camera's intrinsics, and what then is done, one sentence each."""
+    out = [] if depth else ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
+    if not camera:
+        done = "give --intrinsics fx,fy,cx,cy" if depth else "build estimates them; --intrinsics fx,fy,cx,cy is surer"
+        out.append(f"the camera's intrinsics are unknown: {done}")
+    return out
+
+
 GUESSED_FOCAL = 1.2
 """Focal length of an unknown camera by the longer side of its picture (a field of view of 45 degrees, between a
 phone's main camera, 65, and its tele lens)."""

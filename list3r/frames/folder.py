@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import clean_depth, fault_of, read_color, read_gray, read_raw_depth, used_bits
 from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
@@ -262,18 +262,18 @@ class FolderSource:
         return (f"{wrong} of {len(some)} poses looked at are no rigid motion (mirrored, stretched or not finite)",)
 
     def _time_doubts(self) -> tuple[str, ...]:
-        if self._clock or np.count_nonzero(~np.isnan(self._layout.files.times_s)) < 2:
+        if self._clock:
             return ()
-        return (f"the time stamps do not ascend; {self._fps:g} frames a second are assumed (--fps)",)
+        stated = np.count_nonzero(~np.isnan(self._layout.files.times_s)) > 1
+        why = "the time stamps do not ascend" if stated else "no times are stated"
+        return (
+            () if self._options.fps and not stated else (f"{why}: {self._fps:g} frames a second are assumed (--fps)",)
+        )
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
         guess = self._camera_guess()
-        missing = list(layout.missing)
-        if not self._has_depth:
-            missing.append("there is no depth: build takes colour alone (--reconstruction sfm or a network)")
-        if rig.camera is None:
-            missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
+        missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
         if rig.color_size != rig.stored_size:
             notes = (*notes, reduced_note(rig))
         if self._bits < 16:

@@ -58,8 +58,8 @@ class SourceReport:
             f"frames       {info.frame_count} at {info.fps:.4g} a second",
             f"camera       {_seen_text(info)}",
             f"depth        {_depth_text(info)}",
-            f"poses        {'given' if info.has_poses else 'none'}",
-            f"scale        {info.scale_kind}",
+            f"poses        {_poses_text(info)}",
+            f"scale        {_scale_text(info)}",
             *(f"note         {note}" for note in info.notes),
             *(f"missing      {what}" for what in info.missing),
             *([] if self.calibration is None else _calibration_lines(self.calibration)),
@@ -103,11 +103,34 @@ def _camera_text(camera: Camera | None) -> str:
     return f"{c.width}x{c.height}, fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g} px"
 
 
+_UNITS = {1.0: "in metres", 1000.0: "in millimetres"}
+
+
 def _depth_text(info: SourceInfo) -> str:
     if not info.has_depth:
         return "none"
-    units = f"{info.depth_scale:g} units a metre"
+    units = _UNITS.get(info.depth_scale or 0.0, f"{info.depth_scale:g} units a metre")
     if info.depth_camera is None or info.T_color_depth is None:
-        return f"{units}, registered into the colour image"
+        return f"{units}, on the pixels of the colour image"
     x, y, z = 1000.0 * info.T_color_depth[:3, 3]
-    return f"{units}, own camera {_camera_text(info.depth_camera)}, {x:.0f} {y:.0f} {z:.0f} mm off; registered here"
+    place = f"{x:.0f} {y:.0f} {z:.0f} mm from the colour camera" if info.T_color_depth[:3, 3].any() else "at its place"
+    own = f"of a camera of its own, {place} ({_camera_text(info.depth_camera)})"
+    return f"{units}, {own}; build lays it on the pixels of the colour image"
+
+
+def _poses_text(info: SourceInfo) -> str:
+    """Return whether there are poses, and what a build makes of them unless it is told otherwise."""
+    if not info.has_poses:
+        return "none; build estimates them"
+    if info.poses_drift and info.poses_metric and info.has_depth:
+        return "given; build corrects them by the depth (--poses prior), since they drift"
+    return "given; build takes them as they are (--poses given)"
+
+
+def _scale_text(info: SourceInfo) -> str:
+    """Return what a unit of the memory will be."""
+    if info.has_depth:
+        return "metric, by the depth"
+    if info.has_poses:
+        return "metric, by the poses" if info.poses_metric else "relative, in the unit of the poses"
+    return "relative; build --scale-anchor says how long something is"

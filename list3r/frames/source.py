@@ -9,6 +9,7 @@ from pathlib import Path
 from list3r.frames.base import Camera, FrameSource, Listing, SourceInfo
 from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
+from list3r.frames.live.addresses import is_stream, without_secrets
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers import (
     aria,
@@ -66,6 +67,9 @@ def open_source(path: str | Path, options: SourceOptions | None = None, listing:
     Raises `SourceError` for what is not a source, `OptionError` for options that do not fit it.
     """
     options = options or SourceOptions()
+    if is_stream(str(path)):
+        shown = without_secrets(str(path))
+        raise SourceError(f"{shown} is live and has no frames of its own yet: `list3r build` follows it into a memory")
     if str(path) == "":
         raise SourceError(f"the name of the source is empty; {_WANTED}")
     root = Path(path).expanduser()

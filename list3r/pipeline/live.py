@@ -20,10 +20,11 @@ from threadpoolctl import threadpool_limits
 
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, plan_chunks
+from list3r.frames.live.addresses import is_stream, without_secrets
 from list3r.frames.live.feed import Feed, FeedState, LiveSettings
 from list3r.frames.live.growing import FolderFeed
 from list3r.frames.live.spooled import StreamFeed
-from list3r.frames.live.stream import is_stream, open_camera, without_secrets
+from list3r.frames.live.stream import open_camera
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError, TrackingError
 from list3r.memory.store.store import Store

@@ -22,7 +22,6 @@ from list3r.frames.live.usbmux import connect, receive
 from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS, VARIES
 from list3r.memory.errors import OptionError, SourceError
 
-PHONE = "record3d"
 PORT = 1337
 _OUTER = struct.Struct(">4I")
 _HEADER = struct.Struct("<11I")

@@ -5,42 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from urllib.parse import urlsplit, urlunsplit
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.live.addresses import DEVICES, is_phone, without_secrets
 from list3r.frames.live.camera import LiveCamera, LivePicture, LostError
 from list3r.frames.live.feed import Tell
-from list3r.frames.live.record3d import PHONE, Record3dPhone
+from list3r.frames.live.record3d import Record3dPhone
 from list3r.frames.writers.pictures import jpeg
 from list3r.memory.errors import SourceError
-
-SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "udp", "tcp", "srt")
-_DEVICES = "/dev/video"
-
-
-def is_stream(source: str) -> bool:
-    """Return whether a source is a webcam, the address of a stream, or a phone."""
-    return source.startswith(_DEVICES) or urlsplit(source).scheme.lower() in (*SCHEMES, PHONE)
-
-
-def without_secrets(source: str) -> str:
-    """Return the address without name, password, query and serial number, as it may be shown and stored."""
-    parts = urlsplit(source)
-    scheme = parts.scheme.lower()
-    if scheme == PHONE:
-        return f"{PHONE}://usb"
-    if scheme not in SCHEMES:
-        return source
-    host = parts.netloc.rpartition("@")[2]
-    return urlunsplit((parts.scheme, host, parts.path, "", ""))
 
 
 def open_camera(source: str, tell: Tell) -> LiveCamera:
     """Return what the pictures of a stream come from; nothing is connected yet. Raises `OptionError`."""
-    if urlsplit(source).scheme.lower() == PHONE:
+    if is_phone(source):
         return Record3dPhone(source.partition(":")[2].strip("/"), tell)
     return NetworkStream(source)
 
@@ -54,7 +34,7 @@ class NetworkStream:
     def pictures(self, folder: Path, silence_s: float) -> Iterator[LivePicture]:
         """The pictures of one connection, compressed where they are kept. Raises `LostError`, `SourceError`."""
         wait = {"rw_timeout": str(int(1e6 * silence_s)), "fflags": "nobuffer"}
-        kind = "v4l2" if self._source.startswith(_DEVICES) else None
+        kind = "v4l2" if self._source.startswith(DEVICES) else None
         words = {} if kind else wait | ({"rtsp_transport": "tcp"} if self._source.startswith("rtsp") else {})
         try:
             with av.open(self._source, format=kind, options=words, timeout=(2 * silence_s, silence_s)) as container:

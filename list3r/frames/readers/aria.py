@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
@@ -126,7 +126,6 @@ class AriaSource:
         files = [self._path] if self._depth_path is None else [self._path, self._depth_path]
         has_depth, gaps = self._depth_path is not None, np.diff(self._times_s)
         listing = [*((p.name, p.stat().st_size) for p in files), ("poses", sum(T is not None for T in self._poses))]
-        no_depth = "there is no depth: build takes colour alone (--reconstruction sfm or a network)"
         return SourceInfo(
             kind="aria",
             path=str(root),
@@ -139,7 +138,7 @@ class AriaSource:
             fingerprint=fingerprint("aria", listing, self._options),
             depth_scale=(self._options.depth_scale or _MILLIMETRES) if has_depth else None,
             notes=notes,
-            missing=() if has_depth else (no_depth,),
+            missing=tuple(missing_parts(depth=has_depth, camera=True)),
             image_size=(self._view.camera.height, self._view.camera.width),
             z_up=moved is not None and moved.upright,
             poses_drift=moved is not None and moved.drifts,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -129,7 +129,7 @@ class LeRobotSource:
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=self._rig.depth_scale if has_depth else None,
             notes=(*info.notes, *notes),
-            missing=tuple(m for m in info.missing if not (has_depth and "depth" in m)),
+            missing=tuple(missing_parts(depth=has_depth, camera=info.camera is not None)),
         )
 
 

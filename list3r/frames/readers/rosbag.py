@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo
+from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo, missing_parts
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint
 from list3r.frames.layout import FolderLayout, Optics
@@ -178,9 +178,7 @@ class BagSource:
         rig, separate = self._rig, self._rig.registration
         files = [self._path] if self._path.is_file() else sorted(self._path.iterdir())
         listing = [(p.name, p.stat().st_size) for p in files]
-        missing = [] if rig.camera else ["the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy"]
-        if self._depth is None:
-            missing.append("there is no depth: build takes colour alone (--reconstruction sfm or a network)")
+        missing = missing_parts(depth=self._depth is not None, camera=rig.camera is not None)
         gaps = np.diff(self._times_s)
         return SourceInfo(
             kind="rosbag",

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
 from list3r.frames.decoding.stamps import list_stamps, open_container, packets, picture_stream
@@ -173,9 +173,7 @@ class VideoSource:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
         if self._chosen.sharpest:
             notes.append("of each so many frames the sharpest is taken; --no-sharpest takes the first")
-        missing = ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
-        if rig.camera is None:
-            missing.append("the camera's intrinsics are unknown: --intrinsics fx,fy,cx,cy")
+        missing = missing_parts(depth=False, camera=rig.camera is not None)
         focal = None if rig.camera is not None else self._stamps.focal_35mm
         height, width = rig.stored_size
         guess = believable(None if focal is None else film_focal(focal, width, height), width, height)

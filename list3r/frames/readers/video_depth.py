@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import read_raw_depth
 from list3r.frames.layout import Optics
 from list3r.frames.options import Intrinsics, SourceOptions
@@ -113,7 +113,7 @@ class VideoWithDepth:
             T_color_depth=registration.T_color_depth if registration else None,
             depth_scale=self._rig.depth_scale if parts.depth else None,
             notes=(*info.notes, parts.note),
-            missing=tuple(m for m in info.missing if "depth" not in m) if parts.depth else info.missing,
+            missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=parts.z_up,
             poses_drift=parts.poses_drift,
         )

@@ -184,7 +184,9 @@ def _camera(
     height, width = size
     fx, fy, cx, cy = intrinsics
     if not (0 <= cx < width and 0 <= cy < height):
-        raise OptionError(f"{name}: centre ({cx:g}, {cy:g}) lies outside the image of {_size(size)}; scale them to it")
+        raise OptionError(
+            f"{name}: centre ({cx:g}, {cy:g}) lies outside the image of {_size(size)}; give those of such pictures"
+        )
     return Camera(width, height, fx, fy, cx, cy, distortion)
 
 

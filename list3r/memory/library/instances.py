@@ -21,8 +21,9 @@ from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box,
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
-_KEPT = 400
-"""Instances that are kept; more are derived again when they are asked for, so that memory does not grow with chunks."""
+_KEPT_BYTES = 6 << 20
+"""Points and frames of instances that are kept; more are derived again when they are asked for, so that memory does not
+grow with chunks."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,14 @@ class InstanceCache(LruCache[tuple[object, ...], DerivedInstance]):
     """Instances as they were derived from their members, by a digest of those: their names grow with the chunks."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT)
+        super().__init__(_KEPT_BYTES, _bytes_of)
         self.stamps = itertools.count(1)
+
+
+def _bytes_of(found: DerivedInstance) -> int:
+    """Return what an instance takes, about."""
+    geometry = found.geometry
+    return 4096 + geometry.points.nbytes + geometry.rgb.nbytes + found.frames.nbytes
 
 
 def derived_instance(store: Store, instance_id: int, members: Members, settings: DeriveSettings) -> DerivedInstance:
