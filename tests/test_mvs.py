@@ -12,10 +12,11 @@ import torch
 
 from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
+from list3r.reconstruction.mvs import sweep
 from list3r.reconstruction.mvs.fill import fill_regions
-from list3r.reconstruction.mvs.fusion import DepthMap, fill_flat
+from list3r.reconstruction.mvs.fusion import DepthMap, carry, fill_flat
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up
-from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepViewSettings
+from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
 from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
@@ -269,3 +270,36 @@ def test_noise_is_measured_on_smooth_surfaces() -> None:
     assert noise is not None and noise.quadratic == pytest.approx(0.004, rel=0.1)
     assert float(noise.sigma(np.array([2.0], np.float32))[0]) == pytest.approx(0.016, rel=0.1)
     assert stereo_noise(np.zeros((2, 24, 32), np.float32), np.zeros((2, 24, 32), np.float16)) is None
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_compiled_matching_costs_are_those_of_tensors(each: bool) -> None:
+    rng, settings = np.random.default_rng(5), SweepSettings()
+    camera = Camera(61, 47, 50.0, 50.0, 30.0, 23.0)
+    pictures = [torch.from_numpy(cv2.blur(rng.random((47, 61), np.float32), (3, 3))) for _ in range(4)]
+    T = [np.eye(4) for _ in range(3)]
+    for k, pose in enumerate(T):
+        pose[:3, :3], pose[:3, 3] = rotation_exp(rng.normal(0.0, 0.1, 3)), (0.1 * k, -0.05, 1.2 * (k == 2))
+    warps = [Warp.between(np.eye(4), pose, camera, "cpu") for pose in T]  # the last picture is taken from behind things
+    depths = torch.linspace(0.2, 2.0, 7)[:, None, None]
+    depths = depths * (1.0 + torch.from_numpy(rng.random((1, 47, 61), np.float32))) if each else depths
+    reference = sweep.SweepReference.of(pictures[0], settings.radius_px, settings.image_noise)
+    wanted = sweep._cost_of_tensors(reference, pictures[1:], warps, depths, settings)
+    assert wanted.min() < 0.4 and wanted.max() > 0.6
+    torch.testing.assert_close(
+        sweep._group_cost(reference, pictures[1:], warps, depths, settings), wanted, atol=2e-3, rtol=0
+    )
+
+
+def test_depth_is_carried_to_where_it_is_seen_and_the_nearest_counts() -> None:
+    rng, camera = np.random.default_rng(6), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
+    inverse = np.where(rng.random((30, 40)) < 0.8, 0.5, 0.0).astype(np.float32)
+    near = DepthMap(torch.from_numpy(inverse), torch.from_numpy(np.where(inverse > 0, 0.01, 0).astype(np.float32)))
+    far = DepthMap(torch.full((30, 40), 0.25), torch.full((30, 40), 0.001))
+    stay = Warp.between(np.eye(4), np.eye(4), camera, "cpu")
+    seen = carry([near, far], [stay, stay], DepthFusionSettings())
+    torch.testing.assert_close(seen.inverse, torch.where(near.inverse > 0, 0.5, 0.25))
+    torch.testing.assert_close(seen.sigma, torch.where(near.inverse > 0, 0.01, 0.001))
+    back = np.eye(4)
+    back[2, 3] = -2.0  # two units behind what was at 2 units
+    assert carry([near], [Warp.between(np.eye(4), back, camera, "cpu")], DepthFusionSettings()).inverse.max() == 0.25

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
-from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up
+from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up, stacked
+from list3r.reconstruction.mvs.kernels import fill_holes, splat
 from list3r.reconstruction.mvs.settings import DepthFusionSettings
 
 
@@ -74,99 +76,20 @@ def fill_flat(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
 
     Inverse depth of a plane is linear in the pixel's place, so the plane is a regression by window sums.
     """
-    known = (depth.inverse > 0).to(torch.float64)
-    height, width = known.shape
-    v, u = torch.meshgrid(
-        torch.arange(height, device=known.device, dtype=torch.float64),
-        torch.arange(width, device=known.device, dtype=torch.float64),
-        indexing="ij",
-    )
-    w = depth.inverse.to(torch.float64)
-    radius = settings.fill_radius_px
-    stack = torch.stack(
-        [known, known * u, known * v, known * u * u, known * u * v, known * v * v, w, w * u, w * v, w * w]
-    )
-    n, su, sv, suu, suv, svv, sw, swu, swv, sww = _window_sums(stack, radius)
-    count = n.clamp_min(1.0)
-    mu, mv, mw = su / count, sv / count, sw / count
-    cuu, cuv, cvv = suu / count - mu * mu + 1e-3, suv / count - mu * mv, svv / count - mv * mv + 1e-3
-    cuw, cvw, cww = swu / count - mu * mw, swv / count - mv * mw, sww / count - mw * mw
-    determinant = (cuu * cvv - cuv * cuv).clamp_min(1e-9)
-    a = (cvv * cuw - cuv * cvw) / determinant
-    b = (cuu * cvw - cuv * cuw) / determinant
-    residual = torch.sqrt((cww - a * cuw - b * cvw).clamp_min(0.0))
-    plane = mw + a * (u - mu) + b * (v - mv)
-    flat = (residual < settings.fill_residual * mw) & (plane > 0.5 * mw) & (plane < 2.0 * mw)
-    enclosed = _enclosed(depth.inverse > 0, radius)
-    hole = (known == 0) & enclosed & flat & (n > settings.fill_share * (2 * radius + 1) ** 2)
-    inverse = torch.where(hole, plane.to(depth.inverse.dtype), depth.inverse)
-    unsure = torch.full((), settings.fill_sigma, device=inverse.device)
-    return DepthMap(inverse, torch.where(hole, unsure, depth.sigma))
-
-
-def _enclosed(known: Tensor, radius: int) -> Tensor:
-    """Return where something is known within `radius` on the left, on the right, above and below.
-
-    Shape (h, w), bool.
-    """
-    values = known.float()[None, None]
-    out = torch.ones_like(known)
-    for pad, kernel in (
-        ((radius, 0, 0, 0), (1, radius + 1)),
-        ((0, radius, 0, 0), (1, radius + 1)),
-        ((0, 0, radius, 0), (radius + 1, 1)),
-        ((0, 0, 0, radius), (radius + 1, 1)),
-    ):
-        padded = torch.nn.functional.pad(values, pad)
-        out &= torch.nn.functional.max_pool2d(padded, kernel, 1)[0, 0] > 0
-    return out
-
-
-def _window_sums(values: Tensor, radius: int) -> Tensor:
-    """Sums over windows of 2 radius + 1 squared, zero outside, by running totals. Shape (C, h, w)."""
-    for dim in (-1, -2):
-        length = values.shape[dim]
-        before = torch.zeros_like(values.narrow(dim, 0, 1))
-        total = torch.cat([before, values.cumsum(dim)], dim=dim)
-        at = torch.arange(length, device=values.device)
-        high, low = (at + radius + 1).clamp_max(length), (at - radius).clamp_min(0)
-        values = total.index_select(dim, high) - total.index_select(dim, low)
-    return values
+    inverse, radius = depth.inverse.cpu().numpy(), settings.fill_radius_px
+    hole, plane = fill_holes(inverse, radius, settings.fill_share * (2 * radius + 1) ** 2, settings.fill_residual)
+    filled = np.where(hole, plane.astype(np.float32), inverse)
+    unsure = np.where(hole, np.float32(settings.fill_sigma), depth.sigma.cpu().numpy())
+    device = depth.inverse.device
+    return DepthMap(torch.from_numpy(filled).to(device), torch.from_numpy(unsure).to(device))
 
 
 def carry(maps: Sequence[DepthMap], warps: Sequence[Warp], settings: DepthFusionSettings) -> DepthMap:
     """Depth of keyframes as another frame sees it: what is nearest in each pixel, averaged. `warps` lead into it."""
-    height, width = maps[0].inverse.shape
-    device, size = maps[0].inverse.device, height * width
-    index, inverse, sigma, share = (torch.cat(parts) for parts in zip(*map(_splat, maps, warps), strict=True))
-    nearest = torch.zeros(size, device=device).scatter_reduce_(0, index, inverse, "amax")
-    keep = inverse > (1.0 - settings.carried_tolerance) * nearest[index]
-    weight = torch.where(keep, share / sigma**2, torch.zeros((), device=device))
-    total = torch.zeros(size, device=device).index_add_(0, index, weight)
-    mean = torch.zeros(size, device=device).index_add_(0, index, weight * inverse) / total.clamp_min(1e-20)
-    error = torch.zeros(size, device=device).index_add_(0, index, weight * sigma) / total.clamp_min(1e-20)
-    return DepthMap(mean.reshape(height, width), error.reshape(height, width))
-
-
-def _splat(depth: DepthMap, warp: Warp) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixels, inverse depth, sigma and bilinear share of a keyframe's points in another frame, four pixels each."""
-    height, width = depth.inverse.shape
-    known = torch.nonzero(depth.inverse.flatten() > 0)[:, 0]
-    x, y, ratio = (value.flatten().index_select(0, known) for value in warp.place(depth.inverse))
-    inverse, sigma = (value.flatten().index_select(0, known) for value in (depth.inverse, depth.sigma))
-    inverse = inverse / ratio.clamp_min(1e-4)
-    left, top = torch.floor(x), torch.floor(y)
-    parts = []
-    for j in (0, 1):
-        for i in (0, 1):
-            column, row = left + i, top + j
-            share = (1.0 - (x - column).abs()) * (1.0 - (y - row).abs())
-            ok = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (ratio > 1e-3) & (share > 0.05)
-            rows = torch.nonzero(ok)[:, 0]
-            index = (row * width + column).long()
-            parts.append(tuple(value.index_select(0, rows) for value in (index, inverse, sigma, share)))
-    index, inverse, sigma, share = (torch.cat(part) for part in zip(*parts, strict=True))
-    return index, inverse, sigma, share
+    inverse, sigma = stacked([m.inverse for m in maps]), stacked([m.sigma for m in maps])
+    rotated, shift = stacked([w.rotated for w in warps]), stacked([w.shift for w in warps])
+    found = splat(inverse, sigma, rotated, shift, settings.carried_tolerance)
+    return DepthMap(*(torch.from_numpy(image).to(maps[0].inverse.device) for image in found))
 
 
 def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: float) -> tuple[Tensor, Tensor]:

@@ -73,6 +73,11 @@ class Warp:
         return torch.where(ratio > 1e-4, x, outside), y, ratio
 
 
+def stacked(images: Sequence[Tensor]) -> NDArray[np.float32]:
+    """Return tensors of one shape as one array, in the memory of the processor."""
+    return np.stack([image.cpu().numpy() for image in images])
+
+
 def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> tuple[Tensor, Tensor]:
     """Values of an image (h, w) at pixel places (..., h', w'), and where those lie inside it."""
     height, width = image.shape

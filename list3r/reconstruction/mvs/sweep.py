@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
-from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up
+from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up, stacked
+from list3r.reconstruction.mvs.kernels import zncc_cost
 from list3r.reconstruction.mvs.settings import SweepSettings
 
 
@@ -80,6 +82,19 @@ def matching_cost(
 def _group_cost(
     reference: SweepReference, sources: Sequence[Tensor], warps: Sequence[Warp], depths: Tensor, settings: SweepSettings
 ) -> Tensor:
+    if depths.device.type != "cpu":
+        return _cost_of_tensors(reference, sources, warps, depths, settings)
+    known = stacked([reference.gray, reference.mean, reference.spread])
+    places = stacked([w.rotated for w in warps]), stacked([w.shift for w in warps])
+    tried = np.ascontiguousarray(depths.numpy(), np.float32)
+    cost = zncc_cost(known, stacked(sources), *places, tried, settings.radius_px, settings.image_noise)
+    return torch.from_numpy(cost)
+
+
+def _cost_of_tensors(
+    reference: SweepReference, sources: Sequence[Tensor], warps: Sequence[Warp], depths: Tensor, settings: SweepSettings
+) -> Tensor:
+    """Return the same on an accelerator."""
     shape = (depths.shape[0], *reference.gray.shape)
     total = torch.zeros(shape, device=reference.gray.device)
     count = torch.zeros_like(total)

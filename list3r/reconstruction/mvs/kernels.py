@@ -1,0 +1,231 @@
+"""Loops over pixels that dense depth spends most of its time in, on a processor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.compiled import compiled
+
+Floats = NDArray[np.float32]
+
+_ZERO, _HALF, _ONE, _BEHIND = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(1e-4)
+_LEAST = np.float32(0.05)
+"""Share of a pixel that counts."""
+
+
+@compiled
+def zncc_cost(
+    reference: Floats, sources: Floats, rotated: Floats, shift: Floats, depths: Floats, radius: int, noise: float
+) -> Floats:
+    """Return the mean matching cost of inverse depths over sources, 0.5 where no source sees the place.
+
+    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `rotated`
+    (S, 3, h, w) and `shift` (S, 3) tell where pixels lie in them; `depths` (D, h, w) or (D, 1, 1). Shape (D, h, w).
+    """
+    _, height, width = reference.shape
+    out = np.empty((depths.shape[0], height, width), np.float32)
+    total, count = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    inside, sums = np.empty((height, width), np.float32), np.empty((3, height, width), np.float32)
+    line, place = np.empty((3, width + 2 * radius), np.float32), np.empty((2, width), np.float32)
+    tried = np.empty(width, np.float32)
+    for d in range(depths.shape[0]):
+        total[:] = _ZERO
+        count[:] = _ZERO
+        for s in range(sources.shape[0]):
+            for v in range(height):
+                tried[:] = depths[d, min(v, depths.shape[1] - 1)]
+                _place_row(rotated[s], shift[s], v, tried, place, inside)
+                _look_up_row(sources[s], place, line, radius)
+                _row_sums(line, reference, v, radius, sums)
+            _add_zncc(reference, sums, inside, radius, np.float32(noise * noise), total)
+            count += inside
+        for v in range(height):
+            for u in range(width):
+                out[d, v, u] = _HALF - _HALF * total[v, u] / max(count[v, u], _ONE)
+    return out
+
+
+@compiled
+def _place_row(to: Floats, by: Floats, v: int, inverse: Floats, place: Floats, inside: Floats) -> None:
+    """Write where the pixels of a row lie in another picture, at its border where they are outside, and which are
+    inside.
+    """
+    right, bottom = np.float32(to.shape[2] - 1), np.float32(to.shape[1] - 1)
+    dx, dy, dz = by[0], by[1], by[2]
+    for u in range(to.shape[2]):
+        ratio = to[2, v, u] + inverse[u] * dz
+        scale = _ONE / max(ratio, _BEHIND)
+        x = (to[0, v, u] + inverse[u] * dx) * scale if ratio > _BEHIND else -_ONE
+        y = (to[1, v, u] + inverse[u] * dy) * scale
+        inside[v, u] = _ONE if (x >= _ZERO) & (x <= right) & (y >= _ZERO) & (y <= bottom) else _ZERO
+        x, y = x if x > _ZERO else _ZERO, y if y > _ZERO else _ZERO
+        place[0, u], place[1, u] = x if x < right else right, y if y < bottom else bottom
+
+
+@compiled
+def _look_up_row(source: Floats, place: Floats, line: Floats, radius: int) -> None:
+    """Write the brightness of a picture at places (2, w) inside it into a line, which is wider by the radius."""
+    height, width = source.shape
+    for u in range(place.shape[1]):
+        i, j = int(place[0, u]), int(place[1, u])
+        a, b = place[0, u] - np.float32(i), place[1, u] - np.float32(j)
+        k, m = min(i + 1, width - 1), min(j + 1, height - 1)
+        above = source[j, i] + (source[j, k] - source[j, i]) * a
+        below = source[m, i] + (source[m, k] - source[m, i]) * a
+        line[0, radius + u] = above + (below - above) * b
+
+
+@compiled
+def _row_sums(line: Floats, reference: Floats, v: int, radius: int, sums: Floats) -> None:
+    """Write sums (3, h, w) over a window's columns of a row's values, their squares, and their products with grey."""
+    width = reference.shape[2]
+    for u in range(width):
+        value = line[0, radius + u]
+        line[1, radius + u] = value * value
+        line[2, radius + u] = value * reference[0, v, u]
+    for q in range(3):
+        for u in range(radius):
+            line[q, u] = line[q, radius]
+            line[q, radius + width + u] = line[q, radius + width - 1]
+        for u in range(width):
+            sums[q, v, u] = line[q, u]
+        for k in range(1, 2 * radius + 1):
+            for u in range(width):
+                sums[q, v, u] += line[q, u + k]
+
+
+@compiled
+def _add_zncc(reference: Floats, sums: Floats, inside: Floats, radius: int, noise: np.float32, total: Floats) -> None:
+    """Add the correlation of windows to a total, where a source sees the place."""
+    _, height, width = reference.shape
+    size, window = np.float32((2 * radius + 1) ** 2), np.empty((3, width), np.float32)
+    mean, spread = reference[1], reference[2]
+    for v in range(height):
+        for q in range(3):
+            window[q] = sums[q, max(v - radius, 0)]
+            for k in range(v - radius + 1, v + radius + 1):
+                row = min(max(k, 0), height - 1)
+                for u in range(width):
+                    window[q, u] += sums[q, row, u]
+        for u in range(width):
+            own = window[0, u] / size
+            varied = max(window[1, u] / size - own * own, _ZERO) + noise
+            cross = window[2, u] / size - own * mean[v, u]
+            total[v, u] += cross / np.sqrt(varied * spread[v, u]) * inside[v, u]
+
+
+@compiled
+def fill_holes(
+    inverse: Floats, radius: int, least: float, residual: float
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return where holes in flat surroundings are, and the planes of these there. Shape (h, w) each.
+
+    `least` pixels of the window must be known, and deviate from a plane by `residual` of its inverse depth at the most.
+    """
+    height, width = inverse.shape
+    sums = np.zeros((10, height + 1, width), np.float64)
+    line, terms = np.zeros((10, width + 1), np.float64), np.empty(10, np.float64)
+    for v in range(height):
+        for u in range(width):
+            w = np.float64(inverse[v, u])
+            known = 1.0 if w > 0.0 else 0.0
+            terms[0], terms[1], terms[2], terms[3] = known, known * u, known * v, known * u * u
+            terms[4], terms[5], terms[6] = known * u * v, known * v * v, w
+            terms[7], terms[8], terms[9] = w * u, w * v, w * w
+            for c in range(10):
+                line[c, u + 1] = line[c, u] + terms[c]
+        for c in range(10):
+            for u in range(width):
+                inside = line[c, min(u + radius + 1, width)] - line[c, max(u - radius, 0)]
+                sums[c, v + 1, u] = sums[c, v, u] + inside
+    hole, planes = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float64)
+    for v in range(height):
+        high, low = min(v + radius + 1, height), max(v - radius, 0)
+        for u in range(width):
+            n = sums[0, high, u] - sums[0, low, u]
+            if inverse[v, u] > 0.0 or n <= least or not _enclosed(inverse, v, u, radius):
+                continue
+            for c in range(1, 10):
+                terms[c] = (sums[c, high, u] - sums[c, low, u]) / max(n, 1.0)
+            mu, mv, mw = terms[1], terms[2], terms[6]
+            cuu, cuv, cvv = terms[3] - mu * mu + 1e-3, terms[4] - mu * mv, terms[5] - mv * mv + 1e-3
+            cuw, cvw, cww = terms[7] - mu * mw, terms[8] - mv * mw, terms[9] - mw * mw
+            determinant = max(cuu * cvv - cuv * cuv, 1e-9)
+            a, b = (cvv * cuw - cuv * cvw) / determinant, (cuu * cvw - cuv * cuw) / determinant
+            plane = mw + a * (u - mu) + b * (v - mv)
+            flat = np.sqrt(max(cww - a * cuw - b * cvw, 0.0)) < residual * mw
+            hole[v, u] = flat and 0.5 * mw < plane < 2.0 * mw
+            planes[v, u] = plane
+    return hole, planes
+
+
+@compiled
+def _enclosed(inverse: Floats, v: int, u: int, radius: int) -> bool:
+    """Return whether something is known within `radius` on the left, on the right, above and below."""
+    for dv, du in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        found = False
+        for k in range(1, radius + 1):
+            row, column = v + k * dv, u + k * du
+            if 0 <= row < inverse.shape[0] and 0 <= column < inverse.shape[1] and inverse[row, column] > 0.0:
+                found = True
+                break
+        if not found:
+            return False
+    return True
+
+
+@compiled
+def splat(inverse: Floats, sigma: Floats, rotated: Floats, shift: Floats, tolerance: float) -> tuple[Floats, Floats]:
+    """Return the inverse depth and sigma of maps (M, h, w) as another frame sees them: what is nearest, averaged.
+
+    Each point counts in the four pixels around it; those that lie behind the nearest by more than a `tolerance`, share
+    of depth, do not. `rotated` (M, 3, h, w) and `shift` (M, 3) tell where pixels lie. Shape (h, w) each.
+    """
+    count, height, width = inverse.shape
+    nearest, front = np.zeros((height, width), np.float32), np.float32(1.0 - tolerance)
+    mean, error, total = np.zeros_like(nearest), np.zeros_like(nearest), np.zeros_like(nearest)
+    points = [_landed(inverse[m], sigma[m], rotated[m], shift[m]) for m in range(count)]
+    for x, y, w, _ in points:
+        for k in range(len(x)):
+            for n in range(4):
+                share, row, column = _share(x[k], y[k], n, height, width)
+                if share > _ZERO:
+                    nearest[row, column] = max(nearest[row, column], w[k])
+    for x, y, w, own in points:
+        for n in range(4):
+            for k in range(len(x)):
+                share, row, column = _share(x[k], y[k], n, height, width)
+                if share > _ZERO and w[k] > front * nearest[row, column]:
+                    weight = share / (own[k] * own[k])
+                    total[row, column] += weight
+                    mean[row, column] += weight * w[k]
+                    error[row, column] += weight * own[k]
+    total = np.maximum(total, np.float32(1e-20))
+    return mean / total, error / total
+
+
+@compiled
+def _landed(inverse: Floats, sigma: Floats, to: Floats, by: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return places (x, y) in another frame of the points of a map, their inverse depth there and sigma. Shape (N,)."""
+    height, width = inverse.shape
+    out, count = np.empty((4, height * width), np.float32), 0
+    for v in range(height):
+        for u in range(width):
+            w = inverse[v, u]
+            ratio = to[2, v, u] + w * by[2]
+            if w > _ZERO and ratio > np.float32(1e-3):
+                x, y = (to[0, v, u] + w * by[0]) / ratio, (to[1, v, u] + w * by[1]) / ratio
+                if -_ONE <= x <= width and -_ONE <= y <= height:
+                    out[0, count], out[1, count], out[2, count], out[3, count] = x, y, w / ratio, sigma[v, u]
+                    count += 1
+    return out[0, :count], out[1, :count], out[2, :count], out[3, :count]
+
+
+@compiled
+def _share(x: np.float32, y: np.float32, n: int, height: int, width: int) -> tuple[np.float32, int, int]:
+    """Return the bilinear share of one of the four pixels around a place, 0 for little or outside; its row, column."""
+    column, row = int(np.floor(x)) + n % 2, int(np.floor(y)) + n // 2
+    share = (_ONE - abs(x - np.float32(column))) * (_ONE - abs(y - np.float32(row)))
+    inside = 0 <= column < width and 0 <= row < height and share > _LEAST
+    return share if inside else _ZERO, row, column
