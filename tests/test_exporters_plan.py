@@ -97,6 +97,7 @@ def testround_lengths() -> None:
 
 def test_letters_that_the_font_lacks_are_replaced() -> None:
     assert plain_text("écran 2 × 3 cm · …") == "ecran 2 ? 3 cm · …"
+    assert plain_text("🪴 plant") == "plant"
 
 
 def test_a_wide_scene_has_its_legend_below() -> None:

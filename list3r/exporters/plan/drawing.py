@@ -11,8 +11,7 @@ from list3r.exporters.palette import Color
 from list3r.exporters.plan.frame import is_wall
 from list3r.exporters.plan.labels import TagTarget, place_tags
 from list3r.exporters.plan.map import hatched, pale_picture
-from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet, plain_text
-from list3r.memory.description.printable import shown
+from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet
 from list3r.memory.records import Instance, Support
 
 _START: Color = (22, 140, 100)
@@ -110,7 +109,7 @@ def draw_tags(sheet: Sheet, things: list[Instance]) -> None:
         corners = np.array(sheet.footprint(instance))
         low, high = corners.min(axis=0), corners.max(axis=0)
         (x, y), half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
-        width, name = sheet.chip_width(instance.id), _short_name(instance)
+        width, name = sheet.chip_width(instance.id), sheet.name(instance).split(",")[0]
         room = width + sheet.draw.textlength(name, font=sheet.text_font) + 8 * k
         names.append(name if room < 1.8 * half[0] and half[1] > 20 * k else "")
         anchors.append(TagTarget((x, y), (half[0], half[1]), (room if names[-1] else width, 18.0 * k)))
@@ -137,10 +136,6 @@ def _leader(sheet: Sheet, anchor: TagTarget, place: tuple[float, float]) -> None
         return
     sheet.draw.line([anchor.xy, place], fill=(*INK, 170), width=k)
     sheet.draw.ellipse((x - 2 * k, y - 2 * k, x + 2 * k, y + 2 * k), fill=(*INK, 220))
-
-
-def _short_name(instance: Instance) -> str:
-    return plain_text(shown(instance.label or instance.description.split(",")[0]))
 
 
 def _area(outline: list[tuple[float, float]]) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet, font_of, plain_text
-from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance
 
 
@@ -48,9 +47,9 @@ def draw_grid(sheet: Sheet, unit: str) -> None:
 def draw_axes(sheet: Sheet, remark: str) -> None:
     """Draw the world's axes as they lie on the page, what is up, and a remark, under the map."""
     k = OVERSAMPLING
-    origin = np.array([sheet.left + 24.0 * k, sheet.top + sheet.map_size[1] + 32.0 * k])
+    origin = np.array([sheet.left + 24.0 * k, sheet.top + sheet.map_size[1] + 37.0 * k])
     for axis, (name, color) in enumerate((("x", (200, 60, 60)), ("y", (40, 140, 60)), ("z", (50, 90, 200)))):
-        arrow = sheet.frame.R_plan_world[:2, axis] * [1.0, -1.0] * 17 * k
+        arrow = sheet.frame.R_plan_world[:2, axis] * [1.0, -1.0] * 14 * k
         if np.linalg.norm(arrow) < 5 * k:
             continue
         tip = origin + arrow
@@ -61,7 +60,7 @@ def draw_axes(sheet: Sheet, remark: str) -> None:
         at = tip + arrow * 0.45
         sheet.text((float(at[0]), float(at[1])), name, font_of(12), color, anchor="mm")
     sheet.text(
-        (sheet.left + 66.0 * k, sheet.top + sheet.map_size[1] + 32.0 * k),
+        (sheet.left + 66.0 * k, sheet.top + sheet.map_size[1] + 37.0 * k),
         sheet.frame.note + remark,
         sheet.text_font,
         GREY,
@@ -97,14 +96,14 @@ def _legend_column(sheet: Sheet, rows: list[Instance], unit: str, x: float, y: f
     right = x + sheet.layout.column_px * k
     sizes = [_size_text(i) for i in rows]
     reserved = max(sheet.draw.textlength(s, font=sheet.text_font) for s in sizes) + 12 * k
-    sheet.text((x + 46 * k, y + 4 * k), "description", sheet.text_font, GREY)
+    sheet.text((x + 46 * k, y + 4 * k), "name or description", sheet.text_font, GREY)
     sheet.text((right, y + 4 * k), f"size, {unit}", sheet.text_font, GREY, anchor="ra")
     sheet.draw.line([(x, y + 25 * k), (right, y + 25 * k)], fill=(205, 207, 212), width=k)
     for row, (instance, size) in enumerate(zip(rows, sizes, strict=True)):
         middle = y + 28 * k + (row + 0.5) * sheet.settings.row_px * k
         sheet.chip((x + 18 * k, middle), (max(30.0 * k, sheet.chip_width(instance.id)), 18.0 * k), instance.id)
         room = right - reserved - x - 46 * k
-        words = _shorten(sheet, shown(instance.label or instance.description), room)
+        words = _shorten(sheet, sheet.name(instance), room)
         sheet.text((x + 46 * k, middle), words, sheet.text_font, INK, anchor="lm")
         sheet.text((right, middle), size, sheet.text_font, GREY, anchor="rm")
 

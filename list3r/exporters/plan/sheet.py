@@ -15,6 +15,7 @@ from list3r.exporters.palette import Color, instance_color
 from list3r.exporters.plan.frame import PlanFrame
 from list3r.exporters.plan.layout import Layout, PlanSettings
 from list3r.exporters.plan.vector import VectorDraw
+from list3r.memory.description.printable import shown
 from list3r.memory.records import Instance
 
 INK: Color = (38, 42, 52)
@@ -106,6 +107,12 @@ class Sheet:
             xy, words, fill=color, font=font, anchor=anchor, stroke_width=stroke, stroke_fill=(255, 255, 255)
         )
 
+    def name(self, instance: Instance) -> str:
+        """Return the label of an instance; where there is none, or the font lacks its letters, its description."""
+        label, told = shown(instance.label or ""), shown(instance.description)
+        lacking = self.vector is None and plain_text(label).count("?") > label.count("?")
+        return told if not label or (lacking and told) else label
+
     def chip_width(self, instance_id: int) -> float:
         """Return the width of the tag of an id, px."""
         return float(self.draw.textlength(str(instance_id), font=self.tag_font)) + 9.0 * OVERSAMPLING
@@ -126,13 +133,15 @@ def font_of(size_px: int) -> Font:
 
 
 def plain_text(text: str) -> str:
-    """Return the text in the letters that Pillow's own font has."""
+    """Return the text in the letters that Pillow's own font has, without emoji; ? for what it lacks."""
     kept = "".join(c for c in text if c in "·…" or c.isascii())
     if kept == text:
         return text
-    return "".join(
-        c if c in "·…" else unicodedata.normalize("NFKD", c).encode("ascii", "ignore").decode() or "?" for c in text
+    spelled = (unicodedata.normalize("NFKD", c).encode("ascii", "ignore").decode() or "?" for c in text)
+    drawn = "".join(
+        c if c in "·…" else "" if unicodedata.category(c) == "So" else s for c, s in zip(text, spelled, strict=True)
     )
+    return drawn.strip()
 
 
 def _contrast(color: Color) -> Color:

@@ -92,11 +92,12 @@ def _numbers(values: Iterable[float]) -> list[float | None]:
 
 
 def _relations(memory: SceneMemory, instances: list[Instance]) -> list[tuple[int, str, int, float]]:
-    """Return each relation once; of two inverse ones the first of those that are told."""
+    """Return each relation once; of two inverse ones the first of those that are told, and no `near` of `next_to`."""
     known = {i.id for i in instances}
     inverse = {"supports": "on", "contains": "in", "below": "above"}
     found = [r for r in memory.relations() if r.subject in known and r.object in known and r.predicate not in inverse]
-    pairs = {(r.predicate, *sorted((r.subject, r.object))): r for r in found if r.predicate in ("near", "next_to")}
+    pairs = {(min(r.subject, r.object), max(r.subject, r.object)): r for r in found if r.predicate == "near"}
+    pairs |= {(min(r.subject, r.object), max(r.subject, r.object)): r for r in found if r.predicate == "next_to"}
     kept = [r for r in found if r.predicate not in ("near", "next_to")] + list(pairs.values())
     return [(r.subject, r.predicate, r.object, round(float(r.confidence), 2)) for r in kept]
 
