@@ -275,3 +275,9 @@ def test_without_a_command_the_help_is_shown(arguments: tuple[str, ...]) -> None
     result = in_process(*arguments)
     assert "Usage: list3r" in result.stdout + result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_the_name_of_a_format_leads_to_export() -> None:
+    found = in_process("plan", "house.l3r")
+    assert found.returncode == 2
+    assert "list3r export MEMORY --to plan" in found.stderr

@@ -187,12 +187,16 @@ class _Failures:
 
     def usage(self, error: BaseException) -> int:
         """What is wrong with the command line, and where its help is."""
+        from list3r.exporters.registry import FORMATS
+
         context = error.ctx  # type: ignore[attr-defined]
         message = error.format_message()  # type: ignore[attr-defined]
         if not message or message.startswith("Usage:"):
             tell(*(message or context.get_help()).splitlines())
             return 2
         path = context.command_path if context is not None else "list3r"
+        if (name := message.removeprefix("No such command '").rstrip("'.")) in FORMATS:
+            message = f"{name} is a format: list3r export MEMORY --to {name} --out PATH"
         return self.fail("OptionError", f"{message.rstrip('.')}; see `{path} --help`")
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, print_table
 
 
 def changes(
@@ -28,9 +28,12 @@ def changes(
 
     with open_memory(memory) as scene:
         found = find(scene.store, since, KINDS if seen_again else KINDS[:3], min_confidence)
+        alone = not found and len(scene.sessions()) < 2
+        notes = ["the memory holds one session; `list3r update` adds a later one to compare with"] if alone else []
         if json:
-            print_answer((_entry(c) for c in found), scene.units)
+            print_answer((_entry(c) for c in found), scene.units, notes)
             return
+        note(*(f"note: {line}" for line in notes))
         rows = [
             [
                 c.event.session_id,

@@ -139,13 +139,12 @@ def show(
         print_answer([{**instance_dict(instance, track), **label_source(instance, named), **told}], units)
         return
     say(f"{instance.id}  {instance.label or instance.description}")
+    count = len({part["chunk"] for part in parts})
+    chunks = "1 chunk" if count == 1 else f"{count} chunks"
     for key, value in (
         ("center", f"{_triple(instance.center)} {units}{_give_or_take(instance.position_sigma_m, units)}"),
         ("size", f"{_triple(instance.box.size)} {units}"),
-        (
-            "confidence",
-            f"{instance.confidence:.2f}, seen in {instance.observations} frames of {len(parts)} chunk instances",
-        ),
+        ("confidence", f"{instance.confidence:.2f}, seen in {instance.observations} frames of {chunks}"),
         *(() if instance.label is None else (("named by", _named_by(instance, named)),)),
         ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
         ("aliases", ", ".join(map(str, aliases)) or "none"),

@@ -87,7 +87,7 @@ def draw_legend(sheet: Sheet, things: list[Instance], unit: str) -> None:
         x += (layout.column_px + sheet.settings.margin_px) * k
     if len(things) > len(chosen):
         below = (layout.legend_xy[0] + 46) * k, y + (32 + layout.rows * sheet.settings.row_px) * k
-        words = f"and {len(things) - len(chosen)} more, seen in fewer frames"
+        words = f"and {len(things) - len(chosen):,} more, seen in fewer frames"
         sheet.text(below, words, sheet.text_font, GREY)
 
 

@@ -91,7 +91,7 @@ def _subtitle(store: Store, component: Component) -> str:
         if k in structure
     )
     words = [
-        f"{len(component.instances) - len(structure)} things",
+        f"{len(component.instances) - len(structure):,} things",
         f"structure: {kinds}" if kinds else "no structure",
         f"{len(component.poses):,} posed frames",
         f"scale {(store.facts.scale_kind or 'relative')}",
