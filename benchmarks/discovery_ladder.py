@@ -4,8 +4,8 @@ PYTHONPATH=. python benchmarks/discovery_ladder.py --seeds 5001,5004,5008 --json
 
 Each rung takes one more step from the discoverer and the rest from the truth; figures are those of `discovery.py`:
 `true` true masks, `voxels` the true thing of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true thing
-of most of their voxels, `tree` of the clusters that agglomeration passes through those that fit true things best,
-`cut` the clusters where agglomeration stops, those that fit a true thing, `bound` likewise without those that the
+of most of their voxels, `joined` likewise of what parts make up step by step, `tree` of the clusters that agglomeration
+passes through those that fit true things best, `cut` the clusters where agglomeration stops, those that fit a true thing, `bound` likewise without those that the
 networks take for structure, `unlisted` all of these, `listed` those that are sure enough: what the discoverer
 proposes. What tracking and merging make of it is measured by `discovery_memory.py`.
 """
@@ -29,7 +29,7 @@ from list3r.instances.geometric.cuts import Segment, Segmentation, proposals_of
 from list3r.instances.geometric.planes import estimate_up, find_planes
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.cut import CutSettings, make_parts, spread_labels
+from list3r.instances.learned.cut import CutSettings, join_parts, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
 from list3r.instances.learned.network import judge
@@ -141,9 +141,11 @@ def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np
     out["superpoints"] = named(chunk, majority(chunk, cut_superpoints(surface).labels))
     pieces = cut_pieces(surface)
     out["pieces"] = named(chunk, majority(chunk, pieces.labels))
-    parts, coarse = make_parts(surface, pieces, judge(weights, "fine", pieces.graph), s.sure)
-    out["parts"] = named(chunk, majority(chunk, parts))
-    told = judge(weights, "coarse", coarse)
+    g = pieces.graph
+    first = agglomerate(len(g.nodes), g.left, g.right, judge(weights, "fine", g).affinity, g.weight, s.sure)
+    out["parts"] = named(chunk, majority(chunk, pieces.joined(first)))
+    parts, coarse, told = join_parts(surface, pieces, weights, s)
+    out["joined"] = named(chunk, majority(chunk, parts))
     at = lambda end: agglomerate(len(coarse.nodes), coarse.left, coarse.right, told.affinity, coarse.weight, end)  # noqa: E731
     out["tree"] = best_of(chunk, [parts, *(np.append(at(e), -1)[parts] for e in ENDS)])
     own = at(s.enough)

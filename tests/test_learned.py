@@ -121,7 +121,7 @@ def test_verdicts_on_things_are_probabilities_whatever_the_order_of_things() -> 
     count, names = len(graph.nodes), names_of(weights)
     rng = np.random.default_rng(1)
     log_names = np.log(rng.dirichlet(np.ones(len(names)), count)).astype(np.float32)
-    hidden = rng.normal(size=(count, 32)).astype(np.float32)
+    hidden = rng.normal(size=(count, len(weights["coarse.node_head.weight"][0]))).astype(np.float32)
     told = Judgement(rng.normal(size=len(graph.left)), rng.normal(size=count), log_names, hidden)
     own = rng.integers(5, size=count)
     said = judge_things(weights, own, graph, told)

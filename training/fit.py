@@ -54,6 +54,8 @@ class FitSettings:
     """Weight of the loss of names."""
     noise: float = 0.0
     """Deviation of what is added to features, of their own deviation."""
+    least_weight: float = 0.0
+    """What every border counts, however short it is, beside the logarithm of its length: legs are thin."""
     seed: int = 0
     start: Path | None = None
     """Folder of an earlier fit to go on from, its learning rate a third."""
@@ -147,8 +149,8 @@ def _step(
 ) -> dict[str, float]:
     network.train()
     affinity, structure, names, _ = network(*_disturbed(network, lesson, settings.noise))
-    same, _, weight = truths(lesson)
-    w = torch.from_numpy(weight)
+    same, known, weight = truths(lesson)
+    w = torch.from_numpy(weight + np.float32(settings.least_weight) * known)
     pair = F.binary_cross_entropy_with_logits(
         affinity, torch.from_numpy(same.astype(np.float32)), w, reduction="sum"
     ) / w.sum().clamp(min=1)

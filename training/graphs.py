@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.learned.cut import make_parts
+from list3r.instances.learned.agglomeration import agglomerate
+from list3r.instances.learned.cut import group
 from list3r.instances.learned.graph import PieceGraph, Surroundings, chunk_surface
 from list3r.instances.learned.network import judge
 from list3r.instances.learned.pieces import Pieces, cut_pieces
 from training.samples import Sample, read_sample
 from training.worlds.catalogue import LABELS
 
+Ends = tuple[float, ...]
 LEAST_PURE = 0.6
 """Pieces of which no thing has this share teach nothing."""
 
@@ -76,25 +78,35 @@ def first_lesson(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
     return _read(kept)
 
 
-def second_lessons(
-    path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path, sures: Sequence[float]
-) -> list[Lesson]:
-    """Return the graphs of the parts that the first network makes of a sample on disk, with their truth.
+def second_lessons(path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path, ends: Sequence[Ends]) -> list[Lesson]:
+    """Return the graphs of the parts that the networks make of a sample on disk, with their truth; kept in `folder`.
 
-    One for each threshold, so that the second network sees parts of several sizes; kept in `folder`.
+    One for each of `ends`: mean log odds down to which pieces are joined by the first network, and, one step after the
+    other, parts by the second. So the second network learns from what it will see.
     """
-    files = [folder / f"{path.stem}-{sure:g}.parts" for sure in sures]
+    files = [folder / f"{path.stem}-{'-'.join(f'{e:g}' for e in end)}.parts" for end in ends]
     if not all(f.exists() for f in files):
         folder.mkdir(parents=True, exist_ok=True)
         lesson, labels = first_lesson(path)
         sample = read_sample(path)
         cloud = sample.cloud()
         truth = sample.truth_of(cloud)
-        pieces = Pieces(labels, lesson.graph)
+        pieces, g = Pieces(labels, lesson.graph), lesson.graph
         surface = chunk_surface(cloud, sample.views, surroundings_of(sample))
-        told = judge(arrays, "fine", lesson.graph)
-        for sure, file in zip(sures, files, strict=True):
-            parts, graph = make_parts(surface, pieces, told, sure)
+        told = judge(arrays, "fine", g)
+        made: dict[Ends, tuple[NDArray[np.int64], NDArray[np.int32], PieceGraph]] = {}
+        for end, file in zip(ends, files, strict=True):
+            for k in range(1, len(end) + 1):
+                if end[:k] in made:
+                    continue
+                if k == 1:
+                    own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, end[0])
+                else:
+                    before, _, h = made[end[: k - 1]]
+                    said = judge(arrays, "coarse", h).affinity
+                    own = agglomerate(len(h.nodes), h.left, h.right, said, h.weight, end[k - 1])[before]
+                made[end[:k]] = (own, *group(surface, pieces, told, own))
+            _, parts, graph = made[end]
             _write(file, lesson_of(sample, graph, parts, truth), np.zeros(0, np.int32))
     return [_read(f)[0] for f in files]
 

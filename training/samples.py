@@ -14,7 +14,7 @@ from list3r.instances.geometric.cloud import Cloud, build_cloud
 from list3r.instances.geometric.fusion import View
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.settings import InstanceSettings
-from training.worlds.film import Film, FilmSettings, Truth, frames_of, make_film, reconstruction_of
+from training.worlds.film import Film, FilmSettings, Truth, frames_of, make_film, reconstruction_of, varied
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ def make_sample(seed: int, folder: Path, *, held_out: bool = False, fitted: bool
     path = folder / f"{'test' if held_out else 'train'}-{'fitted-' if fitted else ''}{seed:06d}.npz"
     if not path.exists():
         settings = FilmSettings(seed, held_out=held_out, fitted=fitted)
+        settings = settings if held_out else varied(settings)
         sample = sample_of(make_film(settings), seed, settings.every)
         write_sample(path, sample)
     return path

@@ -34,8 +34,8 @@ OTHER_ENDS = (-2.5, -1.0, 0.0)
 class ThingFit:
     """How the judge of things is trained."""
 
-    hidden: int = 128
-    steps: int = 2500
+    hidden: int = 256
+    steps: int = 6000
     batch: int = 256
     rate: float = 3e-3
     decay: float = 1e-2

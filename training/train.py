@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from list3r.instances.learned.cut import EXTRA_EDGES, EXTRA_NODES, CutSettings
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
 from list3r.instances.learned.weights import write_weights
-from training.fit import ABLATIONS, SEEING, FitSettings, fit
+from training.fit import ABLATIONS, SEEING, Blindness, FitSettings, fit
 from training.graphs import Lesson, first_lesson, second_lessons
 from training.model import PieceNetwork
 from training.samples import make_sample
@@ -30,8 +31,14 @@ from training.worlds.catalogue import LABELS
 FIRST_SEED, FIRST_FITTED_SEED, FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 1000, 2000, 5000, 5500
 """Seeds count up from here: worlds for training, those with what is built in, and left-out worlds of both kinds."""
 
-OTHER_THRESHOLDS = (0.5, 3.5)
-"""Where agglomeration of fine pieces stops besides, so that the second network sees parts of other sizes too."""
+WIDTH, EDGE_WIDTH = 48, 32
+"""Widths of the first network's states of pieces and of borders."""
+SECOND_WIDTH, SECOND_EDGE_WIDTH, SECOND_DEPTH = 64, 48, 4
+"""Likewise of the second one, which sees far smaller graphs, and its rounds of messages."""
+FIRST_ENDS = ((2.0,), (3.5,))
+"""Where agglomeration stops for the second network's first lessons."""
+STATES = ((3.5, 3.5), (3.5, 3.5, 2.5), (3.5, 3.5, 2.5, 1.5))
+"""What agglomeration then passes through, by the second network of the first lessons, see `CutSettings.steps`."""
 
 
 def main() -> None:
@@ -67,29 +74,31 @@ def train(
     lessons, seen = [first_lesson(p)[0] for p in paths], [first_lesson(p)[0] for p in held]
     blind = ABLATIONS[without] if without else SEEING
     depth = 3 if blind.messages else 0
-    fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), depth=depth)
+    fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), node=WIDTH, edge=EDGE_WIDTH, depth=depth)
     settings = FitSettings(epochs, start=start and start / "fine", blind=blind)
     arrays = named("fine", fit(fine, lessons, seen, out / "fine", settings))
-    usual = CutSettings().sure
-    every = [
-        lesson
-        for k, p in enumerate(paths)
-        for lesson in second_lessons(p, arrays, out / "parts", _thresholds(k, usual))
-    ]
-    unseen = [second_lessons(p, arrays, out / "parts", (usual,))[0] for p in held]
-    coarse = PieceNetwork(
-        NODE_FEATURES + EXTRA_NODES, EDGE_FEATURES + EXTRA_EDGES, len(LABELS), dropout=0.15, depth=depth
-    )
-    settings = FitSettings(epochs, noise=0.15, decay=1e-2, start=start and start / "coarse", blind=blind)
-    arrays |= named("coarse", fit(coarse, every, unseen, out / "coarse", settings))
-    arrays |= fit_things(arrays, every, unseen, blind=blind)
+    every = [second_lessons(p, arrays, out / "parts", FIRST_ENDS) for p in paths]
+    unseen = [second_lessons(p, arrays, out / "parts", FIRST_ENDS[:1])[0] for p in held]
+    settings = FitSettings(max(1, epochs // 2), noise=0.15, decay=1e-2, blind=blind, least_weight=1.0)
+    first = [lesson for rows in every for lesson in rows]
+    arrays |= named("coarse", fit(_second(blind), first, unseen, out / "coarse", settings))
+    for k, p in enumerate(paths):
+        every[k] += second_lessons(p, arrays, out / "parts", STATES)
+    unseen = [second_lessons(p, arrays, out / "parts", STATES)[-1] for p in held]
+    settings = replace(settings, epochs=epochs + 2)
+    network = fit(_second(blind), [lesson for rows in every for lesson in rows], unseen, out / "states", settings)
+    arrays |= named("coarse", network)
+    arrays |= fit_things(arrays, [rows[k] for rows in every for k in (0, -2, -1)], unseen, blind=blind)
     write_weights(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, unseen)}))  # noqa: T201
 
 
-def _thresholds(row: int, usual: float) -> tuple[float, ...]:
-    """Where agglomeration of fine pieces stops for a chunk: as in use, and for every third chunk besides."""
-    return (usual, OTHER_THRESHOLDS[row // 3 % 2]) if row % 3 == 0 else (usual,)
+def _second(blind: Blindness) -> PieceNetwork:
+    """Return the second network, untrained."""
+    nodes, edges = NODE_FEATURES + WIDTH + EXTRA_NODES, EDGE_FEATURES + EXTRA_EDGES
+    depth = SECOND_DEPTH if blind.messages else 0
+    widths = {"node": SECOND_WIDTH, "edge": SECOND_EDGE_WIDTH, "depth": depth}
+    return PieceNetwork(nodes, edges, len(LABELS), **widths, dropout=0.15)
 
 
 def named(prefix: str, network: PieceNetwork) -> dict[str, NDArray[Any]]:

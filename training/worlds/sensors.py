@@ -32,10 +32,14 @@ def depth_noise(sensor: str) -> DepthNoise | None:
     return DepthNoise(0.004, 0.003, 0.02) if sensor == "computed" else None
 
 
-def read(picture: Picture, sensor: str, rng: np.random.Generator, drift: Floats) -> Reading:
-    """Return the noisy reading of a picture; `drift` is the shared error of computed depth, see `drift_field`."""
+def read(picture: Picture, sensor: str, rng: np.random.Generator, drift: Floats, patches: float = 0.0) -> Reading:
+    """Return the noisy reading of a picture.
+
+    `drift` is the shared error of computed depth, see `drift_field`; `patches` by how much, as a share of depth, what
+    has little texture is off in steps.
+    """
     models = {"structured": _structured, "tof": _time_of_flight, "lidar": _lidar}
-    depth = _computed(picture, rng, drift) if sensor == "computed" else models[sensor](picture, rng)
+    depth = _computed(picture, rng, drift, patches) if sensor == "computed" else models[sensor](picture, rng)
     if sensor != "computed":
         depth = np.where(_patchy(rng, depth.shape) < picture.glass, 0, depth)
     return Reading(_color(picture, rng), depth.astype(np.float32))
@@ -118,16 +122,20 @@ def _lidar(picture: Picture, rng: np.random.Generator) -> Floats:
     return np.where(lost, 0, depth).astype(np.float32)
 
 
-def _computed(picture: Picture, rng: np.random.Generator, drift: Floats) -> Floats:
-    """Depth of a network or of stereo: bent surfaces, edges too wide, holes where nothing is to be matched."""
+def _computed(picture: Picture, rng: np.random.Generator, drift: Floats, patches: float) -> Floats:
+    """Depth of a network or of stereo: bent surfaces, edges too wide, holes where nothing is to be matched.
+
+    With `patches`, a share of depth, what has little texture falls into patches that stand before or behind it.
+    """
     z = picture.depth
     z = z * (1 + 0.008 * drift + 0.0015 * _noise(rng, z.shape, 3.0))
+    gray = cv2.cvtColor(picture.color / 255.0, cv2.COLOR_RGB2GRAY)
+    texture = cv2.GaussianBlur(np.abs(cv2.Laplacian(gray, cv2.CV_32F)), (0, 0), 4.0)
+    z = z * (1 + patches * np.exp(-texture / 0.02) * np.rint(1.5 * drift) / 1.5)
     size = 7
     near = cv2.erode(z, np.ones((size, size), np.uint8))
     wide = _patchy(rng, z.shape) < 0.6
     z = np.where(wide & (z - near > 0.05 * z), near, z)
-    gray = cv2.cvtColor(picture.color / 255.0, cv2.COLOR_RGB2GRAY)
-    texture = cv2.GaussianBlur(np.abs(cv2.Laplacian(gray, cv2.CV_32F)), (0, 0), 4.0)
     blank = (texture < 0.003) & (_patchy(rng, z.shape) < 0.35)
     return np.where(blank | (picture.depth <= 0) | (picture.depth > 6.0), 0, z).astype(np.float32)
 

@@ -21,9 +21,11 @@ from list3r.instances.learned.things import ThingVerdicts, judge_things
 class CutSettings:
     """Where agglomeration stops. Both were chosen on worlds for training (see training/)."""
 
-    sure: float = 2.0
+    sure: float = 3.5
     """Mean log odds above which fine pieces become parts."""
-    enough: float = 1.5
+    steps: tuple[float, ...] = (3.5, 2.5, 1.5)
+    """Mean log odds above which parts are joined before what they make up is judged anew, one step after the other."""
+    enough: float = -1.0
     """Mean log odds above which parts become things."""
     hop_m: float = 0.05
     """Longest gap over which voxels of no piece go to the thing that is nearest."""
@@ -46,13 +48,29 @@ class CloudCut:
 def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | None = None) -> CloudCut:
     """Cut a cloud into things."""
     s = settings or CutSettings()
-    pieces = cut_pieces(surface)
-    parts, coarse = make_parts(surface, pieces, judge(weights, "fine", pieces.graph), s.sure)
-    told = judge(weights, "coarse", coarse)
-    own = agglomerate(len(coarse.nodes), coarse.left, coarse.right, told.affinity, coarse.weight, s.enough)
+    parts, graph, told = join_parts(surface, cut_pieces(surface), weights, s)
+    own = agglomerate(len(graph.nodes), graph.left, graph.right, told.affinity, graph.weight, s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
-    return CloudCut(labels, judge_things(weights, own, coarse, told))
+    return CloudCut(labels, judge_things(weights, own, graph, told))
+
+
+def join_parts(
+    surface: ChunkSurface, pieces: Pieces, weights: Weights, s: CutSettings
+) -> tuple[NDArray[np.int32], PieceGraph, Judgement]:
+    """Return the part of each voxel (N,), -1 for none, the parts' graph, and what the second network says of it.
+
+    Only what is surely one is joined at a time; then size, place and borders of what came of it are measured again, so
+    that no early join is decided by small pieces that could not yet tell.
+    """
+    g, told = pieces.graph, judge(weights, "fine", pieces.graph)
+    own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, s.sure)
+    for end in s.steps:
+        _, graph = group(surface, pieces, told, own)
+        said = judge(weights, "coarse", graph).affinity
+        own = agglomerate(len(graph.nodes), graph.left, graph.right, said, graph.weight, end)[own]
+    labels, graph = group(surface, pieces, told, own)
+    return labels, graph, judge(weights, "coarse", graph)
 
 
 def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: float) -> NDArray[np.int32]:
@@ -82,12 +100,14 @@ def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: 
     return out
 
 
-def make_parts(
-    surface: ChunkSurface, pieces: Pieces, told: Judgement, sure: float
+def group(
+    surface: ChunkSurface, pieces: Pieces, told: Judgement, own: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], PieceGraph]:
-    """Return the part of each voxel (N,), -1 for none, and the parts' graph with what the first network said."""
+    """Return the group of each voxel (N,), -1 for none, and the groups' graph with what the first network said.
+
+    `own` is the group of each piece, from 0. Shape (P,).
+    """
     g = pieces.graph
-    own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, sure)
     labels = pieces.joined(own)
     graph = piece_graph(surface, labels, FAR)
     count = len(graph.nodes)
@@ -106,8 +126,9 @@ def make_parts(
 FAR = 3
 """Doublings of the voxel's size at which parts are neighbours: legs end up to 16 cm below what they carry, where a view
 from above hides their top."""
-EXTRA_NODES = 34
-"""Columns that `make_parts` adds to the features of pieces: 32 of the first network's, structure, number of pieces."""
+EXTRA_NODES = 2
+"""Columns that `group` adds to the features of pieces besides those of the first network's hidden state: structure and
+number of pieces."""
 EXTRA_EDGES = 4
 
 
