@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import tracemalloc
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import list3r.memory.world.gravity as world_gravity
 from list3r.memory.geometry import Array, Sim3, rotation_exp
 from list3r.memory.overlap.planes import Planes, planar_area
 from list3r.memory.store.store import Store
@@ -71,6 +73,20 @@ def test_up_and_floor_are_recovered_in_any_frame(seed: int, pitch: float) -> Non
     floor = T_world_graph.apply(S_graph_world.apply(np.array([[0.0, 1.0, 0.0]])))
     assert abs(floor[0, 2]) < 0.08
     assert np.allclose(T_world_graph.rotation @ gravity.up, [0, 0, 1], atol=1e-9)
+
+
+def test_memory_does_not_grow_with_planes_times_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    rooms = [room(seed=n) for n in range(400)]
+    whole = Planes(*(np.concatenate([getattr(r, f.name)[:50] for r in rooms]) for f in fields(Planes)))
+    held = cameras(25.0, np.linspace(-40, 50, 3000), roll_deg=3.0)
+    tracemalloc.start()
+    found = gravity_from_planes(whole, held)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 30e6  # 48e6 is a single array of all planes by all cameras
+    monkeypatch.setattr(world_gravity, "_MOST_NUMBERS", 1 << 30)
+    at_once = gravity_from_planes(whole, held)
+    assert np.allclose(found.up, at_once.up, atol=1e-9) and found.reason == at_once.reason
 
 
 def test_a_camera_that_looks_down_at_a_desk_by_45_degrees_does_not_take_the_wall_for_the_floor() -> None:

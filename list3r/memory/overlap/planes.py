@@ -22,9 +22,9 @@ class Planes:
     """Centroids. Shape (P, 3)."""
     area: Array
     """Area of the convex hull of the support in the plane, square units. Shape (P,)."""
-    points: Array
+    points: Array | NDArray[np.float32]
     """A sample of all support points, of what is flat and what is not. Shape (N, 3)."""
-    owner: NDArray[np.int64]
+    owner: NDArray[np.int32] | NDArray[np.int64]
     """Plane of each point, -1 for points of what is not flat. Shape (N,)."""
 
 
@@ -38,8 +38,8 @@ def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
         p = node.support.points.astype(np.float64)
         if len(p) == 0:
             continue
-        points.append(p[:: max(1, len(p) // sample)])
-        owner.append(np.full(len(points[-1]), -1 if node.plane is None else len(normals)))
+        points.append(node.support.points[:: max(1, len(p) // sample)])
+        owner.append(np.full(len(points[-1]), -1 if node.plane is None else len(normals), np.int32))
         if node.plane is None:
             continue
         normal = node.plane[:3] / max(float(np.linalg.norm(node.plane[:3])), 1e-12)
@@ -50,8 +50,8 @@ def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
         np.array(normals).reshape(-1, 3),
         np.array(centers).reshape(-1, 3),
         np.array(areas, dtype=np.float64),
-        np.concatenate(points) if points else np.zeros((0, 3)),
-        np.concatenate(owner) if owner else np.zeros(0, np.int64),
+        np.concatenate(points) if points else np.zeros((0, 3), np.float32),
+        np.concatenate(owner) if owner else np.zeros(0, np.int32),
     )
 
 
@@ -64,8 +64,10 @@ def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
         np.concatenate([p.normal @ S.rotation.T for p, S in parts]),
         np.concatenate([S.apply(p.center) for p, S in parts]),
         np.concatenate([p.area * float(S.scale) ** 2 for p, S in parts]),
-        np.concatenate([S.apply(p.points) for p, S in parts]),
-        np.concatenate([np.where(p.owner < 0, -1, p.owner + n) for (p, _), n in zip(parts, start, strict=False)]),
+        np.concatenate([S.apply(p.points.astype(np.float64)) for p, S in parts]),
+        np.concatenate(
+            [np.where(p.owner < 0, -1, p.owner.astype(np.int64) + n) for (p, _), n in zip(parts, start, strict=False)]
+        ),
     )
 
 

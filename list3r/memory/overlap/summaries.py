@@ -35,10 +35,14 @@ class ChunkSummary:
     """Pairs of local ids. Shape (P, 2)."""
     unit: float
     """What a metre is in chunk units: 1 for a metric chunk."""
-    lab: Array
-    """Colours of a sample of all its points, CIE L*a*b*. Shape (C, 3)."""
     motions: dict[int, MotionTrack | None]
     """The local instances that move, by local id, and where they were; what bounds a room never does."""
+
+    @property
+    def lab(self) -> Array:
+        """Colours of a sample of all its points, CIE L*a*b*. Shape (C, 3)."""
+        rgb = self.shapes.rgb
+        return lab_from_rgb(rgb[:: max(1, len(rgb) // _COLORS)])
 
 
 _KEPT_BYTES = 48 << 20
@@ -50,7 +54,7 @@ _SAMPLED = 64
 
 def _bytes_of(summary: ChunkSummary) -> int:
     """Return what the arrays of a summary take, about."""
-    parts: list[object] = [summary.cannot_link, summary.lab]
+    parts: list[object] = [summary.cannot_link]
     for value in (*vars(summary.shapes).values(), *vars(summary.planes).values()):
         parts += value if isinstance(value, tuple) else [value]
     return sum(p.nbytes + 100 for p in parts if isinstance(p, np.ndarray))
@@ -133,10 +137,9 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
     if chunk.scale_kind != "metric":
         shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
-    lab = lab_from_rgb(shapes.rgb[:: max(1, len(shapes.rgb) // _COLORS)])
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
     motions = {n: store.local_instances.motion_track(chunk.chunk_id, n) for n in moves}
-    return ChunkSummary(shapes, planes, store.chunks.cannot_links(chunk.chunk_id), unit, lab, motions)
+    return ChunkSummary(shapes, planes, store.chunks.cannot_links(chunk.chunk_id), unit, motions)
 
 
 def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:

@@ -236,7 +236,7 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, gr
     return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
 
 
-_KEPT_BYTES = 16 << 20
+_KEPT_BYTES = 8 << 20
 
 
 @dataclass(frozen=True)
