@@ -283,7 +283,7 @@ def test_little_is_kept_between_chunks_and_what_is_not_is_read_again(
     walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(summaries, "_KEPT_BYTES", 1)
-    monkeypatch.setattr(library_things, "_KEPT", 20)
+    monkeypatch.setattr(library_things, "_KEPT_BYTES", 20 * 4096)
     for index, place in enumerate((0, 1, 2, 3, 1)):
         add(store, visit(walks, index, place))
         assert len(store.derived.of(summaries.SummaryCache)) == 1
