@@ -17,6 +17,7 @@ from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
     from list3r.batch.runner import BatchReport
+    from list3r.batch.tasks import BatchTask
     from list3r.batch.work import Outcome
 
 _RUN = only("licence", "scale_anchor", "detector", "detector_classes")
@@ -87,10 +88,10 @@ def batch(
 
     Example: list3r batch walks/ --out memories/
     """
-    from list3r.batch.engines.base import TaskResources, make_engine
+    groups = _read(videos, words, request, run)
+    from list3r.batch.engines.base import TaskResources, make_engine  # after a list that may be refused
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
-    from list3r.batch.tasks import Asked, read_tasks
     from list3r.memory.errors import OptionError
     from list3r.pipeline.finishing import check_run
 
@@ -99,7 +100,6 @@ def batch(
     settings = BatchSettings(
         out, place.scratch, place.state, place.retries, 0 if place.cpus == 1 else place.cpus, tasks.onto, tasks.force
     )
-    groups = read_tasks(videos, Asked(lambda fields: replace(words, **fields).options(), request, run))
     if tasks.script is not None:
         if tasks.script != "slurm":
             raise OptionError(f"--print {tasks.script} is not known; slurm is")
@@ -120,6 +120,13 @@ def batch(
     _say(report, json)
     if report.failed:
         raise typer.Exit(1)
+
+
+def _read(videos: str, words: src.SourceWords, request: BuildRequest, run: RunOptions) -> list[list[BatchTask]]:
+    """Return the videos of each memory, before what builds them is loaded."""
+    from list3r.batch.tasks import Asked, read_tasks
+
+    return read_tasks(videos, Asked(lambda fields: replace(words, **fields).options(), request, run))
 
 
 def _told(quiet: bool) -> Any:
