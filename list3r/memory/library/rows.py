@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.description.colors import Swatch, color_words, main_color
 from list3r.memory.description.describe import describe
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.instances import DerivedInstance
@@ -34,7 +35,9 @@ def pack_scores(p: PairScores) -> bytes:
 
 
 def unpack_scores(blob: bytes) -> PairScores:
-    """Return the inverse of `pack_scores`."""
+    """Return the inverse of `pack_scores`. Raises `MemoryFileError` for a blob of another length."""
+    if len(blob) % _SCORES.itemsize:
+        raise MemoryFileError(f"overlaps: {len(blob)} bytes are no whole scores; run `list3r verify` on the file")
     found = np.frombuffer(blob, _SCORES)
     i, j, shared = (found[name].astype(np.int64) for name in ("i", "j", "shared"))
     return PairScores(i, j, found["i_on_j"].copy(), found["j_on_i"].copy(), shared, found["frame_iou"].copy())

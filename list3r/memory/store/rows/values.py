@@ -238,7 +238,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "extent": Rule("typeof({}) = 'blob' AND length({}) = 48", "a box"),
         "dropped": Rule("typeof({}) = 'blob'", "bits"),
     },
-    "overlaps": {"scores": _ARCHIVE},
+    "overlaps": {"scores": _bytes(36, "six numbers a pair")},
     "members": {"first_chunk": _CHUNK, "first_local": _LOCAL, "shown": _FLAG},
     "anchors": {"instance": _integer(1), "chunk_id": _CHUNK, "S_exact_settled": _SIM3},
     "redundant": {
