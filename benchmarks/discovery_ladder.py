@@ -5,10 +5,9 @@ PYTHONPATH=. python benchmarks/discovery_ladder.py --seeds 5001,5004,5008 --json
 Each rung takes one more step from the discoverer and the rest from the truth; figures are those of `discovery.py`:
 `true` true masks, `voxels` the true thing of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true thing
 of most of their voxels, `joined` likewise of what parts make up step by step, `tree` of the clusters that agglomeration
-passes through those that fit true things best, `cut` the clusters where agglomeration stops, those that fit a true
-thing, `bound` likewise without those that the networks take for structure, `unlisted` all of these, `listed` those that
-are sure enough: what the discoverer proposes. What tracking and merging make of it is measured by
-`discovery_memory.py`.
+then passes through those that fit true things best, `cut` the clusters where it stops, those that fit a true thing,
+`bound` likewise without those that the networks take for structure, `unlisted` all of these, `listed` those that are
+sure enough: what the discoverer proposes. What tracking and merging make of it is measured by `discovery_memory.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Make data and weights of the learned discoverer from seeds.
 
-python -m training.train --out DIR --worlds 140 --fitted 60 --held 12
+python -m training.train --out DIR --worlds 470 --fitted 235 --held 12
 
 Every step is kept in the folder and not done again: chunks, graphs, the state of each network after each epoch.
 """
@@ -44,10 +44,10 @@ STATES = ((3.5, 3.5), (3.5, 3.5, 2.5), (3.5, 3.5, 2.5, 1.5))
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of chunks, graphs, states and logs")
-    parser.add_argument("--worlds", type=int, default=140, help="rooms with loose furniture")
-    parser.add_argument("--fitted", type=int, default=60, help="rooms with what is built in")
+    parser.add_argument("--worlds", type=int, default=470, help="rooms with loose furniture")
+    parser.add_argument("--fitted", type=int, default=235, help="rooms with what is built in")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
-    parser.add_argument("--epochs", type=int, default=12)
+    parser.add_argument("--epochs", type=int, default=8)
     parser.add_argument("--start", type=Path, help="folder of an earlier run whose networks are trained on")
     parser.add_argument("--without", choices=sorted(ABLATIONS), help="an ablation: what the networks do not see")
     parser.add_argument("--weights", type=Path, help="where the weights go; out/weights.npz without it")
