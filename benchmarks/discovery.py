@@ -31,7 +31,6 @@ from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_vie
 from list3r.instances.library import select_prompts
 from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings, MaskTrackSettings
-from list3r.instances.tracking.supports import surface_pixels
 from list3r.memory.geometry import OrientedBox, upright_box
 from list3r.memory.relations.instance_geometry import fit_box, without_strays
 from list3r.reconstruction.base import backproject
@@ -147,10 +146,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
     true, told, pairs = _Gathered(), _Gathered(), []
     said: dict[int, tuple[float, str, float]] = {}
     right = claimed = there = 0
-    surface = surface_pixels(
-        views, [p.position for p in found], [_things(p, stride) for p in found], MaskTrackSettings().most_off
-    )
-    for proposals, kept in zip(found, surface, strict=True):
+    for proposals in found:
         view = views.view(proposals.position)
         ids = film.ids[proposals.position][::stride, ::stride].astype(np.int64)
         labels = proposals.labels[::stride, ::stride]
@@ -168,7 +164,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
         true.add(
             _true_points(film, views, proposals.position) @ frame.T, mine, views.small_depth(proposals.position) > 0
         )
-        told.add(points, theirs, view.confirmed & kept)
+        told.add(points, theirs, view.confirmed)
         pairs.append(np.stack([mine[view.confirmed], theirs[view.confirmed]], axis=1))
     pixels, large = np.concatenate(pairs), true.large(MIN_PX)
     wanted = list(true.boxes(MIN_PX).values())
@@ -187,13 +183,6 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals], up: NDArr
             out |= {"duplicates": errors.duplicates, "merged": errors.merged_pairs}
             out |= {"small": len(small), "small_found": sum(k in hit for k in small)}
     return out | _by_masks(pixels, large) | _as_sure_as_right(pixels, large, said, {t.id: t.label for t in film.things})
-
-
-def _things(proposals: Proposals, stride: int) -> NDArray[np.int32]:
-    """Thing + 1 of each pixel at working size, 0 for none and for structure. Shape (h, w)."""
-    number = np.append(-1, proposals.identity if proposals.identity is not None else [])
-    flat = np.append(False, proposals.structure if proposals.structure is not None else []).astype(bool)
-    return np.asarray(np.where(flat, 0, number + 1), np.int32)[proposals.labels[::stride, ::stride]]
 
 
 def _true_points(film: Film, views: ChunkViews, position: int) -> NDArray[np.float32]:

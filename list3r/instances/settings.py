@@ -73,13 +73,6 @@ class MaskTrackSettings:
     cannot_link_frames: int = 3
     """Frames in which a pair must be seen side by side."""
     support_points: int = 3000
-    most_off: float = 0.4
-    """Readings that lie off their surface with a larger probability are left out of supports, see
-    docs/decisions/0125-readings-off-their-surface.md; 1 keeps all."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.most_off <= 1.0:
-            raise OptionError(f"the probability {self.most_off} of a reading to be off its surface must lie in (0, 1]")
 
     def least_frames(self, posed: int) -> float:
         """Frames in which a track of a chunk with so many posed frames must be seen to be kept."""

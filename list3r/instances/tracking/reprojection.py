@@ -13,11 +13,11 @@ from list3r.compiled import compiled
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.features import mean_feature
+from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.separation import cannot_link_pairs
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.joining import join_candidates, warp_labels
-from list3r.instances.tracking.supports import collect_supports
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.reconstruction.base import Reconstruction
 
@@ -71,8 +71,7 @@ class ReprojectionTracker:
         count = max((int(j.max()) + 1 for j in joined if len(j)), default=0)
         images = [_instance_image(views, p, j) for p, j in zip(proposals, joined, strict=True)]
         bases = _bases(views, proposals, joined, count)
-        track = self.settings.track
-        supports = collect_supports(views, proposals, images, bases, track.support_points, track.most_off)
+        supports = collect_supports(views, proposals, images, bases, self.settings.track.support_points)
         positions = np.array([p.position for p in proposals], np.int64)
 
         def labels_of(position: int) -> NDArray[np.int32]:

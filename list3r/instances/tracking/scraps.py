@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.base import Proposals
+from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.reprojection import LabelledChunk
-from list3r.instances.tracking.supports import collect_supports
 from list3r.memory.records import LocalInstance
 
 
@@ -31,7 +31,7 @@ def scrap_instances(
     for p, n in told:
         images[p.position] = np.append(0, n + 1).astype(np.int32)[p.labels[::stride, ::stride]]
     nowhere = np.full((count, 4), np.nan)
-    supports = collect_supports(views, kept, list(images.values()), nowhere, s.support_points, settings.track.most_off)
+    supports = collect_supports(views, kept, list(images.values()), nowhere, s.support_points)
     tracks = LabelledChunk(views, kept, numbers, supports, settings).follow(images.__getitem__, sorted(images))
     whole = {k: float(v) for p, n in told for k, v in zip(n.tolist(), p.score, strict=True)}
     feature = {k: v for p, n in told for k, v in zip(n.tolist(), p.features, strict=True)}

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
+from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.settings import InstanceSettings, VideoTrackerSettings
 from list3r.instances.tracking.reprojection import LabelledChunk
-from list3r.instances.tracking.supports import collect_supports
 from list3r.memory.records import LocalLibrary
 from list3r.models.images import InputShape, network_input, sam_input
 from list3r.models.pretrained import load_named
@@ -79,8 +79,7 @@ class VideoTracker:
                 things.keep(position, masks)
         images = [things.labels(p.position) for p in proposals]
         bases = np.full((things.count, 4), np.nan)
-        track = self._settings.track
-        supports = collect_supports(views, proposals, images, bases, track.support_points, track.most_off)
+        supports = collect_supports(views, proposals, images, bases, self._settings.track.support_points)
         chunk = LabelledChunk(views, proposals, things.joined, supports, self._settings)
         return chunk.library(things.labels, feature_space)
 
