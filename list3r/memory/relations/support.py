@@ -265,7 +265,8 @@ def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> fl
     """Return how far the board over a is above it, where b has surfaces both under a and over it: a shelf.
 
     Where b is not round a on more than one side (`walled`), what is over a's border alone is no board: a headboard
-    rises behind a pillow.
+    rises behind a pillow. A large shelf is sampled so thinly that one point is all that is left of a board over a book;
+    it is enough where a rests on b.
     """
     subject, holder = scene.instances[a], scene.instances[b]
     low, high = _heights(scene, a)
@@ -277,7 +278,8 @@ def _between_boards(scene: RelationScene, a: int, b: int, *, walled: bool) -> fl
     z = holder.points[:, 2]
     under = z[within & (z < low + noise) & (z > low - contact_of(scene, a) - noise)]
     over = z[inner & (z > high + noise)]
-    return float(over.min() - high - noise) if len(under) >= 2 and len(over) >= 2 else None
+    least = 1 if _rests_on(scene, a, b) else 2
+    return float(over.min() - high - noise) if len(under) >= least and len(over) >= least else None
 
 
 def _down_in(scene: RelationScene, a: int, b: int) -> bool:
