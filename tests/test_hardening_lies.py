@@ -88,6 +88,8 @@ SOME = {
     "frames 1:3: T_chunk_cam": "UPDATE frames SET T_chunk_cam = zeroblob(128) WHERE frame_index = 3",
     "relations: object 77 is not in instances": "UPDATE relations SET object = 77 WHERE subject = 3",
     "overlaps 2:2: scores": "UPDATE overlaps SET scores = scores || x'00' WHERE u = 2 AND v = 2",
+    "bends 2: twists": "UPDATE bends SET twists = CAST(x'000000000000f87f' || zeroblob(length(twists) - 8) AS BLOB)",
+    "bends 2: frames": "UPDATE bends SET frames = CAST(x'000000000000f07f' || zeroblob(length(frames) - 8) AS BLOB)",
     "aliases": "UPDATE aliases SET instance = id",
     "memory gravity: value": "UPDATE memory SET value = '\"sideways\"' WHERE key = 'gravity'",
     "edges 1:2:loop:0:3: scores": "UPDATE edges SET scores = '{\"s_det\": {}}'",
@@ -114,6 +116,7 @@ def test_a_lie_is_one_line_that_names_table_and_row(
         store.edges.all()
         store.local_instances.nodes()
         store.library.overlaps.all([2])
+        store.bends.all()
 
 
 def test_an_edit_refuses_overlaps_of_local_instances_that_are_gone(

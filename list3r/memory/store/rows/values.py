@@ -24,6 +24,7 @@ _MOST_CELL = 16 * 2**20
 """Bytes of a value that is looked into as a whole."""
 _MOST_LENGTH = 1e7
 """World units that anything may be away or long."""
+_MOST_LOG_SCALE = 20.0
 _ID = 2**31 - 1
 """What ids and counts may be: receivers such as USD hold them in 32 bits."""
 _TIME_S = 1e12
@@ -260,8 +261,11 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
     },
     "bends": {
         "chunk_id": _CHUNK,
-        "frames": _bytes(8, "numbers"),
-        "twists": Rule("typeof({}) = 'blob' AND length({}) = 7 * length(frames)", "seven numbers a frame"),
+        "frames": _checked("list3r_places", "finite numbers"),
+        "twists": Rule(
+            "typeof({}) = 'blob' AND length({}) = 7 * length(frames) AND list3r_twists({})",
+            "seven finite numbers a frame",
+        ),
     },
     "edits": {
         "entry": _integer(1),
@@ -458,6 +462,16 @@ def _is_geometry(blob: bytes) -> bool:
     )
 
 
+def _are_places(blob: bytes) -> bool:
+    _floats(blob, len(blob) // 8, float(_ID))
+    return len(blob) % 8 == 0
+
+
+def _are_twists(blob: bytes) -> bool:
+    twists = _floats(blob, len(blob) // 56 * 7, _MOST_LENGTH).reshape(-1, 7)
+    return bool((np.abs(twists[:, 6]) < _MOST_LOG_SCALE).all())
+
+
 def _is_place(blob: bytes) -> bool:
     values = _floats(blob, 15, _MOST_LENGTH)
     return bool((values[3:6] >= 0).all()) and _is_rotation(values[6:15].reshape(3, 3))
@@ -513,6 +527,8 @@ _FUNCTIONS: Mapping[str, Callable[..., bool]] = {
     "list3r_plane": _is_plane,
     "list3r_geometry": _is_geometry,
     "list3r_place": _is_place,
+    "list3r_places": _are_places,
+    "list3r_twists": _are_twists,
     "list3r_box": _is_box,
     "list3r_vector": _is_vector,
     "list3r_value": _is_value,
