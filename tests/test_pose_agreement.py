@@ -78,9 +78,10 @@ def test_a_world_with_y_up_is_not_taken_for_one_with_z_up(tmp_path: Path, monkey
     standing = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     level = np.linalg.inv(shots()[0].T_world_cam)  # filmed level, with z up as OpenCV's -y
     upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    monkeypatch.setattr(recordings, "arkit", lambda T: right(upright @ level @ T))
+    turn = np.array([[0.8, 0, 0.6, 0], [0, 1, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, 1]])  # no identity at the start
+    monkeypatch.setattr(recordings, "arkit", lambda T: turn @ right(upright @ level @ T))
     assert open_source(recordings.write_record3d(tmp_path / "a")).info.z_up
-    monkeypatch.setattr(recordings, "arkit", lambda T: standing @ right(upright @ level @ T))
+    monkeypatch.setattr(recordings, "arkit", lambda T: standing @ turn @ right(upright @ level @ T))
     assert not open_source(recordings.write_record3d(tmp_path / "b")).info.z_up
 
 
