@@ -16,14 +16,16 @@ _LEAST = np.float32(0.05)
 
 @compiled
 def zncc_cost(
-    reference: Floats, sources: Floats, rotated: Floats, shift: Floats, depths: Floats, radius: int, noise: float
+    reference: Floats, sources: Floats, ways: tuple[Floats, Floats], depths: Floats, radius: int, noise: float
 ) -> Floats:
     """Return the mean matching cost of inverse depths over sources, 0.5 where no source sees the place.
 
-    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `rotated`
-    (S, 3, h, w) and `shift` (S, 3) tell where pixels lie in them; `depths` (D, h, w) or (D, 1, 1). Shape (D, h, w).
+    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `ways`,
+    (S, 3, h, w) turned and (S, 3) shifted, tell where pixels lie in them; `depths` (D, h, w) or (D, 1, 1).
+    Shape (D, h, w).
     """
     _, height, width = reference.shape
+    rotated, shift = ways
     out = np.empty((depths.shape[0], height, width), np.float32)
     total, count = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     inside, sums = np.empty((height, width), np.float32), np.empty((3, height, width), np.float32)
@@ -105,9 +107,7 @@ def _add_zncc(reference: Floats, sums: Floats, inside: Floats, radius: int, nois
         for q in range(3):
             window[q] = sums[q, max(v - radius, 0)]
             for k in range(v - radius + 1, v + radius + 1):
-                row = min(max(k, 0), height - 1)
-                for u in range(width):
-                    window[q, u] += sums[q, row, u]
+                window[q] += sums[q, min(max(k, 0), height - 1)]
         for u in range(width):
             own = window[0, u] / size
             varied = max(window[1, u] / size - own * own, _ZERO) + noise
@@ -186,40 +186,53 @@ def splat(inverse: Floats, sigma: Floats, rotated: Floats, shift: Floats, tolera
     nearest, front = np.zeros((height, width), np.float32), np.float32(1.0 - tolerance)
     mean, error, total = np.zeros_like(nearest), np.zeros_like(nearest), np.zeros_like(nearest)
     points = [_landed(inverse[m], sigma[m], rotated[m], shift[m]) for m in range(count)]
-    for x, y, w, _ in points:
-        for k in range(len(x)):
-            for n in range(4):
-                share, row, column = _share(x[k], y[k], n, height, width)
-                if share > _ZERO:
-                    nearest[row, column] = max(nearest[row, column], w[k])
-    for x, y, w, own in points:
-        for n in range(4):
-            for k in range(len(x)):
-                share, row, column = _share(x[k], y[k], n, height, width)
-                if share > _ZERO and w[k] > front * nearest[row, column]:
-                    weight = share / (own[k] * own[k])
-                    total[row, column] += weight
-                    mean[row, column] += weight * w[k]
-                    error[row, column] += weight * own[k]
+    for places in points:
+        _keep_nearest(places, nearest)
+    for places in points:
+        _add_shares(places, front * nearest, mean, error, total)
     total = np.maximum(total, np.float32(1e-20))
     return mean / total, error / total
 
 
 @compiled
-def _landed(inverse: Floats, sigma: Floats, to: Floats, by: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return places (x, y) in another frame of the points of a map, their inverse depth there and sigma. Shape (N,)."""
+def _keep_nearest(places: Floats, nearest: Floats) -> None:
+    """Write the greatest inverse depth of the points around each pixel."""
+    for k in range(places.shape[1]):
+        for n in range(4):
+            share, row, column = _share(places[0, k], places[1, k], n, nearest.shape[0], nearest.shape[1])
+            if share > _ZERO:
+                nearest[row, column] = max(nearest[row, column], places[2, k])
+
+
+@compiled
+def _add_shares(places: Floats, front: Floats, mean: Floats, error: Floats, total: Floats) -> None:
+    """Add what the points around each pixel, of those before its `front`, say, by their weights."""
+    for n in range(4):
+        for k in range(places.shape[1]):
+            share, row, column = _share(places[0, k], places[1, k], n, front.shape[0], front.shape[1])
+            if share > _ZERO and places[2, k] > front[row, column]:
+                weight = share / (places[3, k] * places[3, k])
+                total[row, column] += weight
+                mean[row, column] += weight * places[2, k]
+                error[row, column] += weight * places[3, k]
+
+
+@compiled
+def _landed(inverse: Floats, sigma: Floats, to: Floats, by: Floats) -> Floats:
+    """Return places (x, y) in another frame of the points of a map, their inverse depth there and sigma. (4, N)."""
     height, width = inverse.shape
     out, count = np.empty((4, height * width), np.float32), 0
     for v in range(height):
         for u in range(width):
             w = inverse[v, u]
             ratio = to[2, v, u] + w * by[2]
-            if w > _ZERO and ratio > np.float32(1e-3):
-                x, y = (to[0, v, u] + w * by[0]) / ratio, (to[1, v, u] + w * by[1]) / ratio
-                if -_ONE <= x <= width and -_ONE <= y <= height:
-                    out[0, count], out[1, count], out[2, count], out[3, count] = x, y, w / ratio, sigma[v, u]
-                    count += 1
-    return out[0, :count], out[1, :count], out[2, :count], out[3, :count]
+            if w <= _ZERO or ratio <= np.float32(1e-3):
+                continue
+            x, y = (to[0, v, u] + w * by[0]) / ratio, (to[1, v, u] + w * by[1]) / ratio
+            if -_ONE <= x <= width and -_ONE <= y <= height:
+                out[0, count], out[1, count], out[2, count], out[3, count] = x, y, w / ratio, sigma[v, u]
+                count += 1
+    return out[:, :count]
 
 
 @compiled

@@ -87,7 +87,7 @@ def _group_cost(
     known = stacked([reference.gray, reference.mean, reference.spread])
     places = stacked([w.rotated for w in warps]), stacked([w.shift for w in warps])
     tried = np.ascontiguousarray(depths.numpy(), np.float32)
-    cost = zncc_cost(known, stacked(sources), *places, tried, settings.radius_px, settings.image_noise)
+    cost = zncc_cost(known, stacked(sources), places, tried, settings.radius_px, settings.image_noise)
     return torch.from_numpy(cost)
 
 
