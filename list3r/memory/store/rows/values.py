@@ -78,7 +78,7 @@ def _bytes(each: int, words: str) -> Rule:
 _FLAG, _SHARE = _integer(0, 1), _number(0.0, 1.0)
 _ANY = Rule("typeof({}) IN ('integer', 'real')", "a number")
 """It may be infinite, where nothing is known."""
-_LENGTH = Rule(f"{_ANY.condition} AND {{}} >= 0", "a number from 0 on")
+_LENGTH = _number(0.0, 1e12)
 _CHUNK, _LOCAL, _FRAME = _integer(0), _integer(-1), _integer(0)
 _SIM3 = _checked("list3r_sim3", "a similarity")
 _ARCHIVE = Rule("typeof({}) = 'blob'", "arrays")
