@@ -199,7 +199,11 @@ def _scene(store: Store) -> dict[str, Any]:
 
 
 def _path(store: Store, session: int) -> Trajectory:
-    poses = store.trajectory.poses(session)
+    """The path of a session as far as it is in one world with the first chunk, else all of it."""
+    chunks = store.chunks.all()
+    world = {c.chunk_id for c in chunks if c.component == chunks[0].component}
+    every = store.trajectory.poses(session)
+    poses = [p for p in every if p[0].chunk_id in world] or every
     T = np.array([Sim3(1.0, S.rotation, S.translation).as_matrix() for _, S in poses])
     return Trajectory(np.array([f.time_s for f, _ in poses]), T)
 
