@@ -24,7 +24,7 @@ EACH = 50
 BUILDS_S = 60.0
 """Processor time of a command that builds; of all others it is that of `asking`."""
 _BUILDING = {"build", "update", "demo", "precompute", "batch", "convert", "inspect", "detect", "embed"}
-_SERVING = {"view", "mcp"}
+_SERVING = {"view", "mcp", "serve"}
 _RARE = {"demo", "view", "mcp", "batch", "build", "update", "precompute"}
 _NUMBERS = ("0", "1", "2", "3", "-1", "0.5", "nan", "inf", "-inf", "1e400", "99999999999999999999", "0x10", "")
 _TEXTS = ("", "x", "white box on table", "é", "\x1b[2J", "a\nb", "\udce9", "'; DROP TABLE instances; --", "a" * 5000)
