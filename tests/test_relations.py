@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -231,6 +233,19 @@ def test_what_stands_between_the_boards_of_a_shelf_is_in_it_and_what_stands_on_t
     bowl = body(4, Piece("bowl", (-0.2, 0.02, 1.68), (0.2, 0.2, 0.1), round=True, points=400))
     found = facts([body(1, FLOOR, structure="floor"), shelf, vase, bowl])
     assert (3, "in", 2) in found and (4, "on", 2) in found and (4, "in", 2) not in found
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_a_book_in_a_shelf_is_in_it_also_where_one_point_is_left_of_the_board_above(share: float) -> None:
+    boards = [Piece("board", (0, 0, z), (0.8, 0.3, 0.03), points=500) for z in (0.1, 1.1)]
+    shelf = body(2, *boards, Piece("back", (0, -0.14, 0.85), (0.8, 0.02, 1.5), points=900))
+    above = (np.abs(shelf.points[:, 0] - 0.2) < 0.2) & (np.abs(shelf.points[:, 1]) < 0.13) & (shelf.points[:, 2] > 0.6)
+    kept = ~above
+    kept[np.flatnonzero(above)[np.argmin(np.linalg.norm(shelf.points[above, :2] - (0.2, 0.0), axis=1))]] = share > 0
+    few = replace(shelf, points=shelf.points[kept], rgb=shelf.rgb[kept])
+    book = body(3, Piece("book", (0.2, 0.0, 0.24), (0.14, 0.14, 0.25), points=400))
+    found = facts([body(1, FLOOR, structure="floor"), few, book])
+    assert ((3, "in", 2) in found) == (share > 0)
 
 
 def test_a_gap_is_not_made_wider_by_the_sides_that_are_hidden() -> None:

@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--fitted", type=int, default=235, help="rooms with what is built in")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=8)
-    parser.add_argument("--start", type=Path, help="folder of an earlier run whose networks are trained on")
+    parser.add_argument("--start", type=Path, help="folder of an earlier run whose first network is trained on")
     parser.add_argument("--without", choices=sorted(ABLATIONS), help="an ablation: what the networks do not see")
     parser.add_argument("--weights", type=Path, help="where the weights go; out/weights.npz without it")
     words = parser.parse_args()

@@ -19,7 +19,7 @@ from list3r.instances.learned.things import ThingVerdicts, judge_things
 
 @dataclass(frozen=True)
 class CutSettings:
-    """Where agglomeration stops. Both were chosen on worlds for training (see training/)."""
+    """Where agglomeration stops, chosen on 18 left-out worlds (docs/decisions/0124-learning-from-700-rooms.md)."""
 
     sure: float = 3.5
     """Mean log odds above which fine pieces become parts."""
