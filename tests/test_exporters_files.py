@@ -23,6 +23,7 @@ from list3r.exporters.tum import write_tum
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
 from list3r.memory.store.store import Store
+from tests.browser import PROGRAM, Browser
 from tests.test_exporters import write_split_memory
 
 
@@ -128,6 +129,37 @@ def test_glb_boxes_are_twelve_edges_with_facts(room: Store, tmp_path: Path) -> N
     position = accessors[primitive["attributes"]["POSITION"]]  # type: ignore[index]
     assert (primitive["mode"], position["count"]) == (1, 24)
     assert np.allclose(position["max"], room.instances.get(5).aabb[1])
+
+
+def test_glb_says_what_its_buffers_hold(room: Store, tmp_path: Path) -> None:
+    write_glb(room, tmp_path / "out.glb")
+    gltf = read_gltf(tmp_path / "out.glb")
+    parts = [p for m in gltf["meshes"] for p in m["primitives"]]  # type: ignore[attr-defined]
+    used = {gltf["accessors"][n]["bufferView"] for p in parts for n in p["attributes"].values()}  # type: ignore[index]
+    assert {gltf["bufferViews"][n].get("target") for n in used} == {34962}  # type: ignore[index]
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="no Chromium on this machine")
+def test_a_viewer_of_others_shows_the_glb(room: Store, tmp_path: Path) -> None:
+    """The loader of three.js, in the page of viser, in a browser: boxes and points where the memory has them."""
+    viser = pytest.importorskip("viser")
+    write_glb(room, tmp_path / "out.glb", GlbSettings(color="instance"))
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    browser = Browser(tmp_path / "profile")
+    try:
+        turned = Rotation.from_matrix(T_GLTF_WORLD[:3, :3].T).as_quat(scalar_first=True)
+        server.scene.add_glb("/out", (tmp_path / "out.glb").read_bytes(), wxyz=tuple(turned))
+        chair = room.instances.get(5).center
+        server.initial_camera.look_at = tuple(chair)
+        server.initial_camera.position = tuple(chair + np.array([0.0, -2.0, 1.0]))
+        browser.open(f"http://127.0.0.1:{server.get_port()}")
+        browser.says("Connected")
+        ink = np.array(instance_color(5), float)
+        browser.wait(lambda: (np.abs(browser.picture()[:, :900] - ink).max(axis=2) < 40).sum() > 100)
+        assert browser.errors == []
+    finally:
+        browser.close()
+        server.stop()
 
 
 def expected_cell(value: object) -> str:

@@ -22,6 +22,8 @@ from list3r.memory.store.store import Store
 T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """glTF has y up: its x, y, z are the world's x, z, -y."""
 
+_ARRAY_BUFFER = 34962
+"""What holds attributes of vertices, by the numbers of OpenGL."""
 _EDGES = ((0, 1), (0, 2), (0, 4), (3, 1), (3, 2), (3, 7), (5, 1), (5, 4), (5, 7), (6, 2), (6, 4), (6, 7))
 """Pairs of `OrientedBox.corners` that differ along one axis."""
 
@@ -79,7 +81,14 @@ def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
             _add(scene, _wire_box(instance), f"{name}_box", node, instance)
     if not scene.geometry:
         _add_nothing(scene)
-    return bytes(scene.export(file_type="glb", unitize_normals=False))
+    return bytes(scene.export(file_type="glb", unitize_normals=False, tree_postprocessor=_say_what_buffers_hold))
+
+
+def _say_what_buffers_hold(tree: dict[str, Any]) -> None:
+    """Mark views of attributes as what they are, which validators of glTF ask for and trimesh leaves out."""
+    used = {n for mesh in tree["meshes"] for part in mesh["primitives"] for n in part["attributes"].values()}
+    for view in {tree["accessors"][n]["bufferView"] for n in used}:
+        tree["bufferViews"][view]["target"] = _ARRAY_BUFFER
 
 
 def _add(scene: trimesh.Scene, geometry: Any, name: str, parent: str, instance: Instance) -> None:
