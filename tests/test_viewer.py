@@ -19,6 +19,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.library.consolidation import consolidate
+from list3r.memory.records import Relation
 from list3r.memory.store.store import Store
 from tests.conftest import small_picture, write_small_room
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
@@ -32,6 +33,7 @@ from list3r.viewer.beside import SideBySide
 from list3r.viewer.box_lines import thin_lines
 from list3r.viewer.clouds import FINE, CloudSettings
 from list3r.viewer.link import ViewState
+from list3r.viewer.told import described
 from list3r.viewer.world import (
     COLOR_MODES,
     ShownCloud,
@@ -75,6 +77,14 @@ def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # ---------------------------------------------------------------------------------------------- what is shown
+
+
+def test_the_panel_says_of_each_pair_what_tells_most(room: Path) -> None:
+    said = [(MUG, "near", TABLE), (MUG, "next_to", TWIN), (MUG, "near", TWIN), (MUG, "on", TABLE), (TABLE, "near", MUG)]
+    with list3r.open(room) as memory:
+        relations = [Relation(a, predicate, b, 0.9, 0.1) for a, predicate, b in said]
+        text = described(memory, read_world(memory, []), MUG, relations)
+    assert [line for line in text.splitlines() if line.startswith("- ")] == ["- on 2 table", "- next to 4 mug"]
 
 
 @given(st.lists(st.integers(1, 200), min_size=1, max_size=12), st.integers(1, 500))

@@ -34,7 +34,7 @@ def path(store: Store, start: int, end: int, *, structure: bool = True) -> Relat
         if r.subject not in usable or r.object not in usable or r.subject == r.object:
             continue
         key = frozenset((r.subject, r.object))
-        if key not in best or _rank(r) < _rank(best[key]):
+        if key not in best or telling(r) < telling(best[key]):
             best[key] = r
             # One more hop costs more than any doubt saved: confidences decide only among ways equally long.
             graph.add_edge(r.subject, r.object, weight=1.0 + 1e-6 * (1.0 - r.confidence))
@@ -48,7 +48,8 @@ def path(store: Store, start: int, end: int, *, structure: bool = True) -> Relat
     return Relations(steps, "known", f"{len(steps)} step{'s' if len(steps) > 1 else ''}")
 
 
-def _rank(r: Relation) -> tuple[int, float, int]:
+def telling(r: Relation) -> tuple[int, float, int]:
+    """Return a key that sorts relations from the most specific and surest to the least."""
     known = _TELLING.index(r.predicate) if r.predicate in _TELLING else len(_TELLING) + (r.predicate in PREDICATES)
     return known, -r.confidence, r.subject
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from list3r.api import SceneMemory
 from list3r.memory.records import Relation
+from list3r.queries.path import telling
 from list3r.viewer.world import ShownWorld
 
 _MOST_RELATIONS = 14
@@ -24,9 +25,11 @@ def described(memory: SceneMemory, world: ShownWorld, instance_id: int, relation
         f"confidence {i.confidence:.2f}, seen in {i.observations} frames  ",
         f"seen {i.first_seen_s:.1f} s to {i.last_seen_s:.1f} s{_state(i.state, i.dynamic)}",
     ]
-    own = [r for r in relations if r.subject == i.id and r.object in world.instances]
+    own = sorted((r for r in relations if r.subject == i.id and r.object in world.instances), key=telling)
     if own:
-        told = [f"- {r.predicate.replace('_', ' ')} {r.object} {_plain(world.name(r.object))}" for r in own]
+        first = {r.object: r for r in reversed(own)}  # of each other instance the most telling
+        kept = [r for r in own if first[r.object] is r]
+        told = [f"- {r.predicate.replace('_', ' ')} {r.object} {_plain(world.name(r.object))}" for r in kept]
         lines += ["", "**Relations**", "", *told[:_MOST_RELATIONS]]
         lines += [f"- and {len(told) - _MOST_RELATIONS} more"] if len(told) > _MOST_RELATIONS else []
     history = [c for c in memory.changes() if c.instance.id == i.id]
