@@ -218,17 +218,16 @@ class _Clusters:
     """Groups of nodes that grow: members, boxes, and the nodes that must stay out."""
 
     def __init__(self, t: Nodes, enemies: list[set[int]]) -> None:
-        from scipy.cluster.hierarchy import DisjointSet
-
         count = range(len(t.keys))
-        self._sets = DisjointSet(count)
+        self.home = list(count)
+        """The cluster of each node."""
         self.members = {n: [n] for n in count}
         self.low, self.high = t.low.copy(), t.high.copy()
         self.foes = {n: set(enemies[n]) for n in count}
 
     def pair(self, x: int, y: int) -> tuple[int, int]:
         """Return the clusters of two nodes, the one with the smallest member first."""
-        a, b = self._sets[x], self._sets[y]
+        a, b = self.home[x], self.home[y]
         return (a, b) if self.members[a][0] <= self.members[b][0] else (b, a)
 
     def span(self, a: int, b: int) -> float:
@@ -237,8 +236,9 @@ class _Clusters:
 
     def merge(self, a: int, b: int) -> None:
         """Make two clusters one."""
-        self._sets.merge(a, b)
-        kept = self._sets[a]
+        kept, gone = (a, b) if len(self.members[a]) >= len(self.members[b]) else (b, a)
+        for n in self.members[gone]:
+            self.home[n] = kept
         self.low[kept], self.high[kept] = np.minimum(self.low[a], self.low[b]), np.maximum(self.high[a], self.high[b])
         self.foes[kept] = self.foes.pop(a) | self.foes.pop(b)
         self.members[kept] = sorted(self.members.pop(a) + self.members.pop(b))
@@ -253,8 +253,10 @@ def _join(
     edges = np.flatnonzero(links.kind != NONE)
     edges = edges[np.lexsort((links.b[edges], links.a[edges], -links.score[edges]))]
     for n, x, y in zip(edges.tolist(), links.a[edges].tolist(), links.b[edges].tolist(), strict=True):
+        if clusters.home[x] == clusters.home[y]:
+            continue
         a, b = clusters.pair(x, y)
-        if a == b or (a, b) in refused:
+        if (a, b) in refused:
             continue
         against = "" if check is None else check.objection(t.keys[x], t.keys[y])
         against = against or _too_long(t, clusters, a, b, s) or _objection(t, clusters, a, b, overlaps, s)
