@@ -273,8 +273,11 @@ WITH_DEPTH: dict[str, Callable[[Path], Path]] = {
 }
 
 
-def write_bag(root: Path, kind: str = "mcap", *, registered: bool = False, odometry: bool = False) -> Path:
-    """A recording of ROS 1 ("bag") or ROS 2 ("mcap", "db3"): colour, compressed depth, cameras, `/tf`, interleaved.
+def write_bag(
+    root: Path, kind: str = "mcap", *, registered: bool = False, odometry: bool = False, chunk_bytes: int = 1 << 20
+) -> Path:
+    """A recording of ROS 1 ("bag") or ROS 2 ("mcap", "db3"): colour, compressed depth, cameras, `/tf`, interleaved,
+    in chunks (but of a db3) of so many bytes.
 
     The depth camera stands 2 cm beside the colour camera unless depth is registered; the robot carries both.
     """
@@ -287,6 +290,7 @@ def write_bag(root: Path, kind: str = "mcap", *, registered: bool = False, odome
     root.parent.mkdir(parents=True, exist_ok=True)
     path = root.with_suffix(".bag") if kind == "bag" else root
     with _bag_writer(path, kind) as writer:
+        writer.chunk_threshold = chunk_bytes
         put_ = _Put(writer, store, ros1=kind == "bag")
         for message in _messages(put_, registered=registered, odometry=odometry):
             put_(*message)
@@ -314,6 +318,9 @@ class _Put:
             self._open[topic] = self._writer.add_connection(topic, kind, typestore=self.store)
         pack = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
         self._writer.write(self._open[topic], int(1e9 * time_s), pack(message, kind))
+        storage = getattr(self._writer, "storage", None)
+        if hasattr(storage, "close_chunk") and storage.chunk.bio.tell() > self._writer.chunk_threshold:
+            storage.close_chunk()  # rosbags has one length for all
 
     def make(self, kind: str, **fields: object) -> object:
         if self._ros1 and kind == "std_msgs/msg/Header":

@@ -77,6 +77,57 @@ def test_a_recording_that_is_cut_off_is_one_clear_line(kind: str, tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_recording_whose_recorder_was_killed_is_read_as_far_as_it_goes(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", kind, chunk_bytes=20_000)
+    whole, file = list(open_source(path).read(0, COUNT)), file_of(path, kind)
+    data, counts = file.read_bytes(), []
+    for share in (0.6, 0.9, 0.9999):
+        file.write_bytes(data[: int(share * len(data))])
+        source = open_source(path)
+        assert any(f"{file.name} has no index" in note for note in source.info.notes) and source.info.has_poses
+        counts.append(source.info.frame_count)
+        for one, same in zip(source.read(0, COUNT), whole, strict=False):
+            assert isinstance(one, Frame) and isinstance(same, Frame)
+            assert (one.color == same.color).all() and np.array_equal(one.depth, same.depth, equal_nan=True)
+        assert len(list(source.read(counts[-1] - 1, COUNT))) == 1
+    assert 0 < counts[0] < counts[1] < counts[2] == COUNT
+
+
+def test_a_bag_that_says_that_it_has_no_index_is_read(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", "bag", chunk_bytes=20_000)
+    data = path.read_bytes()
+    at = data.index(b"index_pos=") + 10
+    active = path.with_name("walk.bag.active")
+    active.write_bytes(data[:at] + bytes(8) + data[at + 8 : int.from_bytes(data[at : at + 8], "little")])
+    assert [f.color.tolist() for f in frames_of(active)] == [f.color.tolist() for f in frames_of(path)]
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_folder_whose_metadata_was_never_written_is_read(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", kind)
+    (path / "metadata.yaml").unlink()
+    assert open_source(path).info.frame_count == len(frames_of(path)) == COUNT
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_no_place_to_cut_a_recording_breaks_its_reader(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", kind, chunk_bytes=20_000)
+    file = file_of(path, kind)
+    data = file.read_bytes()
+    for length in np.random.default_rng(1).integers(1, len(data), 25).tolist():
+        file.write_bytes(data[:length])
+        try:
+            assert 0 < len(list(open_source(path).read(0, COUNT))) <= COUNT
+        except List3rError as error:
+            assert "\n" not in str(error)
+
+
+def file_of(path: Path, kind: str) -> Path:
+    """The file of a recording that holds its messages."""
+    return path if path.is_file() else next(path.glob(f"*.{kind}"))
+
+
 def test_a_file_of_noise_is_one_clear_line(tmp_path: Path) -> None:
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"\x89" * 500)

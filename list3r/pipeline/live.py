@@ -26,6 +26,7 @@ from list3r.frames.live.growing import FolderFeed
 from list3r.frames.live.spooled import StreamFeed
 from list3r.frames.live.stream import open_camera
 from list3r.frames.options import SourceOptions
+from list3r.frames.readers.rosbag import is_recording
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError, TrackingError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
@@ -181,8 +182,10 @@ def _feed(source: str, spool: Path, options: SourceOptions, how: LiveSettings, w
     """The feed of a source; pictures of a stream are removed when it is over."""
     if not is_stream(source):
         folder = Path(source).expanduser()
-        if not folder.is_dir():
-            raise SourceError(f"{folder} is no folder; --live follows a folder that grows, or the address of a stream")
+        if not folder.is_dir() and not is_recording(folder):
+            raise SourceError(
+                f"{folder} is no folder; --live follows a folder or a bag that grows, or the address of a stream"
+            )
         yield FolderFeed(folder, options, how)
         return
     if spool.exists():

@@ -132,7 +132,9 @@ class RunOptions:
     )
     live: bool = field(
         default=False,
-        metadata=option("build: SOURCE is a folder that still grows. Webcams and streams are live anyway."),
+        metadata=option(
+            "build: SOURCE is a folder or recording that still grows. Webcams and streams are live anyway."
+        ),
     )
     resume: bool = field(default=False, metadata=option("Go on with what was interrupted."))
     force: bool = field(

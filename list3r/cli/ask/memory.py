@@ -48,7 +48,7 @@ def info(
         return
     for key, value in report.items():
         if key != "sessions" and (key, value) != ("beside", None):
-            say(f"{key.replace('_', ' '):20} {value}")
+            say(f"{key.replace('_', ' '):20} {', '.join(value) if isinstance(value, list) else value}")
     for session in report["sessions"]:
         say(f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}")
     if loops:

@@ -23,6 +23,7 @@ from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.bag_chunks import bound_rosbags
+from list3r.frames.recordings.bag_mending import MendedFile, mended
 from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
 from list3r.frames.recordings.ros_transforms import TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
@@ -44,10 +45,24 @@ _MOST_BYTES = 2**50
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is such a recording, by its name and, of a folder, by its metadata."""
+    """Whether a path is such a recording, by its name or, of a folder, by what is in it. One that was killed, or still
+    runs, has no metadata.
+    """
     if path.is_dir():
-        return (path / "metadata.yaml").is_file() and any(path.glob(f"*{end}") for end in ENDINGS[1:])
-    return path.suffix.lower() in ENDINGS
+        return bool(_files(path))
+    return path.suffix.lower() in ENDINGS or path.name.endswith(".bag.active")
+
+
+def recorded_bytes(path: Path) -> int | None:
+    """How long a recording is as yet; None for what is none."""
+    if not is_recording(path):
+        return None
+    return sum(p.stat().st_size for p in (_files(path) if path.is_dir() else [path]))
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a folder that hold messages."""
+    return sorted(p for end in ENDINGS[1:] for p in path.glob(f"*{end}"))
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,7 @@ class BagSource:
         stored = read_color(color.first).shape[:2]
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
         posed = sum(T is not None for T in self._poses)
-        notes = [*notes, *said]
+        notes = [*notes, *said, *_cut_off(path)]
         if posed:
             notes.append(f"poses of {color.frame} in {world}")
         elif tree.moving:
@@ -207,16 +222,32 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise OptionError(f"{path} is a ROS recording, which takes: pip install 'list3r[ros]'") from None
-    bound_rosbags()
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):
             check_ordinary(part.stat(), part, _MOST_BYTES)
-        with AnyReader([path], default_typestore=known) as reader:
+        with AnyReader(_parts(path), default_typestore=known) as reader:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SourceError(f"{path} cannot be read as a ROS recording ({said}); reindex it, or copy it again") from None
+
+
+def _parts(path: Path) -> list[Any]:
+    """What `rosbags` opens of a recording: files that lack their end, with one."""
+    decompressors = bound_rosbags()
+    files = _files(path) if path.is_dir() else [path]
+    parts = [mended(p, decompressors) or p for p in files]
+    return [path] if parts == files and (path / "metadata.yaml").exists() else parts
+
+
+def _cut_off(path: Path) -> list[str]:
+    """Say what is read of the files that lack their end."""
+    return [
+        f"{p.path.name} has no index, its recorder did not end it: {100 * p.end // p.size} % of it are whole and read"
+        for p in _parts(path)
+        if isinstance(p, MendedFile)
+    ]
 
 
 class _Topics:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bz2
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, BinaryIO, Protocol, Self, cast
 
 MOST_BYTES = 96 * 2**20
@@ -38,8 +39,11 @@ def bounded(unpacker: Callable[[], _Unpacker]) -> Callable[..., bytes]:
     return unpack
 
 
-def bound_rosbags() -> None:
-    """Have `rosbags` unpack within bounds, in this process; the bytes stay the same."""
+@cache
+def bound_rosbags() -> Mapping[str, Callable[..., bytes]]:
+    """Have `rosbags` unpack within bounds, in this process; the bytes stay the same. Return what unpacks the chunks of
+    a ROS 1 bag.
+    """
     from rosbags.rosbag1 import reader as first
     from rosbags.rosbag2 import reader as second
     from rosbags.rosbag2 import storage_mcap
@@ -57,6 +61,7 @@ def bound_rosbags() -> None:
     storage_mcap.read_exact = _read_exact  # type: ignore[assignment]
     for table in (first.decompressors, storage_mcap.DECOMPRESSORS):
         table.update({name: unpack for name, unpack in known.items() if name in table})
+    return dict(first.decompressors)
 
 
 def _read_exact(file: BinaryIO, size: int) -> bytes:
