@@ -34,8 +34,16 @@ class VerificationSettings:
     least_feature_share: float = 0.15
     """Least share of the matched features that agree on the pose."""
     registration: RegistrationSettings = field(
+        default_factory=lambda: RegistrationSettings(
+            photometric_weight=0.0, gate_m=0.08, gate_halvings=1, iterations=20
+        )
+    )
+    """Features begin within some centimetres: a wider gate takes the wall for the picture that hung before it
+    (docs/decisions/0058)."""
+    scaled_registration: RegistrationSettings = field(
         default_factory=lambda: RegistrationSettings(photometric_weight=0.0, gate_m=0.15, iterations=20)
     )
+    """Of chunks without metric scale, whose depth is coarser."""
     least_overlap: float = 0.25
     """Least share of a side's surface that the other side sees."""
     least_agreement: float = 0.8
