@@ -22,6 +22,7 @@ from list3r.memory.records import ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.memory.world.gravity import estimate_gravity, world_from_graph
 from list3r.memory.world.scale import write_scale
+from list3r.memory.world.session_ties import counted_once
 from list3r.pipeline.settings import AssociationSettings, session_settings
 from list3r.reconstruction.registry import MODELS
 
@@ -39,15 +40,18 @@ def place_chunks(
     how = settings or AssociationSettings()
     chunks = store.chunks.all()
     measured = store.edges.all()
-    edges = hold_back(measured, {c.chunk_id: c.session_id for c in chunks}, _metre(chunks), how.ties)
+    session_of = {c.chunk_id: c.session_id for c in chunks}
+    edges = hold_back(measured, session_of, _metre(chunks), how.ties)
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
+    weighed = counted_once(edges, session_of)
     fitted = new is not None and len(chunks) > how.solved_whole
     if new is not None and fitted:
-        graph = extend(new, ids, edges, _placed(store, chunks, edges, new), metric, how.graph)
+        graph = extend(new, ids, weighed, _placed(store, chunks, weighed, new), metric, how.graph)
     else:
-        graph = optimize(ids, edges, _graph_poses(store), metric=metric, settings=how.graph)
-    store.edges.add(after for before, after in zip(measured, graph.edges, strict=True) if after is not before)
+        graph = optimize(ids, weighed, _graph_poses(store), metric=metric, settings=how.graph)
+    judged = [_as_stated(after, own) for after, own in zip(graph.edges, edges, strict=True)]
+    store.edges.add(after for before, after in zip(measured, judged, strict=True) if after is not before)
     if bend:
         graph = _straightened(store, graph, chunks, metric, how)
     known = {} if store.facts.poses == "given" else graph.covariances
@@ -63,6 +67,11 @@ def place_chunks(
     store.facts.S_world_graph = S_world_graph
     store.facts.gravity = gravity.status
     store.chunks.place({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
+
+
+def _as_stated(judged: Edge, own: Edge) -> Edge:
+    """An edge as the graph judged it, with the covariance that it states itself."""
+    return judged if judged.covariance is own.covariance else replace(judged, covariance=own.covariance)
 
 
 def _place_fitted(store: Store, graph: GraphResult, covariances: Mapping[int, NDArray[np.float64]]) -> None:

@@ -9,6 +9,7 @@ scores and the reason. How the weights were chosen: docs/decisions/0045.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -37,7 +38,7 @@ from list3r.association.revisits.joint_window import (
     no_edge,
 )
 from list3r.association.revisits.scaled_verification import verify_scaled
-from list3r.association.revisits.second_looks import SecondLookSettings, seeing_the_same
+from list3r.association.revisits.second_looks import SecondLookSettings, are_two, seeing_the_same
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
@@ -241,13 +242,14 @@ class _Lookout:
         u, v = self._rows[c.u], self._rows[self._id]
         way = None if self._apart(c.u) else self._ways.predict(c.u, self._id, found)
         metric = u.scale_kind == v.scale_kind == "metric"
-        known = metric and u.session_id != v.session_id  # its scale, and things may have been moved in between
+        later = u.session_id != v.session_id
+        known = metric and later  # its scale, and things may have been moved in between
         objection = partial(self._objection, NO_CUES if known else scored.cues, way)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
         if _tells(keyframe_u) and _tells(keyframe_v):
             check = verify if metric else verify_scaled
-            edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification)
+            edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification, later=later)
             edge = _objected(edge, objection) if self._settings.verified else edge
         if joint is None or (edge is not None and (edge.accepted or not self._settings.second_opinion)):
             edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
@@ -263,13 +265,15 @@ class _Lookout:
         return self._apart(u) and len(accepted) == 1
 
     def alone(self, edges: Sequence[Edge]) -> Edge | None:
-        """Return the one accepted edge that ties the new chunk to another session, None where there is no such one."""
+        """Return the accepted edge that ties the new chunk to another session, where no other one speaks for it."""
         accepted = [e for e in edges if e.accepted]
-        if len(accepted) != 1 or accepted[0].frames is None:
+        session = {k: row.session_id for k, row in self._rows.items()}
+        apart = self._settings.second_looks.apart
+        if any(e.frames is None or session[e.u] == session[self._id] or not self._apart(e.u) for e in accepted):
             return None
-        u = accepted[0].u
-        other = self._rows[u].session_id != self._rows[self._id].session_id
-        return accepted[0] if other and self._apart(u) else None
+        if any(are_two(e, f, session, apart) for e, f in itertools.combinations(accepted, 2)):
+            return None
+        return max(accepted, key=lambda e: (e.confidence, -e.u), default=None)
 
     def second_looks(self, edge: Edge, known: Container[tuple[int, int] | None]) -> list[Edge]:
         """Return relations of further keyframes of two chunks, until one more is accepted (docs/decisions/0056).

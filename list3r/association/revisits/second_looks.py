@@ -6,7 +6,7 @@ not place a session; but it says which other keyframes should see the same (docs
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.world.session_ties import keyframes_of
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,20 @@ class FramesApart:
         """Tell whether two pairs of Frame.index are two."""
         gaps = [abs(a - b) for a, b in zip(one, other, strict=True)]
         return min(gaps) >= self.each and sum(gaps) >= self.both
+
+
+def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
+    """Tell whether two relations of two sessions speak for each other.
+
+    Those of one pair of chunks do where their frames lie apart. Those of two pairs do not where they share a keyframe:
+    what misled one misleads the other (docs/decisions/0058). `session_of` gives the session of every chunk.
+    """
+    one_pair = (e.u, e.v) == (f.u, f.v)
+    if e.frames is None or f.frames is None:
+        return not one_pair
+    if one_pair:
+        return apart.of(e.frames, f.frames)
+    return not keyframes_of(e, session_of) & keyframes_of(f, session_of)
 
 
 @dataclass(frozen=True)

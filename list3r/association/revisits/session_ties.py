@@ -1,6 +1,6 @@
 """Decide whether a session is placed in the world of another: by two relations that agree, or by one beyond doubt.
 
-Two relations are of two pairs of chunks, or of frames far apart on both sides.
+Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart.
 
 Within one video neighbouring chunks share frames, and a false loop is caught by the chain. Nothing catches a false
 relation that alone ties one session to another: the whole session would land on top of the old world in a wrong place.
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from list3r.association.graph.pose_graph import across, chain_poses
-from list3r.association.revisits.second_looks import FramesApart
+from list3r.association.revisits.second_looks import FramesApart, are_two
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -57,7 +57,7 @@ def hold_back(
     ids = sorted(session_of)
     ties = [k for k, e in enumerate(edges) if session_of[e.u] != session_of[e.v] and (e.accepted or _is_held(e))]
     own = [e for e in edges if session_of[e.u] == session_of[e.v] and (e.accepted or "trust" in e.scores)]
-    blocks = _Blocks(*chain_poses(ids, own))
+    blocks = _Blocks(*chain_poses(ids, own), session_of)
     waiting = _by_block(ties, edges, blocks)
     while waiting:
         pair = next((p for p, found in waiting.items() if _suffices([edges[k] for k in found], blocks, unit, s)), None)
@@ -76,8 +76,8 @@ def hold_back(
 class _Blocks:
     """Chunks that are placed to each other: the frame they share, and their poses in it."""
 
-    def __init__(self, poses: dict[int, Sim3], block: dict[int, int]) -> None:
-        self.poses, self.block = poses, block
+    def __init__(self, poses: dict[int, Sim3], block: dict[int, int], session_of: Mapping[int, int]) -> None:
+        self.poses, self.block, self.session_of = poses, block, session_of
 
     def offset(self, e: Edge) -> Sim3:
         """Return the similarity that takes u's block into v's by this relation."""
@@ -114,14 +114,11 @@ def _best(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -
 
 def _agreeing(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -> list[int]:
     """Return with how many relations of other chunks, or of other frames of its own chunks, each agrees; itself too."""
-    return [1 + len({(f.u, f.v) for f in found if _other(e, f, s) and _agree(e, f, blocks, unit, s)}) for e in found]
-
-
-def _other(e: Edge, f: Edge, s: TieSettings) -> bool:
-    """Tell whether a relation is one more than another."""
-    if (e.u, e.v) != (f.u, f.v):
-        return True
-    return e.frames is not None and f.frames is not None and s.apart.of(e.frames, f.frames)
+    others = [[f for f in found if are_two(e, f, blocks.session_of, s.apart)] for e in found]
+    return [
+        1 + len({(f.u, f.v) for f in rest if _agree(e, f, blocks, unit, s)})
+        for e, rest in zip(found, others, strict=True)
+    ]
 
 
 def _agree(e: Edge, f: Edge, blocks: _Blocks, unit: float, s: TieSettings) -> bool:

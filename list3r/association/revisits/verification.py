@@ -48,6 +48,10 @@ class VerificationSettings:
     """Least share of a side's surface that the other side sees."""
     least_agreement: float = 0.8
     """Least share of it that agrees rather than being seen through."""
+    least_changed_agreement: float = 0.6
+    """The same of two sessions where the other side sees nothing else: something large is gone, or came."""
+    one_sided: float = 0.95
+    """Agreement of that other side."""
     most_residual: float = 3.0
     """Largest robust deviation of depth, in units of the sensor's noise."""
     residual_scale_m: float = 0.03
@@ -92,8 +96,12 @@ def verify(
     v_id: int,
     metric: bool = True,
     settings: VerificationSettings | None = None,
+    later: bool = False,
 ) -> Edge:
-    """Return the loop edge between two chunks by one keyframe of each, accepted or rejected with the reason."""
+    """Return the loop edge between two chunks by one keyframe of each, accepted or rejected with the reason.
+
+    `later`: they are of two sessions, between which something may have been put there or taken away.
+    """
     chosen = settings or VerificationSettings()
     build = _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id)
     if not metric:
@@ -114,7 +122,7 @@ def verify(
         _check(side_u, side_v, T_v_u, chosen),
         _check(side_v, side_u, found.T_model_cam, chosen),
     )
-    return build.judged(T_v_u, found, checks, pose, chosen)
+    return build.judged(T_v_u, found, checks, pose, chosen, later)
 
 
 def rejected(keyframe_u: Keyframe, keyframe_v: Keyframe, u_id: int, v_id: int, reason: str) -> Edge:
@@ -211,17 +219,20 @@ class _EdgeBuilder:
         checks: tuple[_Check, _Check],
         pose: FeaturePose,
         settings: VerificationSettings,
+        later: bool,
     ) -> Edge:
         """Accept or reject by the checks of both sides."""
         overlap = max(c.overlap for c in checks)
         agreement = min(c.agreement for c in checks)
         confidence = min(c.closeness for c in checks)
+        changed = later and max(c.agreement for c in checks) >= settings.one_sided
+        least = settings.least_changed_agreement if changed else settings.least_agreement
         self.scores |= {"overlap": overlap, "agreement": agreement, "residual_sigmas": found.residual}
         fit = f"{pose.inliers} features agree, {overlap:.0%} seen by both, of it {agreement:.0%} agrees"
         reason, good = fit, True
         if min(c.overlap for c in checks) < settings.least_overlap / 2 or overlap < settings.least_overlap:
             reason, good = f"too little is seen by both ({fit})", False
-        elif agreement < settings.least_agreement:
+        elif agreement < least:
             reason, good = f"one side sees through surfaces of the other ({fit})", False
         elif found.residual > settings.most_residual:
             reason, good = f"depth differs by {found.residual:.1f} times the sensor's noise ({fit})", False

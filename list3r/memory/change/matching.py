@@ -73,12 +73,15 @@ class ChangeMatching:
         news = {n: came[n] for n in eligible}
         whole = [n for n in eligible if not self._scrap(n, news, session, before=False)]
         lost = [(t, found) for t, found in gone if not self._scrap(t.now, left, session, before=True)]
-        for move in self._moves(lost, whole, session):
+        moves = self._moves(lost, whole, session)
+        ways = [(m.place, left[m.placed.now], came[m.place]) for m in moves]
+        for move in moves:
             fresh.remove(move.place)
             self._move(move, session, found_gone[move.placed.now])
         for placed, found in gone:
             if placed.state == "unseen" and self._counts[placed.now]:
-                if self._scrap(placed.now, left, session, before=True):
+                along = any(self._went_along(placed.now, *way, session) for way in ways)
+                if along or self._scrap(placed.now, left, session, before=True):
                     placed.state = "removed"
                 else:
                     self._remove(placed, session, found)
@@ -162,6 +165,18 @@ class ChangeMatching:
             if m != n and self._p.component[m] == self._p.component[n]
         )
 
+    def _went_along(self, n: int, place: int, old: OrientedBox, new: OrientedBox, session: int) -> bool:
+        """Return whether it is a part of an instance that moved, which was found whole where that is now.
+
+        Either the tops or the bottoms of what was found of it in both places are the same.
+        """
+        p, s = self._p, self._s
+        if p.component[n] != p.component[place]:
+            return False
+        way, taller = new.center - old.center, _height(new) - _height(old)
+        boxes = [replace(new, center=new.center - way - np.array([0.0, 0.0, end * taller / 2])) for end in (-1.0, 1.0)]
+        return any(p.inside(n, box, s.replaced_link_m, session, before=True) >= s.part for box in boxes)
+
     def _seen(self, placed: _PlacedInstance, places: list[int], session: int) -> None:
         p = self._p
         place = placed.now if placed.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
@@ -212,16 +227,22 @@ class ChangeMatching:
         p, placed, place = self._p, move.placed, move.place
         old, new = p.box(placed.now, session, before=True), p.box(place, session, before=False)
         a, b = p.groups[placed.now][0], p.groups[place][0]
-        distance = float(np.linalg.norm(new.center - old.center)) / p.unit
+        way = new.center - old.center
+        distance = float(np.linalg.norm(way)) / p.unit
+        lies = p.ties.covariance(session, old.center)
+        stayed = bool(lies.any()) and float(way @ np.linalg.solve(lies, way)) <= self._s.placed_deviations**2
+        kind = "seen_again" if stayed else "moved"
         reason = f"gone from its place and found {distance:.2f} m away, of the same look and size"
+        if stayed:
+            reason = f"found {distance:.2f} m away, which is within what the sessions may lie off each other"
         scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
         self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
         sure = self._sure(found) * move.chance
         self._record(
-            placed, Change(self._first(placed), session, "moved", old, new, p.evidence(place, session), sure, reason)
+            placed, Change(self._first(placed), session, kind, old, new, p.evidence(place, session), sure, reason)
         )
         placed.places.append(place)
-        placed.now, placed.state = place, "moved"
+        placed.now, placed.state = place, "present" if stayed else "moved"
         del self._placed[place]
 
     def _sure(self, found: Look) -> float:
@@ -280,6 +301,11 @@ class ChangeMatching:
                 states[keys[0]] = placed.state
         events = tuple(replace(c, first=names[n]) for n, c in self._events if n in names)
         return Changes(sorted(groups), current, states, events, self._decisions)
+
+
+def _height(box: OrientedBox) -> float:
+    """Return the extent of a box along the world's z."""
+    return float(np.abs(box.rotation[2]) @ box.size)
 
 
 def _chance(cost: Array, i: int, j: int, none: float) -> float:

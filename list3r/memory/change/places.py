@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChunkRow
 from list3r.memory.relations.instance_geometry import fit_box
 from list3r.memory.store.store import Store
+from list3r.memory.world.session_ties import SessionTies
 
 _SPREAD = 0.02
 """Share of points outside the box at either end by which instances are compared."""
@@ -56,6 +57,7 @@ class Places:
         self.rows = {c.chunk_id: c for c in chunks}
         self.shapes: dict[int, ChunkShapes] = {k: v.shapes for k, v in summaries.items()}
         self.unit = world_unit(chunks, summaries)
+        self.ties = SessionTies(store.edges.all(), self.rows)
         self._upright = store.facts.gravity != "unknown"
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
@@ -120,16 +122,26 @@ class Places:
     def look_after(self, n: int, session: int) -> Look:
         """Return what a session's frames see where an instance was before."""
         points = self.points(n, session, before=True)
-        return look(points, self._views_of(session, self.component[n]), self._s.visibility)
+        return self._look(points, self._views_of(session, self.component[n]), session)
 
     def look_before(self, n: int, session: int) -> Look:
         """Return what the frames of the last session that could tell saw where an instance is now."""
         points = self.points(n, session, before=False)
         for views in self._views_before(n, session):
-            found = look(points, views, self._s.visibility)
+            found = self._look(points, views, session)
             if found.verdict != "unseen":
                 return found
         return Look("unseen", 0.0, ())
+
+    def _look(self, points: Array, views: Sequence[DepthView], session: int) -> Look:
+        """Return what frames see at a place; gone is only what is gone wherever the session may lie."""
+        found, s = look(points, views, self._s.visibility), self._s
+        if found.verdict == "gone":
+            known = s.visibility.tolerance_m * self.unit
+            for shift in self.ties.shifts(session, points.mean(axis=0), s.placed_deviations, known):
+                if look(points + shift, views, s.visibility).verdict != "gone":
+                    return replace(found, verdict="unclear")
+        return found
 
     def changed(self, n: int, session: int, *, before: bool) -> float:
         """Return the share of its surface that is seen through, of what is told: of what was, by a session that comes

@@ -44,6 +44,9 @@ class ChangeSettings:
     """and what the cosine must be at least."""
     moved_most: float = 9.5
     """Sum of squared deviations up to which two are one instance."""
+    placed_deviations: float = 2.0
+    """Deviations of how surely the sessions lie on each other: within so many nothing has moved, and what is gone must
+    be gone wherever the session may lie (decision 0058)."""
     replaced: float = 0.4
     """Share of a new instance's surface that must lie where an instance stood that is gone, to be new there;"""
     replaced_slack_m: float = 0.02
