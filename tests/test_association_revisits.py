@@ -128,6 +128,35 @@ def test_a_place_with_something_in_front_is_rejected(here: Keyframe, again: Keyf
     assert not edge.accepted
 
 
+def _before(keyframe: Keyframe, columns: slice, nearer: float) -> Keyframe:
+    """A keyframe with a flat thing that hides part of its picture, so much nearer than what was seen there."""
+    depth = keyframe.depth_small.copy()
+    depth[20:100, columns] *= 1.0 - nearer
+    return replace(keyframe, depth_small=depth)
+
+
+@pytest.mark.parametrize("gone", [True, False])
+def test_what_was_taken_away_or_put_there_between_two_sessions_does_not_speak_against_a_place(
+    here: Keyframe, again: Keyframe, gone: bool
+) -> None:
+    u, v = (_before(here, slice(40, 120), 0.3), again) if gone else (here, _before(again, slice(40, 120), 0.3))
+    edge = verify(u, v, 0, 2, later=True)
+    assert edge.accepted, edge.reason
+    shift, turn = pose_errors(np.stack([np.eye(4), edge.S_v_u.as_matrix()]), np.stack([np.eye(4), GAUGE]))
+    assert (shift[1] < 0.02, turn[1] < 0.5) == (True, True)
+    assert not verify(u, v, 0, 2).accepted
+    both = _before(here, slice(10, 80), 0.3), _before(again, slice(80, 150), 0.3)
+    assert not verify(*both, 0, 2, later=True).accepted
+
+
+def test_a_wall_is_not_taken_for_the_picture_that_hung_before_it(here: Keyframe, again: Keyframe) -> None:
+    """Surfaces some centimetres before others, as a television on a wall, do not pull the pose that features give."""
+    edge = verify(_before(here, slice(20, 140), 0.045), again, 0, 2, later=True)
+    shift, turn = pose_errors(np.stack([np.eye(4), edge.S_v_u.as_matrix()]), np.stack([np.eye(4), GAUGE]))
+    assert shift[1] < 0.02
+    assert turn[1] < 0.5
+
+
 def test_a_revisit_of_chunks_without_scale_is_verified_with_its_scale(here: Keyframe, again: Keyframe) -> None:
     u, v = rescaled(here, 3.0), rescaled(again, 0.4)
     edge = verify_scaled(u, v, 0, 2)

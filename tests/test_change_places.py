@@ -13,6 +13,7 @@ from list3r.memory.library.consolidation import consolidate
 from list3r.memory.merging.edges import pair_scores
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, seen_through_share, tally
+from list3r.memory.records import Edge
 from list3r.memory.store.store import Store
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
 
@@ -49,6 +50,37 @@ def _two(path: Path, second: dict[str, Box], first: dict[str, Box] | None = None
                 place_together(store)
                 consolidate(store)
     return path
+
+
+def _tied(path: Path, second: dict[str, Box], sigma_m: tuple[float, float, float]) -> list[str]:
+    """Kinds of what is told to have changed where the sessions lie on each other as surely as one relation tells."""
+    with Store.create(path) as store:
+        for room, start in ((dict(ROOM), 0.4), (second, 1.0)):
+            with store.transaction():
+                add_session(store, room, np.concatenate([cameras(TABLE, start), cameras(TABLE, start + 0.1)]))
+                place_together(store)
+                covariance = np.diag(np.square([*sigma_m, 1e-4, 1e-4, 1e-4, 0.0]))
+                tie = Edge(
+                    1, 2, "loop", Sim3.identity(), 1.0, 1.0, 9, 0.0, True, "", frames=(0, 0), covariance=covariance
+                )
+                store.edges.add([tie] if len(store.chunks.all()) == 2 else [])
+                consolidate(store)
+        return sorted(e.kind for e in store.events.all(2) if e.kind != "seen_again")
+
+
+def test_nothing_has_moved_by_what_the_sessions_may_lie_off_each_other(tmp_path: Path) -> None:
+    """Along the way that it went, that is: across it they may lie as they will."""
+    blue = ROOM["blue"]
+    moved = {**ROOM, "blue": Box((blue.center[0] + 0.25, *blue.center[1:]), blue.size, blue.rgb)}
+    assert _tied(tmp_path / "sure.l3r", moved, (0.01, 0.01, 0.01)) == ["moved"]
+    assert _tied(tmp_path / "across.l3r", moved, (0.01, 0.2, 0.01)) == ["moved"]
+    assert _tied(tmp_path / "along.l3r", moved, (0.2, 0.01, 0.01)) == []
+
+
+def test_what_is_gone_is_gone_wherever_the_sessions_may_lie(tmp_path: Path) -> None:
+    """A box on a table may be sunk into it where height is not known, never where it is."""
+    for sigma_m, told in (((0.01, 0.01, 0.01), ["removed"]), ((0.01, 0.01, 0.09), [])):
+        assert _tied(tmp_path / f"{sigma_m[2]}.l3r", _without("red"), sigma_m) == told
 
 
 def _without(name: str) -> dict[str, Box]:

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from list3r.association.revisits.second_looks import SecondLookSettings, seeing_the_same
 from list3r.association.revisits.session_ties import hold_back
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.records import ChunkRow, Edge, FrameSamples
+from list3r.memory.world.session_ties import SessionTies, counted_once
 
 CHUNKS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 3, 6: 3}
 """Session of each chunk; chunk k stands at x = k metres."""
@@ -104,3 +105,50 @@ def test_one_that_the_depth_contradicts_is_not_beyond_doubt() -> None:
     edge = _edge(1, 3, features=150.0)
     for name in ("overlap", "agreement"):
         assert _accepted([*INSIDE, replace(edge, scores={**edge.scores, name: 0.3})]) == [True] * 3 + [False]
+
+
+def test_two_that_share_a_keyframe_count_as_one() -> None:
+    """What misled one, a thing that was moved, misleads the other."""
+    one = replace(_edge(1, 3), frames=(2, 50))
+    two, three = (replace(_edge(2, 3), frames=(30, n)) for n in (50, 80))
+    assert _accepted([*INSIDE, one, two])[3:] == [False, False]
+    assert _accepted([*INSIDE, one, three])[3:] == [True, True]
+
+
+def _measured(edge: Edge, sigma_m: tuple[float, float, float], frames: tuple[int, int]) -> Edge:
+    covariance = np.diag(np.square([*sigma_m, 1e-4, 1e-4, 1e-4, 0.0]))
+    return replace(edge, covariance=covariance, frames=frames)
+
+
+def _rows() -> dict[int, ChunkRow]:
+    S = {k: Sim3(1.0, np.eye(3), np.array([float(k), 0.0, 0.0])) for k in CHUNKS}
+    place = (1.0, 1.0, 0.0, 0.0)
+    return {k: ChunkRow(k, s, k, 0, 9, 1, S[k], place, (240, 320), "metric") for k, s in CHUNKS.items()}
+
+
+@pytest.mark.parametrize("often", [2, 3, 5])
+def test_relations_that_share_a_keyframe_tell_as_much_as_one(often: int) -> None:
+    at = np.array([1.0, 0.5, 0.0])
+    shared = [_measured(_edge(1, 3), (0.02, 0.02, 0.02), (10 * k, 7)) for k in range(often)]
+    apart = [_measured(_edge(1, 3), (0.02, 0.02, 0.02), (10 * k, 10 * k)) for k in range(often)]
+    own = [_measured(_edge(1, 2), (0.02, 0.02, 0.02), (10 * k, 7)) for k in range(often)]
+    one, same, many = (SessionTies(e, _rows()).covariance(2, at) for e in (shared[:1], shared, apart))
+    assert np.allclose(same, one, rtol=1e-6)
+    assert np.allclose(many, one / often, rtol=1e-6)
+    assert counted_once(own, CHUNKS) == own  # a video's own loops are held by the chain
+    assert not SessionTies(own, _rows()).covariance(2, at).any()
+
+
+def test_a_place_is_known_as_little_as_the_bare_wall_tells() -> None:
+    """Along the wall, x, a relation tells nothing; a second one from elsewhere may tell it."""
+    wall, corner = (
+        _measured(_edge(1, 3), s, f) for s, f in (((0.5, 0.01, 0.01), (0, 0)), ((0.01, 0.01, 0.01), (40, 40)))
+    )
+    at = np.array([1.0, 0.0, 0.0])
+    alone, both = (np.sqrt(np.diag(SessionTies(e, _rows()).covariance(2, at))) for e in ([wall], [wall, corner]))
+    assert np.allclose(alone, [0.5, 0.01, 0.01], rtol=0.02)
+    assert np.allclose(both, [0.01, 0.0071, 0.0071], rtol=0.02)
+    shifts = SessionTies([wall], _rows()).shifts(2, at, 2.0, 0.025)
+    assert sorted(np.round(s[0], 2) for s in shifts) == [-0.98, 0.98]
+    far = np.sqrt(np.diag(SessionTies([corner], _rows()).covariance(2, at + np.array([0.0, 300.0, 0.0]))))
+    assert far[0] > 0.03  # a turn moves what is far

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,13 +134,13 @@ class Places:
         return Look("unseen", 0.0, ())
 
     def _look(self, points: Array, views: Sequence[DepthView], session: int) -> Look:
-        """Return what frames see at a place; gone is only what is gone wherever the session may lie."""
+        """Return what frames see at a place; nothing is told of what may be there as the session may lie."""
         found, s = look(points, views, self._s.visibility), self._s
         if found.verdict == "gone":
             known = s.visibility.tolerance_m * self.unit
             for shift in self.ties.shifts(session, points.mean(axis=0), s.placed_deviations, known):
                 if look(points + shift, views, s.visibility).verdict != "gone":
-                    return replace(found, verdict="unclear")
+                    return Look("unseen", 0.0, ())
         return found
 
     def changed(self, n: int, session: int, *, before: bool) -> float:
