@@ -13,7 +13,8 @@ _PAPER = (245, 245, 245)
 def thumbnail(vertices: NDArray[np.float64], faces: NDArray[np.int64], rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a picture of 256 x 256 px, from the front, a little from the right and above. Shape (256, 256, 3).
 
-    Faces are shaded by their slope and drawn as a dense set of points with a depth buffer.
+    Faces are shaded by their slope and drawn as a dense set of points with a depth buffer. The mesh is closed and its
+    faces look outward, so those that look away are hidden.
     """
     right, back = np.array([0.8, 0.6, 0.0]), np.array([-0.5, 0.67, -0.55])
     back /= np.linalg.norm(back)
@@ -24,6 +25,8 @@ def thumbnail(vertices: NDArray[np.float64], faces: NDArray[np.int64], rgb: NDAr
     px = np.column_stack([(flat - middle) * scale * [1, -1] + _SIDE_PX / 2, vertices @ back])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
+    towards = normal @ back < 0
+    faces, normal = faces[towards], normal[towards]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     shade = 0.55 + 0.45 * np.clip(normal @ _LIGHT, 0, 1)
     color = rgb[faces].mean(axis=1) * shade[:, None]
@@ -39,9 +42,11 @@ def thumbnail(vertices: NDArray[np.float64], faces: NDArray[np.int64], rgb: NDAr
 
 
 def _samples(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return points about half a pixel apart on faces, with the face of each, by size of faces. Shape (F, 3, 3)."""
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)[..., :].max(axis=1)
-    steps = 2 ** np.ceil(np.log2(np.clip(2.0 * edges, 1.0, 512.0))).astype(int)
+    """Return points at most two thirds of a pixel apart on faces, with the face of each, by size of faces. Shape (F, 3,
+    3).
+    """
+    edges = np.linalg.norm((corners - np.roll(corners, 1, axis=1))[..., :2], axis=2).max(axis=1)
+    steps = np.ceil(np.clip(1.5 * edges, 1.0, 512.0)).astype(int)
     out = []
     for n in np.unique(steps).tolist():
         chosen = np.flatnonzero(steps == n)
