@@ -25,6 +25,8 @@ def counted_once(edges: Sequence[Edge], session_of: Mapping[int, int]) -> list[E
     The depth of a keyframe errs for all its relations alike. `session_of` gives the session of every chunk.
     """
     out = list(edges)
+    if len(set(session_of.values())) < 2:
+        return out
     ties = [
         k for k, e in enumerate(edges) if session_of[e.u] != session_of[e.v] and (e.accepted or "trust" in e.scores)
     ]
