@@ -29,7 +29,7 @@ from sessions import measure, total
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.memory.store.store import Store
 from training.worlds.film import Film, FilmSettings, Visit, make_film, world_extents
-from training.worlds.house import film_house, house_extents
+from training.worlds.gazebo import film_house, house_extents
 
 Array = NDArray[np.float64]
 FRAMES = 120

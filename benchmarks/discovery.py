@@ -84,7 +84,7 @@ def seeds_of(text: str) -> list[int]:
 def film_of(seed: int, sensor: str | None, house: Path | None, *, fitted: bool = False) -> tuple[Film, int]:
     """A walk, and of how many frames one is filmed."""
     if house is not None:
-        from training.worlds.house import film_house
+        from training.worlds.gazebo import film_house
 
         return film_house(house, seed, sensor or ("structured", "lidar", "tof")[seed % 3]), 2
     settings = FilmSettings(seed, held_out=True, sensor=sensor, fitted=fitted)

@@ -71,7 +71,7 @@ def film_of(seed: int, house: Path | None, *, fitted: bool) -> Film:
     """The walk of a seed, all of its frames."""
     sensor = SENSORS[seed % 3]
     if house is not None:
-        from training.worlds.house import film_house
+        from training.worlds.gazebo import film_house
 
         return film_house(house, seed, sensor, FRAMES, 1)
     return make_film(FilmSettings(seed, held_out=True, fitted=fitted, frames=FRAMES, every=1, sensor=sensor))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,8 @@ class TexturedMesh:
     """Texture coordinates of the corners of each triangle, v up. Shape (T, 3, 2)."""
     image: Path | None
     """Picture of the texture, None where there is none."""
+    color: tuple[float, float, float] = (150.0, 150.0, 150.0)
+    """RGB in [0, 255] where there is no picture."""
 
 
 def read_collada(path: Path) -> list[TexturedMesh]:
@@ -33,17 +36,33 @@ def read_collada(path: Path) -> list[TexturedMesh]:
     scale = float(unit.get("meter", "1")) if unit is not None else 1.0
     images = _images(root, path)
     out = []
-    for node in root.iterfind(".//c:visual_scene//c:node", _NS):
-        matrix = node.find("c:matrix", _NS)
-        T = np.array(matrix.text.split(), float).reshape(4, 4) if matrix is not None and matrix.text else np.eye(4)
-        for instance in node.iterfind("c:instance_geometry", _NS):
-            uses = instance.iterfind(".//c:instance_material", _NS)
-            bound = {m.get("symbol"): (m.get("target") or "")[1:] for m in uses}
-            mesh = root.find(f".//c:geometry[@id='{(instance.get('url') or '')[1:]}']/c:mesh", _NS)
-            for group in list(mesh) if mesh is not None else []:
-                if group.tag.rpartition("}")[2] in ("triangles", "polylist"):
-                    out.append(_group(mesh, group, T, scale, images.get(bound.get(group.get("material"), ""))))
+    for scene in root.iterfind(".//c:visual_scene", _NS):
+        for node, T in _nodes(root, scene, np.eye(4)):
+            for instance in node.iterfind("c:instance_geometry", _NS):
+                uses = instance.iterfind(".//c:instance_material", _NS)
+                bound = {m.get("symbol"): (m.get("target") or "")[1:] for m in uses}
+                mesh = root.find(f".//c:geometry[@id='{(instance.get('url') or '')[1:]}']/c:mesh", _NS)
+                for group in list(mesh) if mesh is not None else []:
+                    if mesh is not None and group.tag.rpartition("}")[2] in ("triangles", "polylist"):
+                        out.append(_group(mesh, group, T, scale, images.get(bound.get(group.get("material"), ""))))
     return out
+
+
+def _nodes(
+    root: ET.Element, parent: ET.Element, T: NDArray[np.float64]
+) -> Iterator[tuple[ET.Element, NDArray[np.float64]]]:
+    """Yield the nodes below one with their poses, those that instances name among them."""
+    for node in parent.iterfind("c:node", _NS):
+        matrix = node.find("c:matrix", _NS)
+        own = np.array(matrix.text.split(), float).reshape(4, 4) if matrix is not None and matrix.text else np.eye(4)
+        yield node, T @ own
+        yield from _nodes(root, node, T @ own)
+        for instance in node.iterfind("c:instance_node", _NS):
+            named = root.find(f".//c:library_nodes//c:node[@id='{(instance.get('url') or '')[1:]}']", _NS)
+            if named is not None:
+                holder = ET.Element("holder")
+                holder.append(named)
+                yield from _nodes(root, holder, T @ own)
 
 
 def _images(root: ET.Element, path: Path) -> dict[str, Path]:
