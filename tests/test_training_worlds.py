@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 pytest.importorskip("open3d")
 
-from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, kinds_at
+from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, kinds_at
 from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
 from training.worlds.furnish import make_world
@@ -26,6 +28,78 @@ def test_every_kind_is_a_whole_mesh_of_a_likely_size(name: str) -> None:
     assert np.isfinite(mesh.vertices).all()
     assert 0 <= mesh.triangles.min() and mesh.triangles.max() < len(mesh.vertices)
     assert 0.005 < np.max(high - low) < 3.5
+
+
+@pytest.mark.parametrize("place", sorted(ODD))
+def test_oddments_are_whole_and_of_their_place(place: str) -> None:
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        draft = Draft(rng, Palette(rng, held_out=False))
+        ODD[place].build(draft)
+        mesh, (low, high) = draft.mesh(), draft.bounds()
+        assert np.isfinite(mesh.vertices).all() and mesh.triangles.max() < len(mesh.vertices)
+        assert 0.01 < np.max(high - low) <= 2.01
+        if place in ("hang", "panel"):
+            assert low[1] == pytest.approx(0.0, abs=1e-9)
+        assert (high if place == "ceiling" else low)[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_only_odd_rooms_contain_oddments() -> None:
+    assert "oddment" not in {t.kind for t in make_world(6).things}
+    odd = make_world(6, odd=0.5)
+    assert {t.label for t in odd.things if t.kind == "oddment"} == {""}
+
+
+def test_a_gazebo_world_of_others_is_filmed_with_its_truth(tmp_path: Path) -> None:
+    from training.worlds.gazebo import film_house
+
+    (tmp_path / "worlds").mkdir()
+    (tmp_path / "models" / "crate" / "meshes").mkdir(parents=True)
+    (tmp_path / "models" / "crate" / "meshes" / "crate.dae").write_text(CRATE)
+    (tmp_path / "models" / "crate" / "model.sdf").write_text(
+        "<sdf version='1.6'>" + model("crate", mesh("crate/meshes/crate.dae", "1 1 1")) + "</sdf>"
+    )
+    slabs = [("Floor", "6 6 0.1", "0 0 -0.05"), ("Table", "0.8 0.6 0.7", "1.5 0 0.35")]
+    slabs += [("Wall", "6 0.1 3", f"0 {y} 1.5") for y in (-3, 3)] + [("Wall", "0.1 6 3", f"{x} 0 1.5") for x in (-3, 3)]
+    boxes = "".join(model(name, f"<box><size>{size}</size></box>", f"{at} 0 0 0") for name, size, at in slabs)
+    crate = "<model name='crate_1'><include><uri>model://crate</uri></include><pose>1.5 0 0.7 0 0 0</pose></model>"
+    file = tmp_path / "worlds" / "room.world"
+    file.write_text(f"<sdf version='1.6'><world name='w'>{boxes}{crate}</world></sdf>")
+    film = film_house(file, 3, "structured", frames=4)
+    kinds = {t.id: t.kind for t in film.things}
+    assert {t.kind for t in film.things if t.structure} == {"Floor", "Wall"}
+    seen = {kinds[k] for k in np.unique(film.ids).tolist() if k}
+    assert {"Floor", "Wall"} < seen and seen & {"Table", "crate"}
+    where = next(k for k, kind in kinds.items() if kind == "crate")
+    k, v, u = np.argwhere(film.ids == where)[0]
+    ray = np.array([(u - film.camera.cx) / film.camera.fx, (v - film.camera.cy) / film.camera.fy, 1.0])
+    point = film.T_world_cam[k, :3, :3] @ (ray * film.true_depth[k, v, u]) + film.T_world_cam[k, :3, 3]
+    assert (np.abs(point - [1.5, 0.0, 0.85]) < [0.17, 0.12, 0.17]).all()
+
+
+def model(name: str, shape: str, pose: str = "0 0 0 0 0 0") -> str:
+    """A model of SDF with one link that shows one shape."""
+    look = "<material><diffuse>0.8 0.3 0.2 1</diffuse></material>"
+    link = f"<link name='link'><visual name='v'><geometry>{shape}</geometry>{look}</visual></link>"
+    return f"<model name='{name}'><pose>{pose}</pose>{link}</model>"
+
+
+def mesh(uri: str, scale: str) -> str:
+    return f"<mesh><uri>model://{uri}</uri><scale>{scale}</scale></mesh>"
+
+
+CRATE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="24">-15 -10 0 15 -10 0 15 10 0 -15 10 0 -15 -10 30
+15 -10 30 15 10 30 -15 10 30</float_array><technique_common><accessor source="#pa" count="8" stride="3"/>
+</technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<polylist count="6"><input semantic="VERTEX" source="#v" offset="0"/><vcount>4 4 4 4 4 4</vcount>
+<p>0 1 2 3 4 5 6 7 0 1 5 4 1 2 6 5 2 3 7 6 3 0 4 7</p></polylist>
+</mesh></geometry></library_geometries>
+<library_nodes><node id="part"><instance_geometry url="#g"/></node></library_nodes>
+<library_visual_scenes><visual_scene id="s"><node><matrix>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</matrix>
+<instance_node url="#part"/></node></visual_scene></library_visual_scenes></COLLADA>"""
 
 
 def test_left_out_families_are_never_trained_on() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from training.graphs import Lesson
 from training.model import PieceNetwork
@@ -38,6 +39,14 @@ ABLATIONS = {
     "messages": Blindness(messages=False),
 }
 """What can be left out. Superpoints keep to borders of colour all the same."""
+BLINKS = (
+    Blindness((16, 17, 18, 19, 20, 21), (7, 8, 20, 21, 22, 23)),
+    Blindness((24, 25), (17, 18, 19, 20, 21)),
+    Blindness((13, 14, 15), ()),
+    Blindness(tuple(range(26, 74)), ()),
+    Blindness((), (24, 25, 26, 27)),
+)
+"""Colours; views; heights; what the first network made of pieces; what it said of borders."""
 BLIND = 1e9
 """Deviation by which a feature vanishes."""
 
@@ -54,6 +63,10 @@ class FitSettings:
     """Weight of the loss of names."""
     noise: float = 0.0
     """Deviation of what is added to features, of their own deviation."""
+    blink: float = 0.0
+    """How probably each of `BLINKS` is not seen in a lesson, so that nothing leans on one kind of feature alone."""
+    average: float = 0.0
+    """What of the mean of all weights so far a step keeps; above 0 the mean is what is scored and handed out."""
     least_weight: float = 0.0
     """What every border counts, however short it is, beside the logarithm of its length: legs are thin."""
     seed: int = 0
@@ -83,6 +96,9 @@ def fit(
         optimiser.load_state_dict(saved["optimiser"])
         start = int(saved["epoch"])
     steps = settings.epochs * len(lessons)
+    mean = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(settings.average)) if settings.average else None
+    if mean is not None and start:
+        mean.load_state_dict(saved["mean"])
     for epoch in range(start, settings.epochs):
         began, losses = time.monotonic(), []
         order = np.random.default_rng([settings.seed, epoch]).permutation(len(lessons))
@@ -91,12 +107,16 @@ def fit(
             for group in optimiser.param_groups:
                 group["lr"] = float(rate * min(1.0, done * 30 + 0.05) * 0.5 * (1 + np.cos(np.pi * done)))
             losses.append(_step(network, optimiser, lessons[row], settings))
-        entry = {"epoch": epoch + 1, **_means(losses), "s": round(time.monotonic() - began, 1), **score(network, held)}
+            if mean is not None:
+                mean.update_parameters(network)
+        judged = network if mean is None else mean.module
+        entry = {"epoch": epoch + 1, **_means(losses), "s": round(time.monotonic() - began, 1), **score(judged, held)}
         with (folder / "log.jsonl").open("a") as log:
             log.write(json.dumps(entry) + "\n")
         print(json.dumps(entry), flush=True)  # noqa: T201
-        torch.save({"network": network.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1}, state)
-    return network
+        kept = {"network": network.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1}
+        torch.save(kept | ({} if mean is None else {"mean": mean.state_dict()}), state)
+    return network if mean is None else mean.module
 
 
 def load_earlier(network: PieceNetwork, folder: Path) -> None:
@@ -148,7 +168,7 @@ def _step(
     network: PieceNetwork, optimiser: torch.optim.Optimizer, lesson: Lesson, settings: FitSettings
 ) -> dict[str, float]:
     network.train()
-    affinity, structure, names, _ = network(*_disturbed(network, lesson, settings.noise))
+    affinity, structure, names, _ = network(*_disturbed(network, lesson, settings))
     same, known, weight = truths(lesson)
     w = torch.from_numpy(weight + np.float32(settings.least_weight) * known)
     pair = F.binary_cross_entropy_with_logits(
@@ -171,14 +191,24 @@ def _step(
     return {"pair": pair.item(), "structure": bound.item(), "name": word.item()}
 
 
-def _disturbed(network: PieceNetwork, lesson: Lesson, noise: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What a network takes, with noise on the features; both ways of a border keep the same."""
+def _disturbed(
+    network: PieceNetwork, lesson: Lesson, settings: FitSettings
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What a network takes, with noise on the features, and some not seen; both ways of a border keep the same."""
     nodes, left, right, edges, back = tensors(lesson)
-    if noise <= 0:
-        return nodes, left, right, edges, back
-    nodes = nodes + noise * network.node_std * torch.randn_like(nodes)
-    shift = noise * network.edge_std * torch.randn_like(edges)
-    return nodes, left, right, edges + shift, back + shift
+    if settings.noise > 0:
+        nodes = nodes + settings.noise * network.node_std * torch.randn_like(nodes)
+        shift = settings.noise * network.edge_std * torch.randn_like(edges)
+        edges, back = edges + shift, back + shift
+    if settings.blink > 0:
+        nodes, edges, back = nodes.clone(), edges.clone(), back.clone()
+        for group in BLINKS:
+            if torch.rand(()) < settings.blink:
+                n = [k for k in group.nodes if k < nodes.shape[1]]
+                e = [k for k in group.edges if k < edges.shape[1]]
+                nodes[:, n] = network.node_mean[n]
+                edges[:, e], back[:, e] = network.edge_mean[e], network.edge_mean[e]
+    return nodes, left, right, edges, back
 
 
 def _means(rows: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -59,7 +59,8 @@ def lesson_of(sample: Sample, graph: PieceGraph, labels: NDArray[np.int32], trut
     thing[most < LEAST_PURE * size] = -1
     truth_of = {t.id: t for t in sample.things}
     structure = np.array([i > 0 and truth_of[i].structure for i in thing.tolist()], bool)
-    name = [LABELS.index(truth_of[i].label) if i > 0 and not truth_of[i].structure else -1 for i in thing.tolist()]
+    row = {label: k for k, label in enumerate(LABELS)}
+    name = [row.get(truth_of[i].label, -1) if i > 0 and not truth_of[i].structure else -1 for i in thing.tolist()]
     return Lesson(sample.seed, graph, thing, structure, np.array(name, np.int64), size.astype(np.float32))
 
 

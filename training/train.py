@@ -1,6 +1,6 @@
 """Make data and weights of the learned discoverer from seeds.
 
-python -m training.train --out DIR --worlds 470 --fitted 235 --held 12
+python -m training.train --out DIR --worlds 470 --fitted 235 --odd 300 --held 12
 
 Every step is kept in the folder and not done again: chunks, graphs, the state of each network after each epoch.
 """
@@ -28,8 +28,12 @@ from training.samples import make_sample
 from training.things import clusters, fit_things, overlaps
 from training.worlds.catalogue import LABELS
 
-FIRST_SEED, FIRST_FITTED_SEED, FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 1000, 2000, 5000, 5500
-"""Seeds count up from here: worlds for training, those with what is built in, and left-out worlds of both kinds."""
+FIRST_SEED, FIRST_FITTED_SEED, FIRST_ODD_SEED = 1000, 2000, 3000
+"""Seeds count up from here: worlds for training, those with what is built in, those with what no catalogue knows."""
+FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 5000, 5500
+"""Likewise left-out worlds, and those with what is built in."""
+ODD_SHARE = 0.5
+"""Share of things that no catalogue knows in rooms that have such things; every third of them is fitted, too."""
 
 WIDTH, EDGE_WIDTH = 48, 32
 """Widths of the first network's states of pieces and of borders."""
@@ -46,6 +50,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of chunks, graphs, states and logs")
     parser.add_argument("--worlds", type=int, default=470, help="rooms with loose furniture")
     parser.add_argument("--fitted", type=int, default=235, help="rooms with what is built in")
+    parser.add_argument("--odd", type=int, default=300, help="rooms with things that no catalogue knows")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=8)
     parser.add_argument("--start", type=Path, help="folder of an earlier run whose first network is trained on")
@@ -56,6 +61,7 @@ def main() -> None:
     data = words.out / "chunks"
     paths = [make_sample(FIRST_SEED + k, data) for k in range(words.worlds)]
     paths += [make_sample(FIRST_FITTED_SEED + k, data, fitted=True) for k in range(words.fitted)]
+    paths += [make_sample(FIRST_ODD_SEED + k, data, fitted=k % 3 == 2, odd=ODD_SHARE) for k in range(words.odd)]
     held = [make_sample(FIRST_HELD_SEED + k, data, held_out=True) for k in range(words.held)]
     held += [make_sample(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(words.held)]
     train(paths, held, words.out, words.epochs, words.weights or words.out / "weights.npz", words.start, words.without)

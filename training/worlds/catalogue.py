@@ -11,6 +11,7 @@ from training.worlds import seating as s
 from training.worlds import soft, storage, tables
 from training.worlds import tabletop as t
 from training.worlds.draft import Draft
+from training.worlds.oddments import oddment
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,26 @@ _ROWS: tuple[tuple[str, str, str, Callable[[Draft], None], str, float], ...] = (
     ("island", "island", "counter", b.island, "fitted free", 1),
     ("folding screen", "screen", "screen", b.folding_screen, "fitted free", 0.5),
 )
+
+_SMALL = ((0.04, 0.35), (0.04, 0.3), (0.03, 0.4))
+_LARGE = ((0.3, 1.8), (0.3, 1.0), (0.3, 2.0))
+ODD = {
+    place: Kind("oddment", "oddment", "", build, place)
+    for place, build in (
+        ("small", oddment(_SMALL)),
+        ("desk", oddment(_SMALL)),
+        ("media", oddment(_SMALL)),
+        ("seat", oddment(((0.1, 0.5), (0.1, 0.45), (0.05, 0.4)))),
+        ("floor", oddment(((0.08, 0.7), (0.08, 0.6), (0.05, 0.8)))),
+        ("wall", oddment(_LARGE)),
+        ("corner", oddment(_LARGE)),
+        ("free", oddment(((0.4, 1.8), (0.4, 1.2), (0.3, 1.1)))),
+        ("hang", oddment(((0.1, 1.4), (0.02, 0.35), (0.1, 1.0)), hung=True)),
+        ("panel", oddment(((0.3, 1.8), (0.02, 0.4), (0.3, 1.2)), hung=True)),
+        ("ceiling", oddment(((0.2, 0.9), (0.2, 0.9), (0.15, 0.8)), below=True)),
+    )
+}
+"""What no catalogue knows, by place; it has no name."""
 
 KINDS = {row[0]: Kind(*row) for row in _ROWS}
 LOOSE = {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from training.worlds.catalogue import KINDS, Kind, kinds_at
+from training.worlds.catalogue import KINDS, ODD, Kind, kinds_at
 from training.worlds.draft import Draft
 from training.worlds.fitted import built_in_wardrobe, folding_door, large_window, shelf_wall, sliding_door
 from training.worlds.materials import Palette
@@ -26,17 +26,18 @@ class World:
     room: Room
 
 
-def make_world(seed: int, *, held_out: bool = False, fitted: bool = False) -> World:
+def make_world(seed: int, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0) -> World:
     """Return the furnished room of a seed; with `held_out` families and textures appear that training never shows.
 
-    `fitted` rooms have structure that looks like things, and things that are built in.
+    `fitted` rooms have structure that looks like things, and things that are built in. `odd` is the share of oddments;
+    rooms with them may be larger, and things stand on their tops in rows, too.
     """
     rng = np.random.default_rng([seed, 1 if held_out else 0])
-    most = 6.5 if fitted else 5.5
+    most = 7.5 if odd else 6.5 if fitted else 5.5
     size = (float(rng.uniform(2.8, most)), float(rng.uniform(2.8, most)), float(rng.uniform(2.35, 2.9)))
     palette = Palette(rng, held_out=held_out)
     room = Room(size, rng)
-    painter = _Furnisher(room, palette, held_out)
+    painter = _Furnisher(room, palette, held_out, odd)
     painter.shell()
     if fitted:
         painter.built_in()
@@ -53,7 +54,8 @@ def make_world(seed: int, *, held_out: bool = False, fitted: bool = False) -> Wo
 class _Furnisher:
     """Fills one room, step by step."""
 
-    def __init__(self, room: Room, palette: Palette, held_out: bool) -> None:
+    def __init__(self, room: Room, palette: Palette, held_out: bool, odd: float) -> None:
+        self.odd = odd
         self.room, self.palette, self.held_out, self.rng = room, palette, held_out, room.rng
         self.zones: list[tuple[Draft, NDArray[np.float64], Kind]] = []
         self.messy = float(room.rng.choice([0.3, 1.0, 2.0]))
@@ -64,6 +66,8 @@ class _Furnisher:
         return draft
 
     def _draw(self, place: str) -> Kind:
+        if self.odd and place in ODD and self.rng.random() < self.odd:
+            return ODD[place]
         kinds = kinds_at(place, held_out=self.held_out)
         weight = np.array([k.weight for k in kinds])
         return kinds[int(self.rng.choice(len(kinds), p=weight / weight.sum()))]
@@ -424,4 +428,6 @@ class _Furnisher:
             for zone in draft.zones:
                 if zone.z < 2.0 and self.rng.random() < 0.85:
                     density = usual[zone.use] * self.messy * self.rng.uniform(0.3, 1.5)
-                    fill_zone(self.room, self.palette, zone, pose, density=density, held_out=self.held_out)
+                    fill_zone(
+                        self.room, self.palette, zone, pose, density=density, held_out=self.held_out, odd=self.odd
+                    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from training.worlds.catalogue import Kind, kinds_at
+from training.worlds.catalogue import ODD, Kind, kinds_at
 from training.worlds.draft import Draft, Zone, pose_of
 from training.worlds.materials import Palette
 from training.worlds.mesh import turn
@@ -90,9 +90,19 @@ def new_bed(zone: Zone) -> Bed:
 
 
 def fill_zone(
-    room: Room, palette: Palette, zone: Zone, pose: NDArray[np.float64], *, density: float, held_out: bool
+    room: Room,
+    palette: Palette,
+    zone: Zone,
+    pose: NDArray[np.float64],
+    *,
+    density: float,
+    held_out: bool,
+    odd: float = 0.0,
 ) -> None:
-    """Put things into a zone of the thing at `pose` (4, 4); `density` is things a square metre."""
+    """Put things into a zone of the thing at `pose` (4, 4).
+
+    `density` is things a square metre; for `odd` see `make_world`.
+    """
     bed, rng = new_bed(zone), room.rng
     area = (zone.high[0] - zone.low[0]) * (zone.high[1] - zone.low[1])
     if min(zone.high[0] - zone.low[0], zone.high[1] - zone.low[1]) < 0.08:
@@ -105,10 +115,14 @@ def fill_zone(
     if place in ("desk", "media"):
         kinds = kinds + kinds_at("small", held_out=held_out)[:: 2 if place == "desk" else 3]
     weight = np.array([k.weight for k in kinds])
+    if odd and place in ODD and rng.random() < 0.7 * odd:
+        _twins(room, palette, bed, pose, ODD[place] if rng.random() < odd else kinds[int(rng.integers(len(kinds)))])
     previous: tuple[Kind, dict[str, object]] | None = None
     for _ in range(int(rng.poisson(density * area))):
         twin = previous is not None and (rng.random() < 0.2 or place == "shoes")
         kind = previous[0] if twin and previous else kinds[int(rng.choice(len(kinds), p=weight / weight.sum()))]
+        if odd and place in ODD and not twin and rng.random() < odd:
+            kind = ODD[place]
         before = rng.bit_generator.state
         if twin and previous:
             rng.bit_generator.state = previous[1]
@@ -141,6 +155,23 @@ def _put(room: Room, bed: Bed, kind: Kind, draft: Draft, pose: NDArray[np.float6
         if local is not None:
             room.place(kind.name, kind.label, kind.family, draft, pose @ local, mark=False)
             return
+
+
+def _twins(room: Room, palette: Palette, bed: Bed, pose: NDArray[np.float64], kind: Kind) -> None:
+    """Set out several of one thing in rows, near each other."""
+    rng, zone = room.rng, bed.zone
+    draft = Draft(rng, palette)
+    kind.build(draft)
+    rotation = turn(float(rng.integers(4)) * np.pi / 2 + rng.normal(0, 0.05))
+    vertices = draft.mesh().vertices @ rotation.T
+    step = (vertices.max(axis=0) - vertices.min(axis=0))[:2] + rng.uniform(0.005, 0.06)
+    start = np.array(zone.low) + rng.uniform(0, 0.5, 2) * (np.array(zone.high) - np.array(zone.low))
+    for i in range(int(rng.integers(2, 6))):
+        for j in range(int(rng.integers(1, 4))):
+            x, y = start + step * (i, j) + rng.normal(0, 0.004, 2)
+            local = drop(bed, draft, rotation, (float(x), float(y)), stacks=False)
+            if local is not None:
+                room.place(kind.name, kind.label, kind.family, draft, pose @ local, mark=False)
 
 
 def _book_row(room: Room, palette: Palette, bed: Bed, pose: NDArray[np.float64]) -> None:
