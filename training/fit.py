@@ -15,6 +15,8 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from list3r.instances.learned.cut import EXTRA_EDGES
+from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
 from training.graphs import Lesson
 from training.model import PieceNetwork
 from training.worlds.catalogue import LABELS
@@ -33,18 +35,21 @@ class Blindness:
 
 
 SEEING = Blindness()
+COLOUR, VIEWS = Blindness((16, 17, 18, 19, 20, 21), (7, 8, 20, 21, 22, 23)), Blindness((24, 25), (17, 18, 19, 20, 21))
+WIDTH = 48
+"""Width of the first network's states of pieces, which the second one sees."""
 ABLATIONS = {
-    "colour": Blindness((16, 17, 18, 19, 20, 21), (7, 8, 20, 21, 22, 23)),
-    "views": Blindness((24, 25), (17, 18, 19, 20, 21)),
+    "colour": COLOUR,
+    "views": VIEWS,
     "messages": Blindness(messages=False),
 }
 """What can be left out. Superpoints keep to borders of colour all the same."""
 BLINKS = (
-    Blindness((16, 17, 18, 19, 20, 21), (7, 8, 20, 21, 22, 23)),
-    Blindness((24, 25), (17, 18, 19, 20, 21)),
+    COLOUR,
+    VIEWS,
     Blindness((13, 14, 15), ()),
-    Blindness(tuple(range(26, 74)), ()),
-    Blindness((), (24, 25, 26, 27)),
+    Blindness(tuple(range(NODE_FEATURES, NODE_FEATURES + WIDTH)), ()),
+    Blindness((), tuple(range(EDGE_FEATURES, EDGE_FEATURES + EXTRA_EDGES))),
 )
 """Colours; views; heights; what the first network made of pieces; what it said of borders."""
 BLIND = 1e9

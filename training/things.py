@@ -26,7 +26,7 @@ ONE_THING, SAME_NAME = 0.5, 0.25
 """IoU with a true thing, by voxels, from which a cluster is one whole, and from which it should have its name."""
 
 
-OTHER_ENDS = (-2.5, -1.0, 0.0)
+OTHER_ENDS = (-2.5, -1.0, 1.0)
 """Where agglomeration stops besides, so that what is joined too far and not far enough is seen."""
 
 
@@ -151,13 +151,16 @@ def fit_things(
 
 
 def calibrate(arrays: Arrays, held: Sequence[Lesson]) -> dict[str, NDArray[Any]]:
-    """Return the scale and shift of the log odds of being whole, and the temperature of names, on left-out worlds."""
+    """Return the scale and shift of the log odds of being whole, and the temperature of names, on left-out worlds.
+
+    A name is right or wrong only of what is a thing: the other probability tells whether it is one.
+    """
     table = table_of(arrays, held, more=False)
     free = ~table.structure
     x = ((table.x[free] - arrays["things.mean"]) / arrays["things.std"]).astype(np.float32)
     out = two_layers(arrays, "things.net", x).astype(np.float64)
     a, b = _platt(out[:, 0], table.whole[free])
-    listed = 1 / (1 + np.exp(-(a * out[:, 0] + b))) > 0.3
+    listed = (1 / (1 + np.exp(-(a * out[:, 0] + b))) > 0.3) & (table.name[free] >= 0)
     name = table.name[free][listed]
     losses = {}
     for temperature in np.geomspace(0.5, 6.0, 60).tolist():

@@ -1,6 +1,6 @@
 """Make data and weights of the learned discoverer from seeds.
 
-python -m training.train --out DIR --worlds 470 --fitted 235 --odd 300 --held 12
+python -m training.train --out DIR --worlds 470 --fitted 235 --odd 400 --held 12
 
 Every step is kept in the folder and not done again: chunks, graphs, the state of each network after each epoch.
 """
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from list3r.instances.learned.cut import EXTRA_EDGES, EXTRA_NODES, CutSettings
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
 from list3r.instances.learned.weights import write_weights
-from training.fit import ABLATIONS, SEEING, Blindness, FitSettings, fit
+from training.fit import ABLATIONS, SEEING, WIDTH, Blindness, FitSettings, fit
 from training.graphs import Lesson, first_lesson, second_lessons
 from training.model import PieceNetwork
 from training.samples import make_sample
@@ -35,8 +35,10 @@ FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 5000, 5500
 ODD_SHARE = 0.5
 """Share of things that no catalogue knows in rooms that have such things; every third of them is fitted, too."""
 
-WIDTH, EDGE_WIDTH = 48, 32
-"""Widths of the first network's states of pieces and of borders."""
+EDGE_WIDTH = 32
+"""Width of the first network's states of borders; see `WIDTH`."""
+AVERAGE = 0.999
+"""What of the mean of its weights a network keeps in each step."""
 SECOND_WIDTH, SECOND_EDGE_WIDTH, SECOND_DEPTH = 64, 48, 4
 """Likewise of the second one, which sees far smaller graphs, and its rounds of messages."""
 FIRST_ENDS = ((2.0,), (3.5,))
@@ -50,7 +52,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of chunks, graphs, states and logs")
     parser.add_argument("--worlds", type=int, default=470, help="rooms with loose furniture")
     parser.add_argument("--fitted", type=int, default=235, help="rooms with what is built in")
-    parser.add_argument("--odd", type=int, default=300, help="rooms with things that no catalogue knows")
+    parser.add_argument("--odd", type=int, default=400, help="rooms with things that no catalogue knows")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=8)
     parser.add_argument("--start", type=Path, help="folder of an earlier run whose first network is trained on")
@@ -81,17 +83,19 @@ def train(
     blind = ABLATIONS[without] if without else SEEING
     depth = 3 if blind.messages else 0
     fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), node=WIDTH, edge=EDGE_WIDTH, depth=depth)
-    settings = FitSettings(epochs, start=start and start / "fine", blind=blind)
+    settings = FitSettings(
+        epochs, start=start and start / "fine", blind=blind, blink=0.1, average=AVERAGE, least_weight=1.0
+    )
     arrays = named("fine", fit(fine, lessons, seen, out / "fine", settings))
     every = [second_lessons(p, arrays, out / "parts", FIRST_ENDS) for p in paths]
     unseen = [second_lessons(p, arrays, out / "parts", FIRST_ENDS[:1])[0] for p in held]
-    settings = FitSettings(max(1, epochs // 2), noise=0.15, decay=1e-2, blind=blind, least_weight=1.0)
+    settings = replace(settings, epochs=max(1, epochs // 2), start=None, noise=0.15, decay=1e-2, blink=0.15)
     first = [lesson for rows in every for lesson in rows]
     arrays |= named("coarse", fit(_second(blind), first, unseen, out / "coarse", settings))
     for k, p in enumerate(paths):
         every[k] += second_lessons(p, arrays, out / "parts", STATES)
     unseen = [second_lessons(p, arrays, out / "parts", STATES)[-1] for p in held]
-    settings = replace(settings, epochs=epochs + 2)
+    settings = replace(settings, epochs=max(1, epochs - 2))
     network = fit(_second(blind), [lesson for rows in every for lesson in rows], unseen, out / "states", settings)
     arrays |= named("coarse", network)
     arrays |= fit_things(arrays, [rows[k] for rows in every for k in (0, -2, -1)], unseen, blind=blind)

@@ -19,13 +19,13 @@ from list3r.instances.learned.things import ThingVerdicts, judge_things
 
 @dataclass(frozen=True)
 class CutSettings:
-    """Where agglomeration stops, chosen on 18 left-out worlds (docs/decisions/0124-learning-from-700-rooms.md)."""
+    """Where agglomeration stops, chosen on left-out worlds (docs/decisions/0135-what-no-catalogue-knows.md)."""
 
     sure: float = 3.5
     """Mean log odds above which fine pieces become parts."""
     steps: tuple[float, ...] = (3.5, 2.5, 1.5)
     """Mean log odds above which parts are joined before what they make up is judged anew, one step after the other."""
-    enough: float = -1.0
+    enough: float = 0.0
     """Mean log odds above which parts become things."""
     hop_m: float = 0.05
     """Longest gap over which voxels of no piece go to the thing that is nearest."""

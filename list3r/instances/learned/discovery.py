@@ -39,7 +39,7 @@ FLAT = 0.85
 class LearnedSettings:
     """What is listed, and where agglomeration stops."""
 
-    least_confidence: float = 0.55
+    least_confidence: float = 0.6
     """Things that are less probably one whole are scraps, which are kept but not listed; chosen on left-out worlds,
     where recall and precision meet near it."""
     least_scrap: float = 0.1
