@@ -52,32 +52,31 @@ def close_gaps(out: Floats, origin: NDArray[np.int32], fine: Floats, jump: float
     `origin` are those of `project`, shape (H, W); `fine` is the depth image they come from, shape (h, w).
     """
     filled = out.copy()
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            filled[row, column] = _closed(out, origin, fine, (row, column), (jump, noise))
+    height, width = out.shape
+    steep, none = np.float32(1 + 2 * jump), np.float32(0)
+    for row in range(height):
+        for column in range(width):
+            here = out[row, column]
+            value = here
+            if 0 < row < height - 1:
+                before, after = out[row - 1, column], out[row + 1, column]
+                if before > none and after > none and (here == none or here > steep * max(before, after)):
+                    a, b = origin[row - 1, column], origin[row + 1, column]
+                    value = _between(value, before, after, _one_surface(a, b, fine, jump, noise))
+            if 0 < column < width - 1:
+                before, after = out[row, column - 1], out[row, column + 1]
+                if before > none and after > none and (here == none or here > steep * max(before, after)):
+                    a, b = origin[row, column - 1], origin[row, column + 1]
+                    value = _between(value, before, after, _one_surface(a, b, fine, jump, noise))
+            filled[row, column] = value
     return filled
 
 
 @compiled
-def _closed(
-    out: Floats, origin: NDArray[np.int32], fine: Floats, at: tuple[int, int], limits: tuple[float, float]
-) -> np.float32:
-    """Depth of one pixel: its own, or the nearest that opposite neighbours give it."""
-    (row, column), (jump, noise) = at, limits
-    height, width = out.shape
-    steep, here = np.float32(1 + 2 * jump), out[row, column]
-    value = here
-    for down, right in ((0, 1), (1, 0)):
-        if row - down < 0 or row + down >= height or column - right < 0 or column + right >= width:
-            continue
-        before, after = out[row - down, column - right], out[row + down, column + right]
-        if not (before > 0 and after > 0) or (here != 0 and here <= steep * max(before, after)):
-            continue
-        between = np.float32(0.5) * (before + after)
-        a, b = origin[row - down, column - right], origin[row + down, column + right]
-        if (value == 0 or value > between) and _one_surface(a, b, fine, jump, noise):
-            value = between
-    return np.float32(value)
+def _between(value: np.float32, before: np.float32, after: np.float32, one_surface: bool) -> np.float32:
+    """The depth between two neighbours where that is nearer than what a pixel has, or it has none."""
+    between = np.float32(0.5) * (before + after)
+    return between if one_surface and (value == 0 or value > between) else value
 
 
 @compiled
