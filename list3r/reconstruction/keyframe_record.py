@@ -103,8 +103,8 @@ def frame_samples(
     positions = np.flatnonzero(reconstruction.posed)
     camera = reconstruction.camera
     row, column, level = _pixel_grid(camera, chosen)
-    depth = reconstruction.depth[positions][:, row, column]
-    confidence = reconstruction.confidence[positions][:, row, column].astype(np.float32)
+    places = positions[:, None], row, column
+    depth, confidence = reconstruction.depth[places], reconstruction.confidence[places].astype(np.float32)
     instance, small = _instances(library, reconstruction, positions, row, column, chosen)
     last = len(reconstruction.frame_indices) - 1
     near_end = np.minimum(positions, last - positions) < chosen.end_frames

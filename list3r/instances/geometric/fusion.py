@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.instances.geometric.kernels import Intrinsics
 from list3r.instances.settings import DepthNoiseSettings
 
 Float = NDArray[np.float32]
@@ -58,20 +59,9 @@ def single_sigma(depth: Float, noise: DepthNoiseSettings, unit: float) -> Float:
     return np.asarray((noise.base_m + noise.quadratic_per_m * metres * metres) * unit, dtype=np.float32)
 
 
-def project_depth(
-    depth: Float, camera: Camera, T_other_cam: NDArray[np.float64], other: Camera
-) -> tuple[Float, Float, Float]:
-    """Where the pixels of a depth image lie in another camera: x, y in px and z. Shape (h, w) each."""
-    height, width = depth.shape
-    u = (np.arange(width, dtype=np.float32) - camera.cx) / np.float32(camera.fx)
-    v = (np.arange(height, dtype=np.float32) - camera.cy) / np.float32(camera.fy)
-    R, t = T_other_cam[:3, :3].astype(np.float32), T_other_cam[:3, 3].astype(np.float32)
-    row = [R[i, 0] * u[None, :] + (R[i, 1] * v + R[i, 2])[:, None] for i in range(3)]
-    X, Y, Z = (r * depth + t[i] for i, r in enumerate(row))
-    safe = np.where(Z > 1e-6, Z, np.float32(1e-6))
-    x = np.where(depth > 0, X / safe * np.float32(other.fx) + np.float32(other.cx), np.float32(-1e4))
-    y = Y / safe * np.float32(other.fy) + np.float32(other.cy)
-    return np.clip(x, -1e4, 1e4), np.clip(y, -1e4, 1e4), Z
+def intrinsics_of(camera: Camera) -> Intrinsics:
+    """Return the intrinsics of a camera as compiled loops read them."""
+    return np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx), np.float32(camera.cy)
 
 
 def depth_edges(depth: Float, sigma: Float) -> NDArray[np.bool_]:

@@ -14,12 +14,13 @@ from list3r.instances.geometric.fusion import (
     Float,
     View,
     depth_edges,
+    intrinsics_of,
     normals_of,
-    project_depth,
     single_sigma,
     small_color,
     working_camera,
 )
+from list3r.instances.geometric.kernels import read_across
 from list3r.instances.geometric.registration import align_views, moved_view
 from list3r.instances.settings import AnchorViewSettings, InstanceSettings
 from list3r.reconstruction.base import Reconstruction, backproject
@@ -67,6 +68,15 @@ class ChunkViews:
             return self.reconstruction.depth_noise.sigma(depth)
         return single_sigma(depth, self.settings.view.noise, self.unit) * np.float32(self.noise_scale)
 
+    @property
+    def noise_law(self) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+        """What `sigma` reckons with: base and quadratic share in metres, units of a metre, and a scale."""
+        computed, read = self.reconstruction.depth_noise, self.settings.view.noise
+        if computed is not None:
+            return np.float32(computed.base), np.float32(computed.quadratic), np.float32(1), np.float32(1)
+        law = np.float32(read.base_m), np.float32(read.quadratic_per_m)
+        return *law, np.float32(self.unit), np.float32(self.noise_scale)
+
     def _measure_noise(self) -> float:
         """How much larger the disagreement of frames is than the noise model says, poses included."""
         ratios = []
@@ -87,9 +97,9 @@ class ChunkViews:
     def _residual(self, position: int, other: int, depth: Float) -> tuple[Float, NDArray[np.bool_]]:
         """Depth read in frame `other` less that predicted from `depth` at `position`, and where both are known."""
         moved = np.linalg.inv(self.reconstruction.T_chunk_cam[other]) @ self.reconstruction.T_chunk_cam[position]
-        x, y, z = project_depth(depth, self.camera, moved, self.reconstruction.camera)
-        read = cv2.remap(self.reconstruction.depth[other], x, y, cv2.INTER_NEAREST, borderValue=0)
-        return read - z, (read > 0) & (depth > 0) & (z > 0)
+        there = np.ascontiguousarray(self.reconstruction.depth[other])
+        cameras = intrinsics_of(self.camera), intrinsics_of(self.reconstruction.camera)
+        return read_across(depth, cameras[0], moved.astype(np.float32), cameras[1], there)
 
     def _most_sigma(self, depth: Float) -> Float:
         """Standard deviation beyond which depth shows no things. Shape (...)."""

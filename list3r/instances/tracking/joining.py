@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.base import Proposals
-from list3r.instances.geometric.fusion import View, project_depth
+from list3r.instances.geometric.fusion import View, intrinsics_of
+from list3r.instances.geometric.kernels import carry_labels
 from list3r.instances.geometric.views import ChunkViews
 
 MIN_OVERLAP = 0.4
@@ -93,9 +93,11 @@ def warp_labels(
     T_source_cam: NDArray[np.float64],
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Labels of the source view looked up from a depth image of another camera. Shape (h, w) each."""
-    x, y, z = project_depth(depth, views.camera, T_source_cam, views.camera)
-    seen = cv2.remap(source.depth, x, y, cv2.INTER_NEAREST, borderValue=0)
-    found = cv2.remap(labels.astype(np.float32), x, y, cv2.INTER_NEAREST, borderValue=0).astype(np.int32)
-    tolerance = np.float32(4.0) * views.sigma(z) + np.float32(0.005 * views.unit)
-    agrees = (depth > 0) & (seen > 0) & (np.abs(seen - z) < tolerance)
-    return np.where(agrees, found, 0).astype(np.int32), agrees
+    camera = intrinsics_of(views.camera)
+    return carry_labels(
+        np.ascontiguousarray(depth),
+        camera,
+        np.ascontiguousarray(T_source_cam, np.float32),
+        (source.depth, np.ascontiguousarray(labels, np.int32)),
+        (*views.noise_law, np.float32(0.005 * views.unit)),
+    )

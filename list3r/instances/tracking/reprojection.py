@@ -13,6 +13,7 @@ from list3r.compiled import compiled
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.features import mean_feature
+from list3r.instances.geometric.kernels import label_runs, without_lone
 from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.separation import cannot_link_pairs
@@ -176,15 +177,7 @@ def frame_labels(
 
 def _tidy(labels: NDArray[np.int32], depth: NDArray[np.float32]) -> NDArray[np.int32]:
     """Labels without lone pixels, grown over pixels without a label that they surround."""
-    padded = np.pad(labels, 1)
-    alike, most = np.zeros(labels.shape, np.int8), np.zeros(labels.shape, np.int32)
-    for dy in (0, 1, 2):
-        for dx in (0, 1, 2):
-            if (dy, dx) != (1, 1):
-                near = padded[dy : dy + labels.shape[0], dx : dx + labels.shape[1]]
-                alike += near == labels
-                most = np.maximum(most, near)
-    kept = np.where(alike >= 3, labels, 0)
+    kept, most = without_lone(np.ascontiguousarray(labels, np.int32))
     filled = cv2.morphologyEx((kept > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     grow = (kept == 0) & (filled > 0) & (depth <= 0)
     return np.where(grow, most, kept).astype(np.int32)
@@ -194,14 +187,9 @@ def encode_labels(
     labels: NDArray[np.int32], stride: int, shape: tuple[int, int]
 ) -> dict[int, tuple[NDArray[np.uint32], int, tuple[float, float, float, float], tuple[float, float]]]:
     """Run-length code, area, box and centroid of every instance of a label image, at the colour image's size."""
-    full = np.repeat(np.repeat(labels, stride, axis=0), stride, axis=1)[: shape[0], : shape[1]]
-    flat = full.ravel()
-    starts = np.concatenate([[0], np.flatnonzero(flat[1:] != flat[:-1]) + 1])
-    stops = np.append(starts[1:], len(flat))
-    value = flat[starts]
-    known = value > 0
-    order = np.argsort(value[known], kind="stable")
-    starts, stops, value = starts[known][order], stops[known][order], value[known][order]
+    starts, stops, value = label_runs(np.ascontiguousarray(labels, np.int32), stride, *shape)
+    order = np.argsort(value, kind="stable")
+    starts, stops, value = starts[order], stops[order], value[order]
     bounds = np.append(np.flatnonzero(np.diff(value, prepend=-1)), len(value))
     runs, ends, figures = _codes(starts, stops, bounds, *shape)
     out = {}

@@ -88,12 +88,17 @@ def _surface(depth: Floats, rays: Floats, valid: NDArray[np.bool_], steepest: fl
         for column in range(1, width - 1):
             if not valid[row, column]:
                 continue
-            a, b = points[row, column + 1] - points[row, column - 1], points[row + 1, column] - points[row - 1, column]
+            ax = points[row, column + 1, 0] - points[row, column - 1, 0]
+            ay = points[row, column + 1, 1] - points[row, column - 1, 1]
+            az = points[row, column + 1, 2] - points[row, column - 1, 2]
+            bx = points[row + 1, column, 0] - points[row - 1, column, 0]
+            by = points[row + 1, column, 1] - points[row - 1, column, 1]
+            bz = points[row + 1, column, 2] - points[row - 1, column, 2]
             limit = steepest * depth[row, column]
-            if abs(a[2]) >= limit or abs(b[2]) >= limit:
+            if abs(az) >= limit or abs(bz) >= limit:
                 valid[row, column] = False
                 continue
-            x, y, z = b[1] * a[2] - b[2] * a[1], b[2] * a[0] - b[0] * a[2], b[0] * a[1] - b[1] * a[0]
+            x, y, z = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
             length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-12))
             normals[row, column, 0], normals[row, column, 1] = x / length, y / length
             normals[row, column, 2] = z / length
