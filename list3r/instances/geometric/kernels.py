@@ -1,4 +1,4 @@
-"""The loops of `views` and of masks that are followed. Images have the shape (h, w), intrinsics are (fx, fy, cx, cy)."""
+"""The loops of `views` and of masks that are followed. Images are (h, w), intrinsics are (fx, fy, cx, cy)."""
 
 from __future__ import annotations
 

@@ -9,6 +9,8 @@ from list3r.compiled import compiled
 
 Floats = NDArray[np.float32]
 Pose = NDArray[np.float64]
+Paired = tuple[int, Floats, Floats, Floats, Floats, Floats, Floats, Floats, Floats]
+"""What `pair_up` returns."""
 
 
 @compiled
@@ -19,7 +21,7 @@ def pair_up(
     view: tuple[Floats, Floats, NDArray[np.bool_], Floats],
     gate_m: float,
     agreement: float,
-) -> tuple[int, Floats, Floats, Floats, Floats, Floats, Floats, Floats, Floats]:
+) -> Paired:
     """How many model points meet any surface of a view, and those that meet one within the gate, M of them.
 
     `model` is points and normals (N, 3) and grey values (N,); `view` points and normals (h, w, 3) in its camera, where
@@ -176,6 +178,39 @@ def huber_equations(slope: Floats, error: Floats, scale: float, huber: float) ->
         for j in range(i):
             information[j, i] = information[i, j]
     return information, gradient
+
+
+@compiled
+def joint_equations(
+    model: tuple[Floats, Floats, Floats],
+    T_model_cam: Pose,
+    intrinsics: tuple[float, float, float, float],
+    view: tuple[tuple[Floats, Floats, NDArray[np.bool_], Floats], Floats],
+    gate: tuple[float, float, int],
+    kernel: tuple[float, float],
+) -> tuple[Paired, float, Pose, Pose]:
+    """Pairs of `pair_up`, the robust scale of their distances, and information and gradient of a left-hand step.
+
+    `view` is that of `pair_up`, and brightness with its gradients (h, w, 3); `gate` is in metres, the least cosine of
+    normals, and the least number of pairs, below which the equations are left 0; `kernel` is the limit of Huber's for
+    distances, and the weight of brightness, 0 for none.
+    """
+    surface, brightness = view
+    paired = pair_up(model, T_model_cam, intrinsics, surface, gate[0], gate[1])
+    _, moved, points, normals, gray, uv, points_cam, residual, inverse_sigma = paired
+    scale = spread(residual, 1e-3)
+    if len(residual) < gate[2]:
+        return paired, scale, np.zeros((6, 6)), np.zeros(6)
+    slope = plane_slopes(moved, normals, inverse_sigma)
+    information, gradient = huber_equations(slope, residual, scale, kernel[0])
+    if kernel[1] > 0:
+        sampled, R = bilinear(brightness, uv), np.ascontiguousarray(T_model_cam[:3, :3])
+        slope = brightness_slopes(points, points_cam, sampled, R, (intrinsics[0], intrinsics[1]), 0.0)
+        error = centred(sampled[:, 0] - gray)
+        more, further = huber_equations(slope, error, spread(error, 1.0), 1.345)
+        information += kernel[1] * more
+        gradient += kernel[1] * further
+    return paired, scale, information, gradient
 
 
 @compiled

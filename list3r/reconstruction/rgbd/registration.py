@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from list3r.memory.geometry import skew
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.rgbd.kernels import (
+    Paired,
     bilinear,
     brightness_slopes,
     centred,
     huber_equations,
+    joint_equations,
     pair_up,
     plane_slopes,
     spread,
@@ -147,17 +149,15 @@ def register(
     frame = _Frame(view, noise)
     photometric = model.gray is not None and settings.photometric_weight > 0
     T = np.array(T_model_cam, dtype=np.float64)
-    pairs = None
+    laid_out, seen = model.laid_out(), (frame.surface, frame.brightness)
+    kernel = settings.huber, settings.photometric_weight if photometric else 0.0
+    found = None
     for iteration in range(settings.iterations):
         halved = min(iteration // settings.gate_hold, settings.gate_halvings)
-        pairs = _pair(model, frame, T, settings.gate_m * 0.5**halved, settings.normal_agreement)
-        if pairs.count < settings.least_pairs:
+        gate = settings.gate_m * 0.5**halved, settings.normal_agreement, settings.least_pairs
+        *found, information, gradient = joint_equations(laid_out, T, frame.intrinsics, seen, gate, kernel)
+        if len(found[0][1]) < settings.least_pairs:
             return None
-        information, gradient = _geometric(pairs, settings.huber)
-        if photometric:
-            more, slope = _photometric(pairs, frame, T)
-            information += settings.photometric_weight * more
-            gradient += settings.photometric_weight * slope
         if told is not None:
             more, slope = told.normal_equations(T, view.camera.fx)
             information += more
@@ -167,7 +167,8 @@ def register(
         T = _exp(step) @ T
         if halved == settings.gate_halvings and iteration > 2 and np.abs(step).max() < settings.converged:
             break
-    assert pairs is not None
+    assert found is not None
+    pairs = _SurfelPairs.of(model, *found)
     information = _solid_information(pairs, frame, T, settings, photometric)
     if told is not None:
         information += told.information(T, view.camera.fx)
@@ -217,6 +218,7 @@ class _Frame:
 
     def __init__(self, view: WorkingFrame, noise: SensorNoise) -> None:
         self.camera = view.camera
+        self.intrinsics = view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy
         self.surface = view.points, view.normals, view.valid, 1.0 / noise.sigma(view.depth)
         dx = cv2.Sobel(view.gray, cv2.CV_32F, 1, 0, scale=0.125)
         dy = cv2.Sobel(view.gray, cv2.CV_32F, 0, 1, scale=0.125)
@@ -243,29 +245,22 @@ class _SurfelPairs:
     overlap: float
     share: float
 
+    @classmethod
+    def of(cls, model: Samples, paired: Paired, scale: float) -> _SurfelPairs:
+        """Return what `pair_up` found of a model's points."""
+        known, moved, points, normals, gray, uv, points_cam, residual, inverse_sigma = paired
+        shares = known / max(1, len(model.points)), len(residual) / max(1, known)
+        tone = None if model.gray is None else gray
+        return cls(moved, points, normals, tone, uv, points_cam, residual, inverse_sigma, scale, *shares)
+
     @property
     def count(self) -> int:
         return len(self.residual)
 
 
 def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, agreement: float) -> _SurfelPairs:
-    camera = frame.camera
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    known, *found = pair_up(model.laid_out(), np.ascontiguousarray(T), intrinsics, frame.surface, gate_m, agreement)
-    moved, points, normals, gray, uv, points_cam, residual, inverse_sigma = found
-    return _SurfelPairs(
-        moved=moved,
-        points=points,
-        normals=normals,
-        gray=None if model.gray is None else gray,
-        uv=uv,
-        points_cam=points_cam,
-        residual=residual,
-        inverse_sigma=inverse_sigma,
-        scale=spread(residual, 1e-3),
-        overlap=known / max(1, len(model.points)),
-        share=len(residual) / max(1, known),
-    )
+    paired = pair_up(model.laid_out(), np.ascontiguousarray(T), frame.intrinsics, frame.surface, gate_m, agreement)
+    return _SurfelPairs.of(model, paired, spread(paired[7], 1e-3))
 
 
 def _geometric(pairs: _SurfelPairs, huber: float) -> NormalEquations:
