@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from list3r.instances.geometric.fusion import View
+from list3r.instances.geometric.kernels import components, meeting, sums_by
 
 Float = NDArray[np.float32]
 
@@ -99,8 +98,7 @@ def _gather(views: Sequence[View], chosen: Sequence[NDArray[np.bool_]], name: st
 
 
 def _mean(inverse: NDArray[np.int64], values: NDArray[np.generic], weight: Float) -> Float:
-    columns = [np.bincount(inverse, values[:, k], minlength=len(weight)) for k in range(values.shape[1])]
-    return (np.stack(columns, axis=1) / weight[:, None]).astype(np.float32)
+    return (sums_by(inverse, np.ascontiguousarray(values), len(weight)) / weight[:, None]).astype(np.float32)
 
 
 def half_offsets(radius: int) -> list[tuple[int, int, int]]:
@@ -115,11 +113,9 @@ def neighbour_pairs(keys: NDArray[np.int64], radius: int) -> tuple[NDArray[np.in
     """Pairs of positions into ascending `keys` that are neighbours within `radius` cells. Shape (E,) each."""
     left, right = [], []
     for offset in half_offsets(radius):
-        wanted = keys + key_shift(offset)
-        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1) if len(keys) else np.zeros(0, np.int64)
-        hit = np.flatnonzero(keys[at] == wanted)
-        left.append(hit)
-        right.append(at[hit])
+        here, there = meeting(keys, key_shift(offset))
+        left.append(here)
+        right.append(there)
     return np.concatenate(left), np.concatenate(right)
 
 
@@ -133,6 +129,5 @@ def component_numbers(
     left: NDArray[np.int64], right: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Connected components of a graph given by its edges: the number of each of `count` nodes, and the sizes."""
-    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count))
-    number = np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    number = components(left.astype(np.int64), right.astype(np.int64), count)
     return number, np.bincount(number, minlength=1)

@@ -135,3 +135,57 @@ def label_runs(
             starts[count], stops[count], value[count] = start, stop, here
             count += 1
     return starts[:count], stops[:count], value[:count]
+
+
+@compiled
+def meeting(keys: NDArray[np.int64], shift: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Positions of ascending keys that others are `shift` beyond, and those of these others. Shape (H,) each."""
+    here, there = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
+    count, at = 0, 0
+    for k in range(len(keys)):
+        wanted = keys[k] + shift
+        while at < len(keys) and keys[at] < wanted:
+            at += 1
+        if at == len(keys):
+            break
+        if keys[at] == wanted:
+            here[count], there[count] = k, at
+            count += 1
+    return here[:count], there[:count]
+
+
+@compiled
+def components(left: NDArray[np.int64], right: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Connected component of each of `count` nodes of a graph, numbered in order of their first nodes."""
+    parent = np.arange(count)
+    for k in range(len(left)):
+        a, b = left[k], right[k]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        parent[max(a, b)] = min(a, b)
+    found = 0
+    number = np.empty(count, np.int64)
+    for k in range(count):
+        root = k
+        while parent[root] != root:
+            root = parent[root]
+        parent[k] = root
+        if root == k:
+            number[k], found = found, found + 1
+        else:
+            number[k] = number[root]
+    return number
+
+
+@compiled
+def sums_by(own: NDArray[np.int64], values: NDArray[np.floating], count: int) -> NDArray[np.float64]:
+    """Sums of the rows of `values` (N, C) that belong to each of `count` owners. Shape (count, C)."""
+    out = np.zeros((count, values.shape[1]))
+    for k in range(len(own)):
+        for c in range(values.shape[1]):
+            out[own[k], c] += values[k, c]
+    return out

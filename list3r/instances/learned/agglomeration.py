@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.instances.geometric.cloud import component_numbers
+
 Float = NDArray[np.float32]
 
 STRONGEST = 6.0
@@ -54,8 +56,6 @@ def agglomerate(
 
 def _joined(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
     """The least piece of each connected group. Shape (count,)."""
-    from list3r.instances.geometric.cloud import component_numbers
-
     number, _ = component_numbers(a, b, count)
     least = np.full(int(number.max(initial=-1)) + 1, count)
     np.minimum.at(least, number, np.arange(count))

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from list3r.instances.geometric.cloud import Cloud, key_shift, neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import lab_of
 from list3r.instances.geometric.fusion import View
+from list3r.instances.geometric.kernels import meeting, sums_by
+from list3r.instances.learned.kernels import contact_sums, extremes, seen_across, touching
 
 Float = NDArray[np.float32]
 
@@ -94,10 +96,11 @@ def piece_graph(surface: ChunkSurface, labels: NDArray[np.int32], doublings: int
     """
     count = int(labels.max(initial=-1)) + 1
     stats = _Pieces(surface, labels, count)
-    touching = _touching(labels, surface.pairs, count)
-    codes = _codes(surface.cloud, labels, touching, count, doublings)
+    *pairs, code = touching(labels, *surface.pairs, count)
+    meets = _Touching((pairs[0], pairs[1]), code)
+    codes = _codes(surface.cloud, labels, meets, count, doublings)
     left, right = codes // count, codes % count
-    contact = _contact(surface, labels, touching, codes)
+    contact = _contact(surface, labels, meets, codes)
     seen = _seen(surface, labels, codes, count)
     edges = np.column_stack([contact, _between(stats, left, right), seen, _contrast(stats, left, right)])
     weight = np.expm1(contact[:, 0]) + 1.0
@@ -114,7 +117,7 @@ class _Pieces:
 
     def __init__(self, surface: ChunkSurface, labels: NDArray[np.int32], count: int) -> None:
         cloud, around, known = surface.cloud, surface.around, labels >= 0
-        self._own = labels[known]
+        self._own = labels[known].astype(np.int64)
         self.count, self._around = count, around
         frame = upright_frame(around.up)
         points = (cloud.points[known] @ frame.T) / around.unit
@@ -136,13 +139,10 @@ class _Pieces:
         self.voxel = cloud.voxel / around.unit
 
     def _mean(self, values: NDArray[np.generic]) -> NDArray[np.float64]:
-        sums = [np.bincount(self._own, values[:, k], minlength=self.count) for k in range(values.shape[1])]
-        return np.stack(sums, axis=1) / self.size[:, None]
+        return sums_by(self._own, np.ascontiguousarray(values), self.count) / self.size[:, None]
 
     def _extremes(self, z: NDArray[np.generic]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        low, high = np.full(self.count, np.inf), np.full(self.count, -np.inf)
-        np.minimum.at(low, self._own, z)
-        np.maximum.at(high, self._own, z)
+        low, high = extremes(self._own, np.ascontiguousarray(z, np.float64), self.count)
         return np.minimum(low, high), np.maximum(low, high)
 
     def moments(self) -> NDArray[np.float64]:
@@ -193,36 +193,25 @@ def upright_frame(up: NDArray[np.float64]) -> NDArray[np.float64]:
 class _Touching:
     """Pairs of neighbouring voxels of different pieces."""
 
-    row: NDArray[np.int64]
-    """Rows of the voxel pairs. Shape (T,)."""
+    pairs: tuple[NDArray[np.int32], NDArray[np.int32]]
+    """The voxel of the lesser piece, and that of the greater. Shape (T,) each."""
     code: NDArray[np.int64]
     """Lesser piece times the number of pieces plus the greater. Shape (T,)."""
-    flipped: NDArray[np.bool_]
-    """True where the pair's left voxel is of the greater piece. Shape (T,)."""
-
-
-def _touching(labels: NDArray[np.int32], pairs: tuple[NDArray[np.int32], NDArray[np.int32]], count: int) -> _Touching:
-    here, there = labels[pairs[0]], labels[pairs[1]]
-    row = np.flatnonzero((here != there) & (here >= 0) & (there >= 0))
-    a, b = here[row].astype(np.int64), there[row].astype(np.int64)
-    return _Touching(row, np.minimum(a, b) * count + np.maximum(a, b), a > b)
 
 
 MOST_IN_TABLE = 10_000
 """Pieces up to which pairs of them are marked in a table, which is faster than sorting them."""
 
 
-def _codes(
-    cloud: Cloud, labels: NDArray[np.int32], touching: _Touching, count: int, doublings: int
-) -> NDArray[np.int64]:
+def _codes(cloud: Cloud, labels: NDArray[np.int32], meets: _Touching, count: int, doublings: int) -> NDArray[np.int64]:
     """Codes of pieces that touch or come near each other, ascending. Shape (E,)."""
     if count > MOST_IN_TABLE:
-        found = np.unique(touching.code)
+        found = np.unique(meets.code)
         for codes in _near_codes(cloud, labels, count, doublings):
             found = np.union1d(found, codes)
         return found
     table = np.zeros(-(-count * count // 8) * 8, bool)
-    table[touching.code] = True
+    table[meets.code] = True
     for codes in _near_codes(cloud, labels, count, doublings):
         table[codes] = True
     word = np.flatnonzero(table.view(np.uint64))
@@ -244,48 +233,33 @@ def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: 
     span = (-1, 0, 1)
     half = [(i, j, k) for i in span for j in span for k in span if (i, j, k) >= (0, 0, 0)]
     for offset in half:
-        at = np.minimum(np.searchsorted(cells, cells + key_shift(offset)), len(cells) - 1)
-        hit = np.flatnonzero(cells[at] == cells + key_shift(offset))
+        here, there = meeting(cells, key_shift(offset))
         for mine in (first, last):
             for theirs in (first, last):
-                a, b = own[mine[hit]], own[theirs[at[hit]]]
+                a, b = own[mine[here]], own[theirs[there]]
                 yield (np.minimum(a, b) * count + np.maximum(a, b))[a != b]
 
 
 def _contact(
-    surface: ChunkSurface, labels: NDArray[np.int32], touching: _Touching, codes: NDArray[np.int64]
+    surface: ChunkSurface, labels: NDArray[np.int32], meets: _Touching, codes: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """What the voxels on both sides of each border tell. Shape (E, 10)."""
-    cloud, pairs = surface.cloud, surface.pairs
-    at = np.searchsorted(codes, touching.code)
-    a, b = pairs[0][touching.row], pairs[1][touching.row]
-    a, b = np.where(touching.flipped, b, a), np.where(touching.flipped, a, b)
-    size = np.bincount(at, minlength=len(codes)).astype(np.float64)
-    length = np.maximum(size, 1.0)
-
-    def mean(values: NDArray[np.generic]) -> NDArray[np.float64]:
-        return np.bincount(at, values, minlength=len(codes)) / length
-
-    way = (cloud.points[b] - cloud.points[a]) / cloud.voxel
-    n, m = cloud.normals[a], cloud.normals[b]
-    known = ((n != 0).any(axis=1) & (m != 0).any(axis=1)).astype(np.float64)
-    bent = ((m - n) * way).sum(axis=1) * known
-    step = np.abs((way * (n + m) / 2.0).sum(axis=1))
-    color = surface.lab[b] - surface.lab[a]
+    cloud, at = surface.cloud, np.searchsorted(codes, meets.code)
+    held = cloud.points, cloud.normals, surface.lab, cloud.sigma
+    sums = contact_sums(meets.pairs, at, held, np.float32(cloud.voxel), len(codes))
+    size = sums[:, 0]
+    mean = sums / np.maximum(size, 1.0)[:, None]
     count = int(labels.max(initial=-1)) + 1
     outline = np.sqrt(np.maximum(np.bincount(labels[labels >= 0], minlength=count), 1.0))
     return np.column_stack(
         [
             np.log1p(size),
-            mean(bent),
-            mean((bent < -0.15) * 1.0),
-            mean(np.where(known > 0, (n * m).sum(axis=1), 0.7)),
+            mean[:, 1:4],
             size / outline[codes // count] / 4.0,
             size / outline[codes % count] / 4.0,
-            mean(step),
-            mean(np.linalg.norm(color, axis=1)) / 15.0,
-            mean(np.abs(color[:, 0])) / 15.0,
-            mean(np.maximum(cloud.sigma[a], cloud.sigma[b])) / surface.around.unit * 100.0,
+            mean[:, 4],
+            mean[:, 5:7] / 15.0,
+            mean[:, 7] / surface.around.unit * 100.0,
         ]
     )
 
@@ -320,33 +294,10 @@ def _seen(
     surface: ChunkSurface, labels: NDArray[np.int32], codes: NDArray[np.int64], count: int
 ) -> NDArray[np.float64]:
     """What views show across each border: how often it is seen, who is before whom, the step of colour. (E, 5)."""
-    table = np.append(labels, -1)
-    sums = np.zeros((5, len(codes)))
+    table, sums = np.append(labels, np.int32(-1)), np.zeros((len(codes), 5))
     for view, lab, index in zip(surface.views, surface.view_lab, surface.cloud.index, strict=True):
-        image = table[index]
-        limit = 6.0 * view.reading + 0.015 * view.depth
-        for axis in (0, 1):
-            one, two = _apart(axis, REACH_PX)
-            a, b = image[one].ravel().astype(np.int64), image[two].ravel().astype(np.int64)
-            row = np.flatnonzero((a != b) & (a >= 0) & (b >= 0))
-            a, b = a[row], b[row]
-            code = np.minimum(a, b) * count + np.maximum(a, b)
-            at = np.minimum(np.searchsorted(codes, code), len(codes) - 1)
-            hit = codes[at] == code if len(codes) else np.zeros(len(code), bool)
-            row, at, flip = row[hit], at[hit], (a > b)[hit]
-            jump = (view.depth[two].ravel()[row] - view.depth[one].ravel()[row]) * np.where(flip, -1.0, 1.0)
-            sure = limit[one].ravel()[row]
-            step = np.abs(lab[two].reshape(-1, 3)[row] - lab[one].reshape(-1, 3)[row])
-            values = (np.ones(len(row)), jump > sure, jump < -sure, step[:, 0], np.hypot(step[:, 1], step[:, 2]))
-            for k, value in enumerate(values):
-                sums[k] += np.bincount(at, value, minlength=len(codes))
-    times = np.maximum(sums[0], 1.0)
-    return np.column_stack(
-        [np.log1p(sums[0]), sums[1] / times, sums[2] / times, sums[3] / times / 15, sums[4] / times / 15]
-    )
-
-
-def _apart(axis: int, reach: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Two slices of an image, `reach` pixels apart along an axis."""
-    every, head, tail = slice(None), slice(None, -reach), slice(reach, None)
-    return ((head, every), (tail, every)) if axis == 0 else ((every, head), (every, tail))
+        image, limit = table[index], 6.0 * view.reading + 0.015 * view.depth
+        for apart in ((REACH_PX, 0), (0, REACH_PX)):
+            seen_across(image, (view.depth, limit, lab), apart, codes, count, sums)
+    mean = sums / np.maximum(sums[:, :1], 1.0)
+    return np.column_stack([np.log1p(sums[:, 0]), mean[:, 1:3], mean[:, 3:] / 15])

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from list3r.instances.geometric.cloud import Cloud
 from list3r.instances.learned.graph import ChunkSurface
+from list3r.instances.learned.kernels import way_costs
 
 
 @dataclass(frozen=True)
@@ -60,43 +61,9 @@ def cut_superpoints(surface: ChunkSurface, settings: SuperpointSettings | None =
 
 def _costs(surface: ChunkSurface, s: SuperpointSettings) -> NDArray[np.float32]:
     """Length of the way between neighbouring voxels. Shape (M,)."""
-    left, right = surface.pairs
-    out = np.empty(len(left), np.float32)
-    for start in range(0, len(left), BLOCK):
-        rows = slice(start, start + BLOCK)
-        out[rows] = _cost(surface, left[rows], right[rows], s)
-    return out
-
-
-BLOCK = 1 << 18
-"""Neighbours whose ways are worked out at once: a chunk has millions, which would take half its memory."""
-
-
-def _cost(
-    surface: ChunkSurface, left: NDArray[np.int32], right: NDArray[np.int32], s: SuperpointSettings
-) -> NDArray[np.float32]:
-    """Length of the way between some neighbours. Shape (B,)."""
     cloud = surface.cloud
-    n, m = cloud.normals[left], cloud.normals[right]
-    both = (n != 0).any(axis=1) & (m != 0).any(axis=1)
-    away = (cloud.points[right] - cloud.points[left]) / np.float32(cloud.voxel)
-    tone = np.square(surface.lab[left] - surface.lab[right])
-    cosine, step, way, color = (np.zeros(len(left), np.float32) for _ in range(4))
-    for k in range(3):
-        cosine += n[:, k] * m[:, k]
-        step += away[:, k] * (n[:, k] + m[:, k])
-        way += away[:, k] * away[:, k]
-        color += tone[:, k]
-    bend = np.where(both, 1.0 - np.clip(cosine, -1.0, 1.0), np.float32(0.3))
-    rise = np.where(both, np.abs(step) / np.float32(2.0), np.float32(0.0))
-    return np.asarray(
-        0.2
-        + np.sqrt(way)
-        + s.normal_weight * bend
-        + s.color_weight * np.sqrt(color)
-        + s.step_weight * np.maximum(rise - 0.5, 0.0),
-        np.float32,
-    )
+    weights = np.float32(s.normal_weight), np.float32(s.color_weight), np.float32(s.step_weight)
+    return way_costs(surface.pairs, (cloud.points, cloud.normals, surface.lab), np.float32(cloud.voxel), weights)
 
 
 def _seeds(
