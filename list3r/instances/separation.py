@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +32,39 @@ def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: flo
     when they are far apart and not in one plane.
     """
     well = [_well_visible(instance) for instance in instances]
-    trees = [cKDTree(instance.support.points) for instance in instances]
+    parts = [_Part.of(instance) for instance in instances]
     pairs = [
         (a, b)
         for a in range(len(instances))
         for b in range(a + 1, len(instances))
-        if len(well[a] & well[b]) >= frames and _two_things(instances[a], instances[b], (trees[a], trees[b]), unit)
+        if len(well[a] & well[b]) >= frames and _two_things(parts[a], parts[b], unit)
     ]
     return np.array(pairs, np.int32).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """An instance with what every comparison of it needs."""
+
+    instance: LocalInstance
+    low: NDArray[np.float32]
+    """Least corner of its box, chunk units. Shape (3,)."""
+    high: NDArray[np.float32]
+    """Greatest corner. Shape (3,)."""
+    tree: cKDTree
+    some: NDArray[np.float32]
+    """About 300 of its points, chunk units. Shape (S, 3)."""
+
+    @classmethod
+    def of(cls, instance: LocalInstance) -> _Part:
+        """Return the part that an instance is."""
+        points = instance.support.points
+        some = points[:: max(1, len(points) // 300)]
+        return cls(instance, points.min(axis=0), points.max(axis=0), cKDTree(points), some)
+
+    def small(self, unit: float) -> bool:
+        """Return whether it is small in every direction."""
+        return bool((self.high - self.low).max() < PIECE_M * unit)
 
 
 def _well_visible(instance: LocalInstance) -> set[int]:
@@ -46,13 +72,14 @@ def _well_visible(instance: LocalInstance) -> set[int]:
     return set(instance.track.frames[rows].tolist())
 
 
-def _two_things(a: LocalInstance, b: LocalInstance, trees: tuple[cKDTree, cKDTree], unit: float) -> bool:
+def _two_things(one: _Part, two: _Part, unit: float) -> bool:
+    a, b = one.instance, two.instance
     if a.plane is not None and b.plane is not None and (_on_plane(a, b, unit) or _on_plane(b, a, unit)):
         return _color_difference(a, b) > COLOR_DIFFERENCE
-    gap = _gap(a, b, trees[1], 1.1 * ROOM_M * unit) / unit
+    gap = _gap(one, two, 1.1 * ROOM_M * unit) / unit
     if gap < TOUCHING_M:
         return _stands_on(a, b, unit) or _stands_on(b, a, unit)
-    return (_small(a, unit) and _small(b, unit)) or gap > ROOM_M or a.structure or b.structure
+    return (one.small(unit) and two.small(unit)) or gap > ROOM_M or a.structure or b.structure
 
 
 def _color_difference(a: LocalInstance, b: LocalInstance) -> float:
@@ -61,17 +88,12 @@ def _color_difference(a: LocalInstance, b: LocalInstance) -> float:
     return float(np.linalg.norm(tone[0] - tone[1]))
 
 
-def _gap(a: LocalInstance, b: LocalInstance, tree: cKDTree, far: float) -> float:
+def _gap(a: _Part, b: _Part, far: float) -> float:
     """About the smallest distance of a from b, at most `far`."""
-    p, q = a.support.points, b.support.points
-    if np.linalg.norm(np.maximum(np.maximum(p.min(axis=0) - q.max(axis=0), q.min(axis=0) - p.max(axis=0)), 0.0)) > far:
+    if np.linalg.norm(np.maximum(np.maximum(a.low - b.high, b.low - a.high), 0.0)) > far:
         return far
-    distance, _ = tree.query(p[:: max(1, len(p) // 300)], distance_upper_bound=far)
+    distance, _ = b.tree.query(a.some, distance_upper_bound=far)
     return float(np.quantile(np.minimum(distance, far), 0.02))
-
-
-def _small(instance: LocalInstance, unit: float) -> bool:
-    return bool(np.ptp(instance.support.points, axis=0).max() < PIECE_M * unit)
 
 
 def _on_plane(a: LocalInstance, b: LocalInstance, unit: float) -> bool:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.compiled import compiled
 from list3r.frames.base import Camera, Frame
 from list3r.memory.masks import shown_surface
 from list3r.memory.records import Feature, FrameSamples, Keyframe, LocalLibrary
@@ -155,10 +156,30 @@ def _instances(
             k = place.get(int(index))
             if k is None:
                 continue
-            held = (np.searchsorted(np.cumsum(mask.astype(np.int64)), pixel, side="right") % 2 == 1) & (size < area[k])
-            out[k, held], area[k, held] = instance.local_id, size
+            _hold(mask, pixel, (instance.local_id, int(size)), out[k], area[k])
     most = settings.small_share * reconstruction.camera.width * reconstruction.camera.height
     return out, np.asarray(area <= most)
+
+
+@compiled
+def _hold(
+    mask: NDArray[np.uint32],
+    pixel: NDArray[np.int64],
+    held: tuple[int, int],
+    owner: NDArray[np.int32],
+    area: NDArray[np.int32],
+) -> None:
+    """Give pixels (N,), ascending, of a mask's run-length code to an instance of an area, where that is less."""
+    at, stop = 0, np.int64(0)
+    for k in range(len(mask)):
+        stop += np.int64(mask[k])
+        if k % 2 == 0:
+            at += np.searchsorted(pixel[at:], stop)
+            continue
+        while at < len(pixel) and pixel[at] < stop:
+            if held[1] < area[at]:
+                owner[at], area[at] = held
+            at += 1
 
 
 def _pixel_grid(

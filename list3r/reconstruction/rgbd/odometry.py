@@ -106,7 +106,7 @@ class CameraTracker:
 
     def _usable(self, position: int) -> bool:
         return self.frames[position].depth is not None and bool(
-            self.view(position).valid.mean() >= self.settings.least_known
+            self.view(position).known_share >= self.settings.least_known
         )
 
     def _step(self, position: int) -> None:
@@ -160,9 +160,7 @@ class CameraTracker:
 
     def _moved(self, segment: TrackedSegment, position: int) -> bool:
         step = np.linalg.inv(segment.T_segment_cam[segment.keyframes[-1]]) @ segment.T_segment_cam[position]
-        depth = self.view(position).depth
-        far = float(np.median(depth[depth > 0]))
-        return shows_more(step, far, self.settings.keyframes)
+        return shows_more(step, self.view(position).middle_depth, self.settings.keyframes)
 
     def _follow(self, segment: TrackedSegment, position: int) -> Pose | None:
         """Return the frame's pose in the segment, or None when nothing trustworthy is found."""
@@ -248,7 +246,7 @@ class CameraTracker:
     def _trusted(self, found: FrameRegistration, samples: Samples, position: int, blind: bool) -> bool:
         """Return whether a registration can be believed; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
-        share = float(view.valid.mean())
+        share = view.known_share
         agrees = found.correlation >= s.least_correlation if blind else not found.correlation < s.least_correlation
         return bool(
             agrees
@@ -256,7 +254,7 @@ class CameraTracker:
             and len(samples.points) * found.overlap >= 0.25 * s.least_overlap * view.valid.sum()
             and found.inliers >= s.least_inliers
             and found.residual <= s.most_residual
-            and found.looseness_m(float(np.median(view.depth[view.depth > 0]))) <= s.most_looseness_m
+            and found.looseness_m(view.middle_depth) <= s.most_looseness_m
         )
 
     def _possible(self, segment: TrackedSegment, last: int, found: FrameRegistration | None, gap_s: float) -> bool:
@@ -283,7 +281,7 @@ class CameraTracker:
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from motions that a slow video makes between frames."""
         view, T_last = self.view(position), segment.T_segment_cam[last]
-        far = float(np.median(view.depth[view.depth > 0]))
+        far = view.middle_depth
         samples = segment.model.samples(T_last, self.small, self.settings.sweep_samples)
         found = [
             register(samples, view, T_last @ T, self.settings.sweep, self.settings.noise)

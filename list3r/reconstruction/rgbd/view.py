@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -35,6 +35,16 @@ class WorkingFrame:
     """Where depth and normal are both known. Shape (h, w)."""
     gray: Floats
     """Brightness, 0 to 255. Shape (h, w)."""
+
+    @cached_property
+    def known_share(self) -> float:
+        """Share of the pixels with depth and normal."""
+        return float(self.valid.mean())
+
+    @cached_property
+    def middle_depth(self) -> float:
+        """Median of the depth that is known, metres."""
+        return float(np.median(self.depth[self.depth > 0]))
 
 
 @lru_cache(maxsize=8)
