@@ -54,7 +54,7 @@ class FrameFiles(Sequence[FrameFile]):
         self._packed = SpooledTemporaryFile(max_size=_HELD_BYTES)
         self._ends = array("q", [0])
         self._lock = threading.Lock()
-        self._open: tuple[int, list[FrameFile]] = (-1, [])
+        self._open: tuple[int, list[_Row]] = (-1, [])
         times_s, holds, left = array("d"), bytearray(), iter(files)
         while block := list(islice(left, _BLOCK)):
             times_s.extend(np.nan if f.time_s is None else f.time_s for f in block)
@@ -76,17 +76,18 @@ class FrameFiles(Sequence[FrameFile]):
         if isinstance(at, slice):
             return [self[k] for k in range(len(self))[at]]
         number, place = divmod(range(len(self))[at], _BLOCK)
-        return self._block(number)[place]
+        return _file(*self._block(number)[place])
 
     def __iter__(self) -> Iterator[FrameFile]:
         for number in range(len(self._ends) - 1):
-            yield from self._block(number)
+            for row in self._block(number):
+                yield _file(*row)
 
     def that_hold(self, what: int) -> NDArray[np.int64]:
         """Return the numbers of the frames that have any of `what`, ascending. Shape (K,)."""
         return np.flatnonzero(self.holds & np.uint8(what))
 
-    def _block(self, number: int) -> list[FrameFile]:
+    def _block(self, number: int) -> list[_Row]:
         with self._lock:
             if self._open[0] != number:
                 self._packed.seek(self._ends[number])
@@ -118,16 +119,23 @@ def _pack(files: Sequence[FrameFile]) -> bytes:
     return json.dumps(rows).encode() + b"\n" + b"".join(poses)
 
 
-def _unpack(packed: bytes, times_s: NDArray[np.float64]) -> list[FrameFile]:
+_Row = tuple[list[Any], NDArray[np.float64] | None, float]
+"""The plain parts of a frame, its pose, and its time, NaN for none."""
+
+
+def _unpack(packed: bytes, times_s: NDArray[np.float64]) -> list[_Row]:
     rows, _, numbers = packed.partition(b"\n")
     poses = iter(np.frombuffer(numbers, np.float64).reshape(-1, 4, 4))
-    out = []
-    for (*parts, lens, posed), time_s in zip(json.loads(rows), times_s.tolist(), strict=True):
-        color, depth, pose, confidence, mask = map(_stored, parts)
-        T = next(poses) if posed else None
-        camera = None if lens is None else Camera(**{**lens, "distortion": tuple(lens["distortion"])})
-        out.append(FrameFile(color, depth, pose, T, None if np.isnan(time_s) else time_s, confidence, mask, camera))
-    return out
+    return [
+        (row, next(poses) if row[-1] else None, t) for row, t in zip(json.loads(rows), times_s.tolist(), strict=True)
+    ]
+
+
+def _file(row: list[Any], T: NDArray[np.float64] | None, time_s: float) -> FrameFile:
+    *parts, lens, _ = row
+    color, depth, pose, confidence, mask = map(_stored, parts)
+    camera = None if lens is None else Camera(**{**lens, "distortion": tuple(lens["distortion"])})
+    return FrameFile(color, depth, pose, T, None if np.isnan(time_s) else time_s, confidence, mask, camera)
 
 
 def _plain(part: Stored | CodedArray | None) -> Any:

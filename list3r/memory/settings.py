@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from list3r.memory.errors import List3rError, MemoryFileError
@@ -25,8 +27,14 @@ def from_plain(kind: type[T], plain: object) -> T:
 
     What the class does not know, of another version, is left out. Raises `ValueError` for what does not fit.
     """
+    return _made(kind, json.dumps(plain, sort_keys=True))  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=64)
+def _made(kind: Any, text: str) -> Any:
+    """Make settings of their JSON, once: a memory is asked for them many times with every chunk."""
     try:
-        return typed(kind, plain, lenient=True)  # type: ignore[no-any-return]
+        return typed(kind, json.loads(text), lenient=True)
     except List3rError as error:
         raise ValueError(str(error)) from error
 

@@ -289,23 +289,26 @@ def _given_poses(frames: Sequence[Frame]) -> np.ndarray | None:
 
 def joint_model(task: ChunkTask) -> Reconstructor:
     """Return what reconstructs joint windows of frames of two places in the way of the chunks."""
-    known = _source(task.path, task.options).info.camera is not None
-    return _JointModel(replace(task.settings, poses="estimate"), known)
+    return _JointModel(task)
 
 
 class _JointModel:
     """A `JointModel` that is made when the first window is asked for."""
 
-    def __init__(self, settings: BuildSettings, camera_known: bool) -> None:
-        self._settings, self._camera_known = settings, camera_known
+    def __init__(self, task: ChunkTask) -> None:
+        self._task = task
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
         """Reconstruct a chunk."""
-        return _model(self._settings, self._camera_known)(frames, camera)
+        return self._made()(frames, camera)
 
     def joint(self, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
         """Reconstruct all sides in one gauge."""
-        return reconstruct_jointly(_model(self._settings, self._camera_known), sides)
+        return reconstruct_jointly(self._made(), sides)
+
+    def _made(self) -> Reconstructor:
+        known = _source(self._task.path, self._task.options).info.camera is not None
+        return _model(replace(self._task.settings, poses="estimate"), known)
 
 
 @lru_cache(maxsize=2)
