@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up, stacked
-from list3r.reconstruction.mvs.kernels import fill_holes, splat
+from list3r.reconstruction.mvs.kernels import enlarged, fill_holes, splat
 from list3r.reconstruction.mvs.settings import DepthFusionSettings
 
 
@@ -98,6 +98,15 @@ def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: floa
     Kopf et al. 2007: each large pixel takes the four small ones around it, those of its own brightness most; where
     they lie on two surfaces (`step` apart, share of depth) those of the surface that fits better.
     """
+    if full.device.type == "cpu":
+        small = depth.inverse.numpy(), depth.sigma.numpy(), np.ascontiguousarray(gray.numpy())
+        found = enlarged(small, np.ascontiguousarray(full.numpy()), np.float32(edge), np.float32(step))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+    return _enlarged_tensors(depth, gray, full, edge, step)
+
+
+def _enlarged_tensors(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: float) -> tuple[Tensor, Tensor]:
+    """Return the same on an accelerator."""
     height, width = depth.inverse.shape
     H, W = full.shape
     y = (torch.arange(H, device=full.device) + 0.5) * (height / H) - 0.5

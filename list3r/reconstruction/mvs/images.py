@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -55,9 +56,8 @@ class Warp:
         """From the pixels of `ref` into `other`; both have the same camera."""
         T = np.linalg.inv(T_chunk_other) @ T_chunk_ref
         K = camera.matrix()
-        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
-        rays = np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
-        rotated = (K @ T[:3, :3] @ np.linalg.inv(K) @ rays).reshape(3, camera.height, camera.width)
+        turned = K @ T[:3, :3] @ np.linalg.inv(K)
+        rotated = (turned @ _pixels(camera.height, camera.width)).reshape(3, camera.height, camera.width)
         return Warp(
             torch.from_numpy(rotated.astype(np.float32)).to(device),
             torch.from_numpy((K @ T[:3, 3]).astype(np.float32)).to(device),
@@ -71,6 +71,13 @@ class Warp:
         y = (self.rotated[1] + inverse_depth * self.shift[1]) / safe
         outside = torch.full((), -1e4, device=x.device)
         return torch.where(ratio > 1e-4, x, outside), y, ratio
+
+
+@lru_cache(maxsize=4)
+def _pixels(height: int, width: int) -> NDArray[np.float64]:
+    """Homogeneous places of the pixels of a picture. Shape (3, height * width)."""
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    return np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
 
 
 def stacked(images: Sequence[Tensor]) -> NDArray[np.float32]:

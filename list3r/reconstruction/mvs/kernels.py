@@ -242,3 +242,45 @@ def _share(x: np.float32, y: np.float32, n: int, height: int, width: int) -> tup
     share = (_ONE - abs(x - np.float32(column))) * (_ONE - abs(y - np.float32(row)))
     inside = 0 <= column < width and 0 <= row < height and share > _LEAST
     return share if inside else _ZERO, row, column
+
+
+@compiled
+def enlarged(
+    small: tuple[Floats, Floats, Floats], full: Floats, edge: np.float32, step: np.float32
+) -> tuple[Floats, Floats]:
+    """Return inverse depth and sigma of a map at the size of the picture `full` (H, W), see `fusion.enlarge`.
+
+    `small` is inverse depth, sigma and brightness (h, w).
+    """
+    inverse, sigma, gray = small
+    height, width = inverse.shape
+    out, unsure = np.zeros(full.shape, np.float32), np.zeros(full.shape, np.float32)
+    tall, wide = np.float32(height / full.shape[0]), np.float32(width / full.shape[1])
+    value, weight, error = np.empty(4, np.float32), np.empty(4, np.float32), np.empty(4, np.float32)
+    for v in range(full.shape[0]):
+        y = (np.float32(v) + _HALF) * tall - _HALF
+        top = np.floor(y)
+        for u in range(full.shape[1]):
+            x = (np.float32(u) + _HALF) * wide - _HALF
+            left, known, best, most = np.floor(x), 0, _ZERO, -_ONE
+            for n in range(4):
+                low, across = top + np.float32(n // 2), left + np.float32(n % 2)
+                row, column = min(max(int(low), 0), height - 1), min(max(int(across), 0), width - 1)
+                value[n], error[n], weight[n] = inverse[row, column], sigma[row, column], _ZERO
+                if value[n] > _ZERO:
+                    near = (_ONE - abs(y - low)) * (_ONE - abs(x - across))
+                    weight[n] = near * np.exp(-abs(gray[row, column] - full[v, u]) / edge) + np.float32(1e-6)
+                    known += 1
+                if weight[n] > most:
+                    best, most = value[n], weight[n]
+            if known < 2:
+                continue
+            total, mean, doubt = _ZERO, _ZERO, _ZERO
+            for n in range(4):
+                if abs(value[n] - best) < step * best:
+                    total += weight[n]
+                    mean += weight[n] * value[n]
+                    doubt += weight[n] * error[n]
+            total = max(total, np.float32(1e-12))
+            out[v, u], unsure[v, u] = mean / total, doubt / total
+    return out, unsure
