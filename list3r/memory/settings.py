@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.rows.json_values import typed
@@ -27,7 +27,8 @@ def from_plain(kind: type[T], plain: object) -> T:
 
     What the class does not know, of another version, is left out. Raises `ValueError` for what does not fit.
     """
-    return _made(kind, json.dumps(plain, sort_keys=True))  # type: ignore[no-any-return]
+    made: T = _made(cast(Any, kind), json.dumps(plain, sort_keys=True))
+    return made
 
 
 @lru_cache(maxsize=64)

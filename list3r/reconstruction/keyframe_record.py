@@ -174,7 +174,7 @@ def _hold(
     for k in range(len(mask)):
         stop += np.int64(mask[k])
         if k % 2 == 0:
-            at += np.searchsorted(pixel[at:], stop)
+            at += int(np.searchsorted(pixel[at:], stop))
             continue
         while at < len(pixel) and pixel[at] < stop:
             if held[1] < area[at]:

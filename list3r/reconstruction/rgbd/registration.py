@@ -151,12 +151,13 @@ def register(
     T = np.array(T_model_cam, dtype=np.float64)
     laid_out, seen = model.laid_out(), (frame.surface, frame.brightness)
     kernel = settings.huber, settings.photometric_weight if photometric else 0.0
-    found = None
+    found: tuple[Paired, float] | None = None
     for iteration in range(settings.iterations):
         halved = min(iteration // settings.gate_hold, settings.gate_halvings)
         gate = settings.gate_m * 0.5**halved, settings.normal_agreement, settings.least_pairs
-        *found, information, gradient = joint_equations(laid_out, T, frame.intrinsics, seen, gate, kernel)
-        if len(found[0][1]) < settings.least_pairs:
+        paired, scale, information, gradient = joint_equations(laid_out, T, frame.intrinsics, seen, gate, kernel)
+        found = paired, scale
+        if len(paired[1]) < settings.least_pairs:
             return None
         if told is not None:
             more, slope = told.normal_equations(T, view.camera.fx)
