@@ -45,7 +45,7 @@ def verify_scaled(
     if found is None:
         return rejected(keyframe_u, keyframe_v, u_id, v_id, f"no scale makes {len(a)} matched features agree")
     coarse = replace(chosen, registration=chosen.scaled_registration)
-    edge = verify(_scaled(keyframe_u, unit), _scaled(keyframe_v, found), u_id, v_id, True, coarse, later)
+    edge = verify(_scaled(keyframe_u, unit), _scaled(keyframe_v, found), u_id, v_id, coarse, later)
     spread = float(np.linalg.norm(np.ptp(np.quantile(b, [0.05, 0.95], axis=0), axis=0)))
     S = edge.S_v_u
     covariance = edge.covariance

@@ -94,7 +94,6 @@ def verify(
     keyframe_v: Keyframe,
     u_id: int,
     v_id: int,
-    metric: bool = True,
     settings: VerificationSettings | None = None,
     later: bool = False,
 ) -> Edge:
@@ -104,8 +103,6 @@ def verify(
     """
     chosen = settings or VerificationSettings()
     build = _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id)
-    if not metric:
-        return build.rejected("the chunks have no metric scale")
     matched = match(keyframe_u.keypoint_descriptors, keyframe_v.keypoint_descriptors, chosen.features.ratio)
     a, b = keyframe_u.points_cam[matched[:, 0]], keyframe_v.points_cam[matched[:, 1]]
     pose = relative_pose(a, b, chosen.features, chosen.noise)

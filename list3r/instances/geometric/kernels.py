@@ -21,7 +21,7 @@ def read_across(
     residual, seen = np.empty(depth.shape, np.float32), np.zeros(depth.shape, np.bool_)
     for row in range(height):
         for column in range(width):
-            pixel, z = _pixel(depth[row, column], row, column, camera, T_other_cam, other, image.shape)
+            pixel, z = _pixel(depth[row, column], (row, column), camera, T_other_cam, other, image.shape)
             read = image[pixel // image.shape[1], pixel % image.shape[1]] if pixel >= 0 else np.float32(0)
             residual[row, column] = read - z
             seen[row, column] = read > 0 and depth[row, column] > 0 and z > 0
@@ -49,7 +49,7 @@ def carry_labels(
         for column in range(width):
             if not depth[row, column] > 0:
                 continue
-            pixel, z = _pixel(depth[row, column], row, column, camera, T_source_cam, camera, read.shape)
+            pixel, z = _pixel(depth[row, column], (row, column), camera, T_source_cam, camera, read.shape)
             if pixel < 0:
                 continue
             there = read[pixel // width, pixel % width]
@@ -64,14 +64,14 @@ def carry_labels(
 @compiled
 def _pixel(
     depth: np.float32,
-    row: int,
-    column: int,
+    place: tuple[int, int],
     camera: Intrinsics,
     T_other_cam: Float,
     other: Intrinsics,
     shape: tuple[int, int],
 ) -> tuple[int, np.float32]:
     """Which pixel of another camera shows what one of a depth image does, -1 for none, and its depth there."""
+    row, column = place
     u, v = (np.float32(column) - camera[2]) / camera[0], (np.float32(row) - camera[3]) / camera[1]
     T = T_other_cam
     z = (T[2, 0] * u + (T[2, 1] * v + T[2, 2])) * depth + T[2, 3]
@@ -95,16 +95,22 @@ def without_lone(labels: Labels) -> tuple[Labels, Labels]:
     kept, most = np.zeros(labels.shape, np.int32), np.zeros(labels.shape, np.int32)
     for row in range(height):
         for column in range(width):
-            here, alike, greatest = labels[row, column], 0, 0
-            for y in range(max(0, row - 1), min(height, row + 2)):
-                for x in range(max(0, column - 1), min(width, column + 2)):
-                    if y != row or x != column:
-                        alike += labels[y, x] == here
-                        greatest = max(greatest, labels[y, x])
-            most[row, column] = greatest
+            alike, most[row, column] = _neighbours(labels, row, column)
             if alike >= 3:
-                kept[row, column] = here
+                kept[row, column] = labels[row, column]
     return kept, most
+
+
+@compiled
+def _neighbours(labels: Labels, row: int, column: int) -> tuple[int, np.int32]:
+    """How many of the eight neighbours of a pixel have its label, and the greatest label among them, at least 0."""
+    here, alike, greatest = labels[row, column], 0, np.int32(0)
+    for y in range(max(0, row - 1), min(labels.shape[0], row + 2)):
+        for x in range(max(0, column - 1), min(labels.shape[1], column + 2)):
+            if y != row or x != column:
+                alike += labels[y, x] == here
+                greatest = max(greatest, labels[y, x])
+    return alike, greatest
 
 
 @compiled

@@ -124,24 +124,30 @@ def seen_across(
             a, b = image[row, column], image[row + down, column + across]
             if a == b or a < 0 or b < 0:
                 continue
-            code = np.int64(min(a, b)) * count + max(a, b)
-            low, high = 0, len(codes)
-            while low < high:
-                middle = (low + high) // 2
-                if codes[middle] < code:
-                    low = middle + 1
-                else:
-                    high = middle
-            if low == len(codes) or codes[low] != code:
+            at = _place(codes, np.int64(min(a, b)) * count + max(a, b))
+            if at < 0:
                 continue
             jump = depth[row + down, column + across] - depth[row, column]
             jump = -jump if a > b else jump
             sure, first, second = limit[row, column], lab[row, column], lab[row + down, column + across]
-            sums[low, 0] += 1
-            sums[low, 1] += jump > sure
-            sums[low, 2] += jump < -sure
-            sums[low, 3] += abs(second[0] - first[0])
-            sums[low, 4] += np.hypot(abs(second[1] - first[1]), abs(second[2] - first[2]))
+            sums[at, 0] += 1
+            sums[at, 1] += jump > sure
+            sums[at, 2] += jump < -sure
+            sums[at, 3] += abs(second[0] - first[0])
+            sums[at, 4] += np.hypot(abs(second[1] - first[1]), abs(second[2] - first[2]))
+
+
+@compiled
+def _place(codes: Codes, code: int) -> int:
+    """Row of a code among ascending ones, -1 where it is not there."""
+    low, high = 0, len(codes)
+    while low < high:
+        middle = (low + high) // 2
+        if codes[middle] < code:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < len(codes) and codes[low] == code else -1
 
 
 @compiled
