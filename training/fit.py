@@ -126,7 +126,9 @@ def fit(
 
 def load_earlier(network: PieceNetwork, folder: Path) -> None:
     """Take over the weights of an earlier fit; names are matched by their words, new ones start anew."""
-    saved = torch.load(folder / "state.pt", weights_only=True)["network"]
+    state = torch.load(folder / "state.pt", weights_only=True)
+    means = {k.removeprefix("module."): v for k, v in state.get("mean", {}).items() if k.startswith("module.")}
+    saved = means or state["network"]
     row = {word: 1 + k for k, word in enumerate(json.loads((folder / "labels.json").read_text()))}
     own = network.state_dict()
     for part in ("weight", "bias"):
