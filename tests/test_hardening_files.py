@@ -14,6 +14,7 @@ from list3r.cli.app import run
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.maintenance import edits
 from list3r.memory.maintenance.repair import repair
+from list3r.memory.store.file import check_beside
 from list3r.memory.store.lock import WriterLock, lock_path
 from list3r.memory.store.store import Store
 
@@ -57,6 +58,23 @@ def test_what_is_in_the_way_of_a_writer_is_neither_followed_nor_written(
             Store.open(memory, writable=True)
         assert not place.is_file() or place.read_bytes() == PRECIOUS
     assert precious.read_bytes() == PRECIOUS and os.path.lexists(place)
+
+
+def test_a_log_that_a_writer_empties_while_it_is_looked_at_is_in_nobodys_way(
+    make_memory: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = make_memory()
+    log = memory.with_name(memory.name + "-wal")
+    log.write_bytes(b"\x37\x7f\x06\x82" + bytes(28))
+    opened = Path.open
+
+    def emptied(self: Path, *words: object, **named: object) -> object:
+        if self == log:
+            os.truncate(log, 0)
+        return opened(self, *words, **named)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(Path, "open", emptied)
+    check_beside(memory)
 
 
 def test_an_empty_file_of_the_name_of_the_lock_is_left(make_memory: Make) -> None:

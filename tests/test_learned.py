@@ -13,7 +13,6 @@ from list3r.instances.geometric.cloud import Cloud, build_cloud, pack
 from list3r.instances.geometric.planes import find_planes
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.learned import graph as graphs
-from list3r.instances.learned import superpoints
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CloudCut, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
@@ -188,7 +187,6 @@ def test_pieces_and_their_graph_are_the_same_however_much_is_worked_out_at_once(
     surface = chunk_surface(build_cloud(shown, 0.02), shown, around)
     forget_views()
     once = cut_pieces(surface)
-    monkeypatch.setattr(superpoints, "BLOCK", 1000)
     monkeypatch.setattr(graphs, "MOST_IN_TABLE", 0)
     again = cut_pieces(surface)
     assert np.array_equal(once.labels, again.labels)

@@ -263,8 +263,9 @@ def check_beside(path: Path) -> None:
             continue
         ours = stat.S_ISREG(found.st_mode) and found.st_nlink == 1
         if ours and found.st_size and starts:
-            with contextlib.suppress(PermissionError), beside.open("rb") as file:
-                ours = file.read(len(starts[0])) in starts
+            with contextlib.suppress(PermissionError, FileNotFoundError), beside.open("rb") as file:
+                head = file.read(len(starts[0]))
+                ours = not head or head in starts  # a writer may have emptied it since
         if not ours:
             raise MemoryFileError(f"{beside} has the name that {path.name} needs while it is written; move it away")
 
