@@ -53,35 +53,25 @@ def close_gaps(out: Floats, origin: NDArray[np.int32], fine: Floats, jump: float
     """
     filled = out.copy()
     height, width = out.shape
-    law = jump, noise
+    steep = np.float32(1 + 2 * jump)
     for row in range(height):
         for column in range(width):
-            value = here = out[row, column]
-            if 0 < row < height - 1:
-                ends, origins = out[row - 1 : row + 2 : 2, column], origin[row - 1 : row + 2 : 2, column]
-                value = _closed(value, here, ends, origins, fine, law)
-            if 0 < column < width - 1:
-                ends, origins = out[row, column - 1 : column + 2 : 2], origin[row, column - 1 : column + 2 : 2]
-                value = _closed(value, here, ends, origins, fine, law)
+            here = out[row, column]
+            value = here
+            if 0 < row < height - 1 and _is_gap(here, out[row - 1, column], out[row + 1, column], steep):
+                one = _one_surface(origin[row - 1, column], origin[row + 1, column], fine, jump, noise)
+                value = _between(value, out[row - 1, column], out[row + 1, column], one)
+            if 0 < column < width - 1 and _is_gap(here, out[row, column - 1], out[row, column + 1], steep):
+                one = _one_surface(origin[row, column - 1], origin[row, column + 1], fine, jump, noise)
+                value = _between(value, out[row, column - 1], out[row, column + 1], one)
             filled[row, column] = value
     return filled
 
 
 @compiled
-def _closed(
-    value: np.float32,
-    here: np.float32,
-    ends: Floats,
-    origins: NDArray[np.int32],
-    fine: Floats,
-    law: tuple[float, float],
-) -> np.float32:
-    """The value of a pixel with the gap closed between its two opposite neighbours, `ends` (2,), if it is one."""
-    before, after, none = ends[0], ends[1], np.float32(0)
-    steep = np.float32(1 + 2 * law[0])
-    if before > none and after > none and (here == none or here > steep * max(before, after)):
-        return _between(value, before, after, _one_surface(origins[0], origins[1], fine, law[0], law[1]))
-    return value
+def _is_gap(here: np.float32, before: np.float32, after: np.float32, steep: np.float32) -> bool:
+    """Whether a pixel between two that are known is not, or lies far behind them."""
+    return bool(before > 0 and after > 0 and (here == 0 or here > steep * max(before, after)))
 
 
 @compiled

@@ -252,57 +252,35 @@ def enlarged(
 
     `small` is inverse depth, sigma and brightness (h, w).
     """
-    height, width = small[0].shape
-    out, unsure = np.zeros(full.shape, np.float32), np.zeros(full.shape, np.float32)
-    tall, wide = np.float32(height / full.shape[0]), np.float32(width / full.shape[1])
-    near = np.empty((3, 4), np.float32)
-    for v in range(full.shape[0]):
-        y = (np.float32(v) + _HALF) * tall - _HALF
-        for u in range(full.shape[1]):
-            x = (np.float32(u) + _HALF) * wide - _HALF
-            known, best = _four(small, (y, x), full[v, u], edge, near)
-            if known >= 2:
-                out[v, u], unsure[v, u] = _of_one_surface(near, best, step)
-    return out, unsure
-
-
-@compiled
-def _four(
-    small: tuple[Floats, Floats, Floats],
-    place: tuple[np.float32, np.float32],
-    tone: np.float32,
-    edge: np.float32,
-    near: Floats,
-) -> tuple[int, np.float32]:
-    """Write value, sigma and weight of the four pixels around a place (row, column) of a map into `near` (3, 4).
-
-    Returns how many are known, and the value of the one with most weight.
-    """
     inverse, sigma, gray = small
     height, width = inverse.shape
-    y, x = place
-    top, left, known, best, most = np.floor(y), np.floor(x), 0, _ZERO, -_ONE
-    for n in range(4):
-        low, across = top + np.float32(n // 2), left + np.float32(n % 2)
-        row, column = min(max(int(low), 0), height - 1), min(max(int(across), 0), width - 1)
-        near[0, n], near[1, n], near[2, n] = inverse[row, column], sigma[row, column], _ZERO
-        if near[0, n] > _ZERO:
-            share = (_ONE - abs(y - low)) * (_ONE - abs(x - across))
-            near[2, n] = share * np.exp(-abs(gray[row, column] - tone) / edge) + np.float32(1e-6)
-            known += 1
-        if near[2, n] > most:
-            best, most = near[0, n], near[2, n]
-    return known, best
-
-
-@compiled
-def _of_one_surface(near: Floats, best: np.float32, step: np.float32) -> tuple[np.float32, np.float32]:
-    """Weighted means of value and sigma of those of four pixels that are of the surface of the best one."""
-    total, mean, doubt = _ZERO, _ZERO, _ZERO
-    for n in range(4):
-        if abs(near[0, n] - best) < step * best:
-            total += near[2, n]
-            mean += near[2, n] * near[0, n]
-            doubt += near[2, n] * near[1, n]
-    total = max(total, np.float32(1e-12))
-    return mean / total, doubt / total
+    out, unsure = np.zeros(full.shape, np.float32), np.zeros(full.shape, np.float32)
+    tall, wide = np.float32(height / full.shape[0]), np.float32(width / full.shape[1])
+    value, weight, error = np.empty(4, np.float32), np.empty(4, np.float32), np.empty(4, np.float32)
+    for v in range(full.shape[0]):
+        y = (np.float32(v) + _HALF) * tall - _HALF
+        top = np.floor(y)
+        for u in range(full.shape[1]):
+            x = (np.float32(u) + _HALF) * wide - _HALF
+            left, known, best, most = np.floor(x), 0, _ZERO, -_ONE
+            for n in range(4):
+                low, across = top + np.float32(n // 2), left + np.float32(n % 2)
+                row, column = min(max(int(low), 0), height - 1), min(max(int(across), 0), width - 1)
+                value[n], error[n] = inverse[row, column], sigma[row, column]
+                near = (_ONE - abs(y - low)) * (_ONE - abs(x - across))
+                alike = np.exp(-abs(gray[row, column] - full[v, u]) / edge) if value[n] > _ZERO else _ZERO
+                weight[n] = near * alike + np.float32(1e-6) if value[n] > _ZERO else _ZERO
+                known += value[n] > _ZERO
+                best = value[n] if weight[n] > most else best
+                most = max(most, weight[n])
+            if known < 2:
+                continue
+            total, mean, doubt = _ZERO, _ZERO, _ZERO
+            for n in range(4):
+                share = weight[n] if abs(value[n] - best) < step * best else _ZERO
+                total += share
+                mean += share * value[n]
+                doubt += share * error[n]
+            total = max(total, np.float32(1e-12))
+            out[v, u], unsure[v, u] = mean / total, doubt / total
+    return out, unsure
