@@ -55,6 +55,8 @@ def _nodes(
     for node in parent.iterfind("c:node", _NS):
         matrix = node.find("c:matrix", _NS)
         own = np.array(matrix.text.split(), float).reshape(4, 4) if matrix is not None and matrix.text else np.eye(4)
+        if not np.isfinite(own).all():
+            continue
         yield node, T @ own
         yield from _nodes(root, node, T @ own)
         for instance in node.iterfind("c:instance_node", _NS):

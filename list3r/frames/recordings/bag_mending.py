@@ -276,7 +276,7 @@ def _looked_through(
 def _times(file: BinaryIO, index: _Record) -> list[tuple[int, int]]:
     """Return seconds and nanoseconds of the messages that an index names."""
     file.seek(index.data)
-    data = file.read(12 * index.number(b"count"))
+    data = file.read(min(12 * index.number(b"count"), index.stop - index.data))
     return [(s, ns) for s, ns, _ in struct.iter_unpack("<III", data[: len(data) // 12 * 12])]
 
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from list3r.instances.geometric.fusion import View
-from list3r.instances.geometric.kernels import components, meeting, sums_by
+from list3r.instances.geometric.kernels import meeting, sums_by
 
 Float = NDArray[np.float32]
 
@@ -129,5 +131,6 @@ def component_numbers(
     left: NDArray[np.int64], right: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Connected components of a graph given by its edges: the number of each of `count` nodes, and the sizes."""
-    number = components(left.astype(np.int64), right.astype(np.int64), count)
+    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count))
+    number = np.asarray(connected_components(graph, directed=False)[1], np.int64)
     return number, np.bincount(number, minlength=1)

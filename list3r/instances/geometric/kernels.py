@@ -161,33 +161,6 @@ def meeting(keys: NDArray[np.int64], shift: int) -> tuple[NDArray[np.int64], NDA
 
 
 @compiled
-def components(left: NDArray[np.int64], right: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Connected component of each of `count` nodes of a graph, numbered in order of their first nodes."""
-    parent = np.arange(count)
-    for k in range(len(left)):
-        a, b = left[k], right[k]
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
-        parent[max(a, b)] = min(a, b)
-    found = 0
-    number = np.empty(count, np.int64)
-    for k in range(count):
-        root = k
-        while parent[root] != root:
-            root = parent[root]
-        parent[k] = root
-        if root == k:
-            number[k], found = found, found + 1
-        else:
-            number[k] = number[root]
-    return number
-
-
-@compiled
 def sums_by(own: NDArray[np.int64], values: NDArray[np.floating], count: int) -> NDArray[np.float64]:
     """Sums of the rows of `values` (N, C) that belong to each of `count` owners. Shape (count, C)."""
     out = np.zeros((count, values.shape[1]))

@@ -22,7 +22,7 @@ def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings
     law = noise.constant_m, noise.quadratic_per_m, noise.nearest_m, settings.half_sigma_m
     edge = 2 * settings.edge_step, settings.edge_confidence
     found = _confidence(depth, cv2.dilate(depth, window) - lowest, _facing(depth, camera, settings), law, edge)
-    return _halves(found.view(np.uint32), np.float32(0.5)).view(np.float16)
+    return found.astype(np.float16)
 
 
 @compiled
@@ -42,28 +42,6 @@ def _confidence(
                 sigma = (law[0] + law[1] * (z - law[2]) * (z - law[2])) / law[3]
                 found = facing[row, column] / (1 + sigma * sigma)
                 out[row, column] = found * edge[1] if relief[row, column] > edge[0] * z else found
-    return out
-
-
-@compiled
-def _halves(bits: NDArray[np.uint32], half: np.float32) -> NDArray[np.uint16]:
-    """Bits of the nearest half-precision numbers to single-precision ones in [0, 1]; ties to even. Shape (H, W).
-
-    What is less than 2^-14 has no exponent of its own: `half` added to it rounds it to a multiple of 2^-24.
-    """
-    out, low = np.empty(bits.shape, np.uint16), np.empty(1, np.float32)
-    for row in range(bits.shape[0]):
-        for column in range(bits.shape[1]):
-            here = bits[row, column]
-            if here >= np.uint32(0x38800000):
-                odd = (here >> np.uint32(13)) & np.uint32(1)
-                out[row, column] = (here - np.uint32(0x38000000) + np.uint32(0xFFF) + odd) >> np.uint32(13)
-            elif here == 0:
-                out[row, column] = 0
-            else:
-                low.view(np.uint32)[0] = here
-                low[0] += half
-                out[row, column] = low.view(np.uint32)[0] - np.uint32(0x3F000000)
     return out
 
 
