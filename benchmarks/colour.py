@@ -158,7 +158,7 @@ def blank_share(colour: Path) -> float:
 def depth_errors(reconstructions: Path, walk: Path) -> dict[str, float]:
     """Share of pixels with depth and errors after one scale for each chunk, on every third pixel."""
     known, ratios = [], []
-    for path in sorted(reconstructions.glob("parts-*.npz")):
+    for path in sorted(reconstructions.glob("*.npz")):
         for part in read_kept(path):
             rows = np.flatnonzero(part.posed)[::5]
             frames = part.frame_indices[rows].tolist()
