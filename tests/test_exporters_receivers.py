@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import html.parser
+import importlib
 import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import networkx
@@ -48,6 +50,21 @@ def test_graphml_says_what_the_store_says(room: Path, tmp_path: Path) -> None:
     assert "label" not in graph.nodes[TABLE] and "\\u202e" in graph.nodes[MUG]["label"]
     assert networkx.read_graphml(merges).number_of_nodes() == 6
     assert b"None" not in first.read_bytes()
+
+
+def test_every_format_counts_what_the_store_counts(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pxr")
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / "benchmarks")
+    receivers = importlib.import_module("receivers")
+    row = receivers.examined(room, tmp_path, nvidia=False)
+    assert row["sound"] and row["instances"] == 6 and {"json", "csv", "graphml", "usd"} <= set(row["agree"])
+    with list3r.open(room) as memory:
+        wanted = receivers.stored(memory)
+    found = receivers.read_usd(tmp_path / "points.usdc")
+    assert receivers.agrees(wanted, found) and receivers.off(wanted, found) < 1e-6
+    assert not receivers.agrees(wanted, replace(found, relations=found.relations[1:]))
+    assert receivers.off(wanted, replace(found, corners={k: c + 0.01 for k, c in found.corners.items()})) > 0.009
+    assert receivers.off(wanted, replace(found, corners={MUG: found.corners[MUG]})) == float("inf")
 
 
 def test_node_link_is_read_by_networkx(room: Path, tmp_path: Path) -> None:
