@@ -22,6 +22,8 @@ from tests.conftest import box_points, chunk_result, instance, local_instance, w
 pxr = pytest.importorskip("pxr")
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade  # noqa: E402
 
+from list3r.exporters.simready.assembly import SimreadySettings, write_simready  # noqa: E402
+
 TABLE, MUG, WALL = 2, 3, 6
 
 
@@ -156,6 +158,18 @@ def test_nothing_is_made_up(room: Path, tmp_path: Path, make_memory: Callable[..
         memory.export("simready", tmp_path / "other")
     assert run(["export", str(room), "--to", "simready", "--out", str(tmp_path / "d"), "--density", "-3"]) == 2
     assert not (tmp_path / "d").exists()
+
+
+def test_only_the_things_that_are_asked_for(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["export", str(room), "--to", "simready", "--out", str(tmp_path / "some")]
+    assert run([*words, "--ids", "3, 5"]) == 0
+    assert {p.name for p in (tmp_path / "some").iterdir() if p.is_dir()} == {"mug_3", "chair_5"}
+    for ids, told in (("1", "#1: structure"), ("99", "99"), ("3;5", "such as 3,7,12")):
+        capsys.readouterr()
+        assert run([*words[:-1], str(tmp_path / "none"), "--ids", ids]) == 2
+        assert told in capsys.readouterr().err and not (tmp_path / "none").exists()
+    with list3r.open(room) as memory, pytest.raises(OptionError, match=r"has 4 things; 2 props at most .* --ids"):
+        write_simready(memory.store, tmp_path / "none", SimreadySettings(most=2))
 
 
 def test_names_of_props_are_plain(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def read_components(store: Store) -> list[Component]:
 
 def thinned_support(store: Store, instance: Instance, limit: int | None) -> Support:
     """Return the surface points in the world, at most `limit` of them, finite; the same ones every time."""
-    support = store.surfaces.of(instance.id)
+    support = store.surfaces.of_instance(instance)
     keep = np.flatnonzero(np.isfinite(support.points).all(axis=1))
     if limit is not None and len(keep) > limit:
         keep = np.sort(np.random.default_rng(instance.id).choice(keep, limit, replace=False))
@@ -74,7 +74,8 @@ def point_spacing(points: NDArray[np.float32]) -> float:
     if not extent[0] > 0:
         return 0.01
     cell = max(np.sqrt(extent[0] * max(extent[1], extent[0] / 50) * 16 / len(points)), extent[0] / 500)
-    occupied = np.unique(np.floor((points - points.min(axis=0)) / cell).astype(np.int64), axis=0)
+    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    occupied = np.unique(at @ [1 << 20, 1 << 10, 1])  # a side has 500 cells at most
     return float(np.sqrt(len(occupied) * cell**2 / len(points)))
 
 

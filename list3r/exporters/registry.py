@@ -28,6 +28,7 @@ class ExportOptions(TypedDict, total=False):
     mesh: bool | None
     colliders: bool | None
     density: float | None
+    ids: tuple[int, ...] | None
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ FORMATS: dict[str, Format] = {
         (),
         "a prop for each instance and a scene of them, for simulators",
         settings="SimreadySettings",
-        options=("density",),
+        options=("density", "ids"),
         address_space_mb=USD_MB,
     ),
     "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),

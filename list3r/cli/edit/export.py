@@ -43,6 +43,20 @@ class ExportWords:
     density: float | None = field(
         default=None, metadata=option("simready: kg per cubic metre of the hull, for an estimated mass.", "KG/M3")
     )
+    ids: str | None = field(default=None, metadata=option("simready: only these things, such as 3,7,12.", "ID,..."))
+
+    def given(self) -> dict[str, Any]:
+        """Return the options that are not left out. Raises `OptionError`."""
+        options = {name: value for name, value in asdict(self).items() if value not in (None, False)}
+        return options if self.ids is None else {**options, "ids": _ids(self.ids)}
+
+
+def _ids(text: str) -> tuple[int, ...]:
+    from list3r.memory.errors import OptionError
+
+    if not all(word.strip().isdecimal() for word in text.split(",")):
+        raise OptionError(f"--ids {text}: numbers with commas are needed, such as 3,7,12")
+    return tuple(map(int, text.split(",")))
 
 
 @spread
@@ -65,7 +79,7 @@ def export(
     """
     from list3r.memory.errors import OptionError
 
-    options = {name: value for name, value in asdict(words).items() if value not in (None, False)}
+    options = words.given()
     if out == Path("-"):
         if json:
             raise OptionError("--out - takes standard output, --json too; leave one of them out")

@@ -29,6 +29,10 @@ class SimreadySettings:
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for no mass and no rigid body."""
+    ids: tuple[int, ...] | None = None
+    """Of the things that become props; None for all."""
+    most: int = 10_000
+    """Props of one export: minutes of work and 0.7 GB."""
 
     def __post_init__(self) -> None:
         if self.density is not None and not 0 < self.density < 1e6:
@@ -40,7 +44,8 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
 
     Props have a closed mesh, a material, labels, a collider, a thumbnail and metadata; with a density a rigid body
     whose mass is an estimate, marked so. Structure is fixed and lies in the scene. What was seen to move, is gone, or
-    has too few points for a mesh has no prop. Raises `OptionError` for a memory without scale.
+    has too few points for a mesh has no prop. Raises `OptionError` for a memory without scale, for more props than
+    `most`, and for ids that allow none.
     """
     folder, settings = Path(folder), settings or SimreadySettings()
     if units(store) != "m":
@@ -48,21 +53,39 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
             f"{store.path.name} has no metric scale, which a simulator needs: `list3r scale --anchor` gives it one"
         )
     facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density)
-    main = read_components(store)[0]
+    things, structure = _chosen(store, settings)
     with replacing_folder(folder, "simready") as temporary, errors_of_disk(folder):
-        props: list[Prop] = []
-        fixed: list[tuple[Instance, InstanceMesh]] = []
-        for i in main.instances:
-            if i.state == "removed" or not has_box(i) or (mesh := instance_mesh(store, i)) is None:
-                continue
-            if i.structure is not None:
-                fixed.append((i, mesh))
-            elif not i.dynamic:
-                props.append(write_prop(temporary, i, mesh, facts))
+        meshes = ((i, instance_mesh(store, i)) for i in things)
+        props = [write_prop(temporary, i, mesh, facts) for i, mesh in meshes if mesh is not None]
+        if settings.ids is not None and len(props) < len(things):
+            bare = sorted({i.id for i in things} - {p.instance_id for p in props})
+            raise OptionError(f"{_told(bare)}: too few surface points for a mesh; leave it out of the ids")
+        fixed = [(i, mesh) for i in structure if (mesh := instance_mesh(store, i)) is not None]
         stage = Usd.Stage.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
         _fill_scene(stage, props, fixed)
         stage.GetRootLayer().Save()
     return tuple(sorted(p for p in folder.rglob("*") if p.is_file()))
+
+
+def _chosen(store: Store, settings: SimreadySettings) -> tuple[list[Instance], list[Instance]]:
+    """Return the things of the main component that become props where they have a mesh, and its structure."""
+    there = [i for i in read_components(store)[0].instances if i.state != "removed" and has_box(i)]
+    things = [i for i in there if i.structure is None and not i.dynamic]
+    if settings.ids is not None:
+        wanted = {store.instances.get(n).id for n in settings.ids}
+        if bare := sorted(wanted - {i.id for i in things}):
+            raise OptionError(f"{_told(bare)}: structure, gone, moving or placed apart; leave it out of the ids")
+        things = [i for i in things if i.id in wanted]
+    if len(things) > settings.most:
+        raise OptionError(
+            f"{store.path.name} has {len(things):,} things; {settings.most:,} props at most are written at once: "
+            "choose by --ids, such as those of `list3r query within --json`"
+        )
+    return things, [i for i in there if i.structure is not None]
+
+
+def _told(ids: Sequence[int]) -> str:
+    return ", ".join(f"#{n}" for n in ids[:10]) + (f" and {len(ids) - 10} more" if len(ids) > 10 else "")
 
 
 def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[Instance, InstanceMesh]]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameRow, Observation, Support
+from list3r.memory.records import FrameRow, Instance, Observation, Support
 from list3r.memory.store.tables.chunks import Chunks
 from list3r.memory.store.tables.edges import Bends
 from list3r.memory.store.tables.events import Events
@@ -57,7 +57,10 @@ class Surfaces:
 
         Raises `UnknownIdError`.
         """
-        instance = self._instances.get(instance_id)
+        return self.of_instance(self._instances.get(instance_id))
+
+    def of_instance(self, instance: Instance) -> Support:
+        """Return `of` for an instance that was read."""
         parts = self._supports.of(instance.id)
         found = Support(
             self._in_world([(p.chunk_id, p.support.points) for p in parts]),
