@@ -11,18 +11,23 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import BadFrame, Frame, missing_parts
+from list3r.frames.decoding.decode import sure_depth
 from list3r.frames.inspection import SourceReport
 from list3r.frames.options import SourceOptions
+from list3r.frames.readers.phones.record3d import PhoneCamera
 from list3r.frames.source import open_source
 from list3r.memory.errors import List3rError, SourceError
 from tests.recordings import (
     COUNT,
+    DEPTH_HEIGHT,
+    DEPTH_WIDTH,
     WITH_DEPTH,
     arkit,
     off_plane,
     png,
     put,
     shots,
+    write_arkitscenes,
     write_colmap,
     write_euroc,
     write_nerfstudio,
@@ -83,6 +88,37 @@ def test_what_the_sensor_is_not_sure_of_is_unknown(tmp_path: Path) -> None:
     assert sure is not None and half is not None
     width = sure.shape[1]
     assert (half[:, : width // 2 - 2] == 0).all() and (half[:, width // 2 + 3 :] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("code", [1, 127])
+@pytest.mark.parametrize("write", [write_stray, write_polycam, write_arkitscenes])
+def test_confidence_in_either_code_says_the_same(write: Callable[[Path], Path], code: int, tmp_path: Path) -> None:
+    path = write(tmp_path / "walk")
+    files = [p for p in path.rglob("*.png") if p.parent.name == "confidence"]
+    levels = np.tile(np.repeat(np.array([0, 1, 2], np.uint8), DEPTH_WIDTH // 3), (DEPTH_HEIGHT, 1))
+    levels = np.pad(levels, ((0, 0), (0, DEPTH_WIDTH - levels.shape[1])), mode="edge")
+    for file in files:
+        put(file, png((levels * np.float32(code if code == 1 else 127.5)).astype(np.uint8)))
+    depth = frames_of(path)[0].depth
+    assert depth is not None
+    third = depth.shape[1] // 3
+    assert (depth[:, : third - 4] == 0).all() and (depth[:, third + 4 :] > 0).mean() > 0.9
+    for file in files:
+        put(file, png(np.zeros((DEPTH_HEIGHT, DEPTH_WIDTH), np.uint8)))
+    assert any("sure of no depth" in note for note in open_source(path).info.notes)
+
+
+def test_half_sure_in_either_code_is_not_sure(tmp_path: Path) -> None:
+    raw = np.full((1, 3), 7, np.uint16)
+    for code in (np.array([[0, 1, 2]], np.uint8), np.array([[0, 127, 255]], np.uint8)):
+        assert sure_depth(raw, code, 1).tolist() == [[0, 7, 7]] and sure_depth(raw, code, 2).tolist() == [[0, 0, 7]]
+
+
+def test_the_front_camera_of_a_phone_has_no_poses(tmp_path: Path) -> None:
+    info = open_source(write_record3d(tmp_path, poses=[[0, 0, 0, 1, 0, 0, 0]] * COUNT)).info
+    assert not info.has_poses and info.has_depth and any("front camera" in note for note in info.notes)
+    size = {"w": 720, "h": 960, "dw": 720, "dh": 960, "K": [600, 0, 0, 0, 600, 0, 360, 480, 1]}
+    assert PhoneCamera.of(tmp_path, size).depth_size == (960, 720)
 
 
 def test_an_unpacked_recording_reads_as_the_file_does(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Frame, SourceInfo
-from list3r.frames.pose_agreement import CONVENTIONS, depth_factor, wrong_convention
+from list3r.frames.pose_agreement import CONVENTIONS, depth_factor, scale_doubts, wrong_convention
 from list3r.frames.source import open_source
 from list3r.memory.errors import SourceError
 from list3r.pipeline.session import check_convention
@@ -97,3 +97,8 @@ def test_depth_in_another_unit_than_its_poses_is_told(times: float, frames: list
     told = [replace(f, depth=np.float32(times) * f.depth) for f in frames if f.depth is not None]
     found = depth_factor(Walk(told))  # type: ignore[arg-type]
     assert found is None if 0.7 < times < 1.5 else found == pytest.approx(1 / times, rel=0.1)
+
+
+def test_disparity_is_told_from_depth(frames: list[Frame]) -> None:
+    told = [replace(f, depth=(f.depth > 0) * np.float32(3) / np.maximum(f.depth, 1e-3)) for f in frames]
+    assert "disparity" in scale_doubts(Walk(told))[0]  # type: ignore[arg-type]

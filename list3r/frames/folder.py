@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from collections import Counter
@@ -15,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
-from list3r.frames.decoding.decode import clean_depth, fault_of, read_color, read_gray, read_raw_depth, used_bits
+from list3r.frames.decoding.decode import (
+    clean_depth,
+    fault_of,
+    read_color,
+    read_gray,
+    read_raw_depth,
+    sure_depth,
+    used_bits,
+)
 from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
@@ -34,6 +43,7 @@ _POSES_TRIED = 50
 _FILES_TRIED = 12
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
+NOWHERE_SURE = "the sensor is sure of no depth that was looked at; is `confidence` of this recording?"
 _LEAST_UPRIGHT = 0.4
 """Least z of the cameras' mean up, where z is up: people film level or look down at most by some 60 degrees."""
 
@@ -155,7 +165,7 @@ class FolderSource:
         confidence = read_raw_depth(file.confidence)
         if confidence.shape != raw.shape:
             confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        return np.where(confidence >= least, raw, np.zeros((), raw.dtype))
+        return sure_depth(raw, confidence, least)
 
     def _time_s(self, number: int, file: FrameFile) -> float:
         return file.time_s if self._clock and file.time_s is not None else number / self._fps
@@ -247,11 +257,20 @@ class FolderSource:
 
     def _depth_doubts(self) -> tuple[str, ...]:
         typical_m = self._typical_raw / self._rig.depth_scale
-        if not self._has_depth or _LEAST_M <= typical_m <= _MOST_M:
+        if not self._has_depth:
             return ()
+        if _LEAST_M <= typical_m <= _MOST_M:
+            return (NOWHERE_SURE,) if self._nowhere_sure() else ()
         if typical_m == 0:
             return ("the depth that was looked at is unknown everywhere (all 0, or all of the largest value)",)
         return (f"depth is {typical_m:.3g} m in the middle of its range, hardly indoors: --depth-scale may be wrong",)
+
+    def _nowhere_sure(self) -> bool:
+        """Whether no frame that is looked at has depth that the sensor is sure enough of."""
+        some = [f for f in self._some_that_hold(DEPTH) if f.confidence is not None]
+        with contextlib.suppress(FrameError):
+            return bool(some) and not any(self._sure(read_raw_depth(f.depth), f).any() for f in some if f.depth)
+        return False
 
     def _pose_doubts(self) -> tuple[str, ...]:
         """Of poses that are given, spread over the source, those that are no rigid motion."""

@@ -64,7 +64,7 @@ class FolderLayout:
     notes: tuple[str, ...] = field(default=())
     missing: tuple[str, ...] = field(default=())
     least_confidence: int | None = None
-    """Depth whose confidence is stored as less than this is unknown; None where there is no confidence."""
+    """Depth whose confidence (0, 1, 2) is less than this is unknown; None where there is no confidence."""
     poses_metric: bool = True
     """Whether given poses are in metres."""
     z_up: bool = False

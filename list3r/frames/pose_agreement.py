@@ -46,6 +46,8 @@ class AgreementSettings:
     """Depth that is as many times off is told; a wrong focal length alone makes less."""
     spread: float = 0.25
     """Six of ten matches must agree on one factor within this share."""
+    relief: float = 0.08
+    """Deviation of the logarithms of depth from which on it can be told whether they rise or fall together."""
     good: float = 0.75
     """Another convention is meant where at least this share agrees in it,"""
     gain: float = 0.2
@@ -87,23 +89,26 @@ def wrong_convention(source: FrameSource, settings: AgreementSettings | None = N
 def depth_factor(source: FrameSource, settings: AgreementSettings | None = None) -> float | None:
     """Return what depth must be multiplied by for pixels to move as the given poses say, where that is far from 1.
 
-    None where it is near, or where it cannot be told: without depth, metric poses or motion, or where matches disagree.
+    Infinite where depth falls with what they say, as disparity does. None where it is near 1, or where it cannot be
+    told: without depth, metric poses or motion, or where matches disagree.
     """
     s, info = settings or AgreementSettings(), source.info
     if not (info.has_depth and info.has_poses and info.camera is not None and info.poses_metric):
         return None
     starts = np.linspace(0, max(0, info.frame_count - 2), s.pairs).astype(int).tolist()
     pairs = [pair for start in starts if (pair := _pair(source, start, s)) is not None]
-    factors = np.concatenate([np.zeros(0), *(_factors(*pair, info.camera, s) for pair in pairs)])
+    stated, factors = np.concatenate([np.zeros((2, 0)), *(_factors(*p, info.camera, s) for p in pairs)], axis=1)
     if len(factors) < s.least_matches:
         return None
+    if _falls(stated, stated * factors, s):
+        return float("inf")
     middle = float(np.median(factors))
     agree = middle > 0 and float((np.abs(factors / middle - 1) < s.spread).mean()) > 0.6
     return middle if agree and max(middle, 1 / middle) >= s.factor else None
 
 
 def _factors(a: Frame, b: Frame, camera: Camera, s: AgreementSettings) -> NDArray[np.float64]:
-    """Return for each match of two frames what a's depth must be multiplied by for it to fall on b's. Shape (M,).
+    """Return for each match of two frames a's depth, and what it must be multiplied by to fall on b's. Shape (2, M).
 
     Of a ray r with depth z and the ray q of its match, k z R r + t is parallel to q: q x (R r) k z = -q x t.
     """
@@ -120,7 +125,16 @@ def _factors(a: Frame, b: Frame, camera: Camera, s: AgreementSettings) -> NDArra
     told = (off * camera.fx < s.epipolar_px) & (np.linalg.norm(moved, axis=1) * camera.fx > s.parallax_px) & (z > 0)
     across = np.cross(q[told], turned[told])
     factors: NDArray[np.float64] = -(across * np.cross(q[told], t)).sum(axis=1) / (z[told] * (across**2).sum(axis=1))
-    return factors
+    return np.stack([z[told], factors])
+
+
+def _falls(stated: NDArray[np.float64], meant: NDArray[np.float64], s: AgreementSettings) -> bool:
+    """Tell whether depth falls where what it should be rises."""
+    known = meant > 0
+    logs = np.log(np.stack([stated[known], meant[known]]))
+    return logs.shape[1] >= s.least_matches and bool(
+        logs.std(axis=1).min() > s.relief and np.corrcoef(logs)[0, 1] < -0.5
+    )
 
 
 def _matches(a: Frame, b: Frame, s: AgreementSettings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -149,6 +163,10 @@ def scale_doubts(source: FrameSource, settings: AgreementSettings | None = None)
     factor = depth_factor(source, settings)
     if factor is None:
         return ()
+    if np.isinf(factor):
+        return (
+            "depth grows where the motion of what is seen says that things are nearer: is it disparity (1 / depth)?",
+        )
     how = f"{factor:.2g} times as far away" if factor > 1 else f"{1 / factor:.2g} times as near"
     units = source.info.depth_scale
     fix = "" if units is None else f": --depth-scale {float(f'{units / factor:.2g}'):g} would fit, it is {units:g}"

@@ -58,7 +58,7 @@ EXTRA_OF_PACKAGE = {
     "cv2": "build",
     "numba": "build",
     "av": "build",
-    "PIL": "build",
+    "PIL": "export",
     "tqdm": "build",
     "threadpoolctl": "build",
     "torch": "colour",

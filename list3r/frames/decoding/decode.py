@@ -73,6 +73,12 @@ def read_raw_depth(path: Stored | CodedArray) -> NDArray[Any]:
     return raw
 
 
+def sure_depth(raw: NDArray[Any], confidence: NDArray[Any], least: int) -> NDArray[Any]:
+    """Return depth as stored, 0 where ARKit was less sure than `least` (0, 1, 2; some apps store 0, 127, 255)."""
+    levels = confidence if confidence.max(initial=0) <= 2 else np.rint(confidence / 127.5)
+    return np.where(levels >= least, raw, np.zeros((), raw.dtype))
+
+
 def clean_depth(raw: NDArray[Any], scale: float, max_depth_m: float | None) -> NDArray[np.float32]:
     """Depth in metres, 0 where unknown.
 

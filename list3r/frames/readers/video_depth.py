@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,13 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
-from list3r.frames.decoding.decode import read_raw_depth
+from list3r.frames.decoding.decode import read_raw_depth, sure_depth
+from list3r.frames.folder import NOWHERE_SURE
 from list3r.frames.layout import Optics
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
 from list3r.memory.errors import FrameError
+
+_FRAMES_TRIED = 12
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,15 @@ class VideoWithDepth:
         confidence = read_raw_depth(path)
         if confidence.shape != raw.shape:
             raise FrameError(f"{path.name}: confidence and depth are of different sizes")
-        return np.where(confidence >= self._parts.least_confidence, raw, np.zeros((), raw.dtype))
+        return sure_depth(raw, confidence, self._parts.least_confidence)
+
+    def _doubts(self) -> tuple[str, ...]:
+        """Return what looks wrong with depth, of some frames spread over the recording."""
+        numbers = sorted(self._parts.depth)
+        some = numbers[:: max(1, len(numbers) // _FRAMES_TRIED)]
+        with contextlib.suppress(FrameError):
+            return () if not some or any(self._sure(k).any() for k in some) else (NOWHERE_SURE,)
+        return ()
 
     def _describe(self, root: Path) -> SourceInfo:
         info, parts, registration = self._video.info, self._parts, self._rig.registration
@@ -112,7 +124,7 @@ class VideoWithDepth:
             depth_camera=registration.depth_camera if registration else None,
             T_color_depth=registration.T_color_depth if registration else None,
             depth_scale=self._rig.depth_scale if parts.depth else None,
-            notes=(*info.notes, parts.note),
+            notes=(*info.notes, parts.note, *self._doubts()),
             missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=parts.z_up,
             poses_drift=parts.poses_drift,

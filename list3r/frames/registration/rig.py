@@ -187,7 +187,20 @@ def _camera(
         raise OptionError(
             f"{name}: centre ({cx:g}, {cy:g}) lies outside the image of {_size(size)}; give those of such pictures"
         )
+    if _off_middle(cx, cy, width, height) > _OFF_MIDDLE and _off_middle(cx, cy, height, width) < _IN_MIDDLE:
+        raise OptionError(
+            f"{name}: centre ({cx:g}, {cy:g}) is the middle of pictures of {height}x{width}, and these are "
+            f"{_size(size)}: give the camera of the pictures as they stand upright"
+        )
     return Camera(width, height, fx, fy, cx, cy, distortion)
+
+
+_OFF_MIDDLE, _IN_MIDDLE = 0.1, 0.05
+"""A camera's centre from the middle, as a share of the side: of pictures turned by a quarter, and of its own."""
+
+
+def _off_middle(cx: float, cy: float, width: int, height: int) -> float:
+    return max(abs(cx / width - 0.5), abs(cy / height - 0.5))
 
 
 def _size(shape: tuple[int, ...]) -> str:

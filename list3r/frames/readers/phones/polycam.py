@@ -17,8 +17,8 @@ from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit
 from list3r.memory.errors import OptionError, SourceError
 
-LEAST_CONFIDENCE = 127
-"""Depth of confidence 0 is unknown (stored 0, 127, 255)."""
+LEAST_CONFIDENCE = 1
+"""Depth of confidence 0 is unknown (stored 0, 127, 255 for 0, 1, 2)."""
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:

@@ -2,7 +2,8 @@
 
 `metadata` is JSON: `K` has nine numbers column by column for pictures of `w` x `h`, depth has `dw` x `dh`; `poses` are
 [qx qy qz qw tx ty tz], camera-to-world with ARKit's axes and y up. `rgbd/N.depth` is float32 metres packed with LZFSE,
-NaN where unknown; `rgbd/N.conf` is 0, 1 or 2. Recordings of the front camera have no depth of a room and no poses.
+NaN where unknown; `rgbd/N.conf` is 0, 1 or 2. Recordings of the front camera have the same pose in
+every frame, which is none.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ _LEAST_TURN = 1e-4
 """Of a first pose that says more than that the recording begins there; nobody holds a phone as exactly level."""
 _AT_START = pose_of_arkit(np.eye(4))[:3, :3]
 _NOT_UPRIGHT = "poses begin at the first picture and do not say which way is up: floors and walls will"
-MOST_DEPTH_PIXELS = 2**19
-"""Of one depth image; phones have up to 640x480."""
+MOST_DEPTH_PIXELS = 2**20
+"""Of one depth image; LiDAR has 192x256, the front camera up to 720x960."""
 VARIES = 0.01
 """Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
 
@@ -151,7 +152,9 @@ def _layout(
     if spread > VARIES:
         notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: one camera serves all of them")
     lost = sum(p is None for p in poses) + max(0, len(numbers) - len(poses))
-    if lost:
+    if _stands(content):
+        notes.append("every frame states the same pose, as of the front camera: poses are not used")
+    elif lost:
         notes.append(f"{lost} of {len(numbers)} frames come without a pose")
     first = next((p for p in poses if p is not None), None)
     return camera.layout("record3d", files, first, with_depth, options, notes)
@@ -159,7 +162,15 @@ def _layout(
 
 def _poses(content: Mapping[str, Any]) -> list[NDArray[np.float64] | None]:
     rows = content.get("poses")
+    if _stands(content):
+        return []
     return [pose_of_row(row) for row in rows] if isinstance(rows, list) else []
+
+
+def _stands(content: Mapping[str, Any]) -> bool:
+    """Whether several frames have one pose, to the last digit: nobody holds a phone so still."""
+    rows = content.get("poses")
+    return isinstance(rows, list) and len(rows) > 1 and all(row == rows[0] for row in rows)
 
 
 def pose_of_row(row: object) -> NDArray[np.float64] | None:
