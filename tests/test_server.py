@@ -167,15 +167,51 @@ def test_with_write_an_agent_edits_and_takes_back(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------------------------------- stdio
 
 
-def test_over_stdio(room: Path) -> None:
-    async def asked() -> tuple[Any, Any]:
-        server = StdioServerParameters(command=sys.executable, args=["-m", "list3r", "mcp", str(room)])
-        async with Client(server) as client:
-            return await client.call_tool("find", {"text": "chair"}), await client.call_tool("label", {"id": 3})
+EVERY: dict[str, dict[str, Any]] = {
+    "overview": {},
+    "find": {"text": "chair"},
+    "nearest": {"point": [0.0, 0.0, 1.0]},
+    "within": {"center": [2, 0, 0.7], "radius": 0.5},
+    "relations": {"predicate": "on"},
+    "between": {"a": MUG, "b": TWIN},
+    "measure": {"a": MUG, "b": TWIN},
+    "describe": {"id": MUG},
+    "picture": {"id": MUG},
+    "changes": {},
+    "path_of": {"id": MUG},
+}
+EDITS: list[tuple[str, dict[str, Any]]] = [
+    ("label", {"id": MUG, "text": "cup"}),
+    ("merge", {"a": MUG, "b": TWIN}),
+    ("split", {"id": MUG}),
+    ("delete", {"id": CHAIR}),
+    ("undo", {}),
+]
 
-    found, refused = asyncio.run(asked())
-    assert found.structured_content["matches"][0]["id"] == CHAIR
-    assert refused.is_error
+
+async def told_by_all(client: Client) -> dict[str, Any]:
+    """What every tool that reads answers, without its pictures."""
+    asked = {name: await client.call_tool(name, words) for name, words in EVERY.items()}
+    assert not any(answer.is_error for answer in asked.values())
+    return {name: answer.structured_content or answer.content[0].mime_type for name, answer in asked.items()}
+
+
+def test_over_stdio(tmp_path: Path) -> None:
+    path = write_room(tmp_path / "room.l3r")
+
+    async def asked() -> tuple[Any, ...]:
+        reading, writing = (["-m", "list3r", "mcp", str(path), *more] for more in ((), ("--write",)))
+        async with Client(StdioServerParameters(command=sys.executable, args=reading)) as client:
+            told, refused = await told_by_all(client), [await client.call_tool(name, words) for name, words in EDITS]
+        async with Client(StdioServerParameters(command=sys.executable, args=writing)) as client:
+            return told, refused, [await client.call_tool(name, words) for name, words in EDITS]
+
+    wanted = ask(path, told_by_all)
+    told, refused, done = asyncio.run(asked())
+    assert set(told) == READING and told == wanted and {name for name, _ in EDITS} == WRITING
+    assert all(answer.is_error for answer in refused) and not any(answer.is_error for answer in done), done
+    with list3r.open(path) as memory:
+        assert memory.instance(MUG).label == "cup" and memory.instance(CHAIR).state == "present"
 
 
 # ---------------------------------------------------------------------------------------------- HTTP
@@ -213,6 +249,10 @@ def over_http(address: str, question: Callable[[Client], Awaitable[T]], clients:
         return await asyncio.gather(*(one() for _ in range(clients)))
 
     return asyncio.run(all_of_them())
+
+
+def test_every_tool_over_http(address: str, room: Path) -> None:
+    assert over_http(address, told_by_all) == [ask(room, told_by_all)]
 
 
 def test_over_http_ten_clients_at_once(address: str) -> None:

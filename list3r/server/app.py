@@ -130,6 +130,7 @@ def _listen(port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, port))
+        listener.listen()  # who is told the address may come before the server is ready
     except OSError as error:
         listener.close()
         raise OptionError(f"port {port} of {HOST} cannot be used ({error.strerror}); choose another one") from error
