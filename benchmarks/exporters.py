@@ -84,7 +84,14 @@ def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, An
     out = folder / f"out{suffix}"
     command = [sys.executable, "-m", "list3r", "export", str(memory), "--to", to, "--out", str(out)]
     began = time.monotonic()
-    process = subprocess.Popen([*command, *OPTIONS.get(name, ())], stdout=subprocess.DEVNULL, preexec_fn=_limit(limit))
+    process = subprocess.Popen(
+        [*command, *OPTIONS.get(name, ())],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_limit(limit),
+    )
+    said = process.stderr.read() if process.stderr else ""
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     files = [p for p in folder.rglob("*") if p.is_file()]
@@ -98,6 +105,8 @@ def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, An
         "files": len(files),
         "mb": round(sum(p.stat().st_size for p in files) / 1e6, 3),
     }
+    if process.returncode == 2:
+        row["refused"] = said.strip().splitlines()[-1]
     subprocess.run(["rm", "-r", str(folder)], check=True)
     return row
 

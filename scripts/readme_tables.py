@@ -317,7 +317,9 @@ def exports() -> str:
         r = found.get((name, count))
         if r is None:
             return "not measured"
-        return f"{r['cpu_s']:.1f} s, {r['peak_mb']} MB, {r['mb']:.1f} MB" if r["done"] else "not done"
+        if not r["done"]:
+            return "refused" if "refused" in r else "not done"
+        return f"{r['cpu_s']:.1f} s, {r['peak_mb']} MB, {r['mb']:.1f} MB"
 
     return _table(["format", *(f"{n:,}" for n in counts)], [[n, *(cell(n, c) for c in counts)] for n in formats])
 
