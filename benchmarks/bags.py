@@ -2,8 +2,9 @@
 
 python benchmarks/bags.py --gigabytes 1 --json benchmarks/results/bags.json
 
-Raw pictures and depth of 640 x 480 with cameras and `/tf`, interleaved by time, are written by `rosbags` as mcap and as
-db3. A process of its own opens the recording and reads all frames; the disk's own speed is that of reading the file's
+Raw pictures and depth of 640 x 480 with a camera and `/tf`, interleaved by time, are written by `rosbags` as mcap and
+db3, as mcap whose chunks are packed (`-zstd`) and whose last tenth and index are cut off (`-cut`), and as a bag of ROS 1
+packed by LZ4. A process of its own opens the recording and reads all frames; the disk's own speed is that of reading the file's
 bytes just before (it may lie in the system's cache both times). Speeds by processor time say what the reader costs on
 a machine that is busy with other work.
 """
@@ -12,10 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,26 +44,29 @@ print(opened - started, time.monotonic() - opened, *cpu, first / 1024, peak / 10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gigabytes", type=float, default=1.0)
-    parser.add_argument("--kinds", default="mcap,db3")
+    parser.add_argument("--kinds", default="mcap,db3,mcap-zstd,mcap-cut,bag-lz4")
     parser.add_argument("--json", type=Path)
     words = parser.parse_args()
     rows = []
     for kind in words.kinds.split(","):
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / "walk"
-            write(path, kind, int(words.gigabytes * 1e9 / FRAME_BYTES))
+            path = write(path, kind, int(words.gigabytes * 1e9 / FRAME_BYTES))
             rows.append({"kind": kind, **read(path)})
             print(json.dumps(rows[-1]), flush=True)
     print(machine())
     write_json(words.json, {"rows": rows})
 
 
-def write(path: Path, kind: str, frames: int) -> None:
-    """Write so many frames."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
+def write(path: Path, kind: str, frames: int) -> Path:
+    """Write so many frames; return the recording."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    first = kind.startswith("bag")
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+    if first:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    packed = store.serialize_ros1 if first else store.serialize_cdr
     types = store.types
     rng = np.random.default_rng(0)
     color, depth = (
@@ -70,7 +76,16 @@ def write(path: Path, kind: str, frames: int) -> None:
 
     def header(time_s: float) -> Any:
         stamp = types["builtin_interfaces/msg/Time"](sec=int(time_s), nanosec=round(1e9 * (time_s % 1)))
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+        number = {"seq": 0} if first else {}
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera", **number)
+
+    def place(time_s: float) -> Any:
+        moved = types["geometry_msgs/msg/Vector3"](x=0.1 * (time_s - 100.0), y=0.0, z=0.0)
+        turned = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        T = types["geometry_msgs/msg/Transform"](translation=moved, rotation=turned)
+        head = replace(header(time_s), frame_id="map")
+        step = types["geometry_msgs/msg/TransformStamped"](header=head, child_frame_id="camera", transform=T)
+        return types["tf2_msgs/msg/TFMessage"](transforms=[step])
 
     def image(time_s: float, encoding: str, step: int, data: Any) -> Any:
         return types["sensor_msgs/msg/Image"](
@@ -79,26 +94,51 @@ def write(path: Path, kind: str, frames: int) -> None:
 
     k = np.array([500.0, 0, 319.5, 0, 500.0, 239.5, 0, 0, 1])
     region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
-        names = (("/color/image_raw", "Image"), ("/depth/image_raw", "Image"), ("/color/camera_info", "CameraInfo"))
-        topics = [writer.add_connection(n, f"sensor_msgs/msg/{t}", typestore=store) for n, t in names]
+    names = [("/color/image_raw", "Image"), ("/depth/image_raw", "Image"), ("/color/camera_info", "CameraInfo")]
+    topics_of = [*((n, f"sensor_msgs/msg/{t}") for n, t in names), ("/tf", "tf2_msgs/msg/TFMessage")]
+    path = path.with_suffix(".bag") if first else path
+    with writer_of(path, kind) as writer:
+        topics = [writer.add_connection(n, t, typestore=store) for n, t in topics_of]
         for number in range(frames):
             time_s = 100.0 + number / 30.0
+            lens = dict(
+                zip("DKRP" if first else "dkrp", (np.zeros(5), k, np.eye(3).ravel(), np.zeros(12)), strict=True)
+            )
             info = types["sensor_msgs/msg/CameraInfo"](
-                header=header(time_s), height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=np.zeros(5), k=k,
-                r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=region,
+                header=header(time_s), height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", **lens,
+                binning_x=0, binning_y=0, roi=region,
             )  # fmt: skip
-            messages = (image(time_s, "rgb8", 3 * WIDTH, color), image(time_s, "16UC1", 2 * WIDTH, depth), info)
-            for topic, message in zip(topics, messages, strict=True):
-                writer.write(topic, int(1e9 * time_s), store.serialize_cdr(message, topic.msgtype))
+            pictures = (image(time_s, "rgb8", 3 * WIDTH, color), image(time_s, "16UC1", 2 * WIDTH, depth))
+            for topic, message in zip(topics, (*pictures, info, place(time_s)), strict=True):
+                writer.write(topic, int(1e9 * time_s), packed(message, topic.msgtype))
+    if kind.endswith("-cut"):
+        (whole,) = path.glob("*.mcap")
+        os.truncate(whole, whole.stat().st_size * 9 // 10)
+    return path
+
+
+def writer_of(path: Path, kind: str) -> Any:
+    """Return what writes a kind of recording."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    if kind.startswith("bag"):
+        first = Writer1(path)
+        first.set_compression(Writer1.CompressionFormat.LZ4)
+        return first
+    plugin = StoragePlugin.SQLITE3 if kind == "db3" else StoragePlugin.MCAP
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if kind.endswith("-zstd"):
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    return writer
 
 
 def read(path: Path) -> dict[str, Any]:
     """Read a recording's bytes, then its frames in a process of its own."""
-    size = sum(p.stat().st_size for p in path.iterdir())
+    files = list(path.iterdir()) if path.is_dir() else [path]
+    size = sum(p.stat().st_size for p in files)
     started = time.monotonic()
-    for file in path.iterdir():
+    for file in files:
         with file.open("rb") as data:
             while data.read(2**22):
                 pass
@@ -106,7 +146,7 @@ def read(path: Path) -> dict[str, Any]:
     out = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True).stdout
     opened_s, read_s, opened_cpu_s, read_cpu_s, opened_mb, peak_mb, frames = (float(v) for v in out.split())
     begun = time.process_time()
-    for file in path.iterdir():
+    for file in files:
         with file.open("rb") as data:
             while data.read(2**22):
                 pass

@@ -274,10 +274,17 @@ WITH_DEPTH: dict[str, Callable[[Path], Path]] = {
 
 
 def write_bag(
-    root: Path, kind: str = "mcap", *, registered: bool = False, odometry: bool = False, chunk_bytes: int = 1 << 20
+    root: Path,
+    kind: str = "mcap",
+    *,
+    registered: bool = False,
+    odometry: bool = False,
+    chunk_bytes: int = 1 << 20,
+    packed: str = "",
 ) -> Path:
     """A recording of ROS 1 ("bag") or ROS 2 ("mcap", "db3"): colour, compressed depth, cameras, `/tf`, interleaved,
-    in chunks (but of a db3) of so many bytes.
+    in chunks (but of a db3) of so many bytes, `packed` as rosbags names it: "lz4" and "bz2" of ROS 1; of ROS 2, by
+    zstd, "storage" (mcap), "message" or "file".
 
     The depth camera stands 2 cm beside the colour camera unless depth is registered; the robot carries both.
     """
@@ -289,7 +296,7 @@ def write_bag(
         store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
     root.parent.mkdir(parents=True, exist_ok=True)
     path = root.with_suffix(".bag") if kind == "bag" else root
-    with _bag_writer(path, kind) as writer:
+    with _bag_writer(path, kind, packed) as writer:
         writer.chunk_threshold = chunk_bytes
         put_ = _Put(writer, store, ros1=kind == "bag")
         for message in _messages(put_, registered=registered, odometry=odometry):
@@ -297,14 +304,21 @@ def write_bag(
     return path
 
 
-def _bag_writer(path: Path, kind: str) -> object:
+def _bag_writer(path: Path, kind: str, packed: str) -> object:
     if kind == "bag":
         from rosbags.rosbag1 import Writer as Writer1
 
-        return Writer1(path)
-    from rosbags.rosbag2 import StoragePlugin, Writer
+        first = Writer1(path)
+        if packed:
+            first.set_compression(Writer1.CompressionFormat[packed.upper()])
+        return first
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    return Writer(path, version=9, storage_plugin=StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3)
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if packed:
+        writer.set_compression(CompressionMode[packed.upper()], CompressionFormat.ZSTD)
+    return writer
 
 
 class _Put:

@@ -10,7 +10,7 @@ import pytest
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.errors import List3rError, OptionError, SourceError
 from tests.recordings import COUNT, off_plane, shots, write_bag
 from tests.test_frames_recordings import frames_of, world_points
 
@@ -29,6 +29,30 @@ def test_depth_through_every_pose_lies_on_the_wall(kind: str, registered: bool, 
         assert np.median(off) < 0.002 and np.quantile(off, 0.95) < 0.012
         assert np.allclose(frame.T_source_cam, shot.T_world_cam, atol=1e-5)
         assert (frame.color == shot.color).all()
+
+
+PACKED = [("bag", "lz4"), ("bag", "bz2"), ("mcap", "storage"), ("mcap", "message"), ("db3", "message")]
+
+
+@pytest.mark.parametrize(("kind", "packed"), PACKED)
+def test_messages_that_are_packed_are_those_that_are_not(kind: str, packed: str, tmp_path: Path) -> None:
+    plain, small = (write_bag(tmp_path / name / "walk", kind, packed=how) for name, how in (("a", ""), ("b", packed)))
+    for one, other in zip(frames_of(plain), frames_of(small), strict=True):
+        assert (one.depth == other.depth).all() and (one.color == other.color).all()
+        assert np.array_equal(one.T_source_cam, other.T_source_cam)
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_a_file_that_is_packed_as_a_whole_is_asked_to_be_unpacked(kind: str, tmp_path: Path) -> None:
+    folder = write_bag(tmp_path / "walk", kind, packed="file")
+    (packed,) = folder.glob("*.zstd")
+    for path in (folder, packed):
+        with pytest.raises(SourceError, match="zstd -d"):
+            open_source(path)
+    zstd = pytest.importorskip("backports.zstd")
+    packed.with_suffix("").write_bytes(zstd.decompress(packed.read_bytes()))
+    packed.unlink()
+    assert len(frames_of(folder)) == COUNT
 
 
 def test_poses_of_odometry_are_carried_to_the_camera(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ depth are brought together by the times in their headers. Poses come from an odo
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,14 +41,19 @@ _TF = "tf2_msgs/msg/TFMessage"
 _INFO = "sensor_msgs/msg/CameraInfo"
 _TOLD_EVERY = 200
 """Messages after which whoever watches hears of the listing."""
+_PACKED = ".zstd"
+"""Ends the names of files that `ros2 bag record --compression-mode file` packed, also in metadata, which stay so."""
 _MOST_BYTES = 2**50
 """Of a recording: it is read message by message."""
 
 
 def is_recording(path: Path) -> bool:
     """Whether a path is such a recording, by its name or, of a folder, by what is in it. One that was killed, or still
-    runs, has no metadata.
+    runs, has no metadata. Raises `SourceError` for files that are packed as a whole.
     """
+    packed = [path] if path.is_file() else [p for end in ENDINGS for p in path.glob(f"*{end}{_PACKED}")]
+    if any(p.name.endswith(tuple(end + _PACKED for end in ENDINGS)) for p in packed):
+        raise SourceError(f"{path} is packed as a whole: unpack it (`zstd -d --rm {packed[0]}`), and give it again")
     if path.is_dir():
         return bool(_files(path))
     return path.suffix.lower() in ENDINGS or path.name.endswith(".bag.active")
@@ -238,7 +244,12 @@ def _parts(path: Path) -> list[Any]:
     decompressors = bound_rosbags()
     files = _files(path) if path.is_dir() else [path]
     parts = [mended(p, decompressors) or p for p in files]
-    return [path] if parts == files and (path / "metadata.yaml").exists() else parts
+    return [path] if parts == files and _describes(path / "metadata.yaml") else parts
+
+
+def _describes(metadata: Path) -> bool:
+    """Whether metadata are there, and not those of files that were packed when they were written."""
+    return metadata.exists() and not re.search(rf"\.(db3|mcap){_PACKED}\b", metadata.read_text("utf-8", "replace"))
 
 
 def _cut_off(path: Path) -> list[str]:
