@@ -3,10 +3,10 @@
 python benchmarks/bags.py --gigabytes 1 --json benchmarks/results/bags.json
 
 Raw pictures and depth of 640 x 480 with a camera and `/tf`, interleaved by time, are written by `rosbags` as mcap and
-db3, as mcap whose chunks are packed (`-zstd`) and whose last tenth and index are cut off (`-cut`), and as a bag of ROS 1
-packed by LZ4. A process of its own opens the recording and reads all frames; the disk's own speed is that of reading the file's
-bytes just before (it may lie in the system's cache both times). Speeds by processor time say what the reader costs on
-a machine that is busy with other work.
+db3, as mcap whose chunks are packed (`-zstd`) or whose last tenth and index are cut off (`-cut`), and as a bag of ROS
+1 packed by LZ4. A process of its own opens the recording and reads all frames; the disk's own speed is that of reading
+the file's bytes just before (it may lie in the system's cache both times). Speeds by processor time say what the reader
+costs on a machine that is busy with other work.
 """
 
 from __future__ import annotations
