@@ -12,11 +12,12 @@ from list3r.memory.relations.structure import StructureSettings, classify_struct
 COMPUTED = StructureSettings(floor_band_m=StructureSettings().computed_floor_band_m)
 
 
-def level(height: float, thickness: float, size: float = 3.0, flagged: float = 0.0) -> InstanceGeometry:
+def level(height: float, thickness: float, size: float = 3.0, flagged: float = 0.0, x: float = 0.0) -> InstanceGeometry:
     """A level surface whose middle four fifths of points are so thick; chunks took that share of it for structure."""
     rng = np.random.default_rng(5)
     points = rng.uniform((-size / 2, -size / 2, -1.0), (size / 2, size / 2, 1.0), (3000, 3))
     points[:, 2] = height + points[:, 2] * thickness / 1.6
+    points[:, 0] += x
     aabb = np.stack([points.min(axis=0), points.max(axis=0)])
     rgb, up = np.zeros((len(points), 3), np.uint8), np.array([0.0, 0.0, 1.0])
     return InstanceGeometry(1, points, rgb, upright_box(points), aabb, up, flagged=flagged)
@@ -63,3 +64,9 @@ def test_a_rug_is_what_chunks_told_from_a_floor(
     """Discoverers that never tell structure leave the word to height alone, as does computed depth."""
     there = [level(0.0, 0.02, flagged=floor), level(0.012, 0.02, 1.2, flagged=rug)]
     assert classify_structure(there, 0.0, lambda body: 1.5, 1.0, settings) == said
+
+
+def test_what_no_floor_surrounds_is_the_floor() -> None:
+    """A carpet beyond a table is no rug, though chunks took it for one: a rug has floor beside it."""
+    there = [level(0.0, 0.02, 1.0, flagged=1.0), level(0.012, 0.02, 1.2, x=1.5)]
+    assert classify_structure(there, 0.0, lambda body: 1.5, 1.0) == ["floor", "floor"]

@@ -26,8 +26,12 @@ class StructureSettings:
     computed_floor_band_m: float = 0.2
     """and this near where depth was computed: rooms bend, and up is known to two degrees."""
     least_flagged: float = 0.5
-    """Of those, one of which the chunks took less than this share for structure lies on the floor, if they took others
-    for floor: a rug. 0 where depth was computed, by which chunks hardly tell a rug from a floor that bends."""
+    """Of those, one of which the chunks took less than this share for structure lies on the floor, if they took what
+    is beside it for floor: a rug. 0 where depth was computed: by that a floor that bends looks like a rug."""
+    bordered: float = 0.1
+    """Share of a rug's outline at least that has floor beside it,"""
+    beside_m: float = 0.15
+    """so near."""
     min_area_m2: float = 0.25
     wall_height_m: float = 1.2
     wall_width_m: float = 0.8
@@ -63,10 +67,11 @@ def classify_structure(
 
     `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
     saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level, lies at the
-    floor, and is no rug, which chunks told from a floor; a ceiling is level, above the cameras, and faces down; a wall
-    is upright, tall and wide, and (nearly) nothing lies behind it. A smaller surface that the chunks flagged and that
-    has nothing behind it is `plane`. A table top or a cabinet front stands in the room and is none of these. What lies
-    near an instance decides, so `around` may be all instances (the default: those given) or those within `near_m`.
+    floor, and is no rug, which chunks told from a floor that is seen beside it; a ceiling is level, above the cameras,
+    and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. A smaller surface that the
+    chunks flagged and that has nothing behind it is `plane`. A table top or a cabinet front stands in the room and is
+    none of these. What lies near an instance decides, so `around` may be all instances (the default: those given) or
+    those within `near_m`.
     """
     s = settings or StructureSettings()
     known = instances if around is None else around
@@ -81,10 +86,24 @@ def classify_structure(
         rows = np.flatnonzero(gap <= s.near_m * unit).tolist()
         kind = _classify(b, floor_height, eye_level, np.concatenate([cloud[n] for n in rows]), unit, s)
         if kind == "floor" and b.flagged < s.least_flagged and floor_height is not None:
-            told = any(known[n].flagged >= s.least_flagged and _low(known[n], floor_height, unit, s) for n in rows)
-            kind = None if told else kind
+            told = [known[n] for n in rows if known[n].flagged >= s.least_flagged]
+            floors = [n.points for n in told if _low(n, floor_height, unit, s)]
+            kind = None if floors and _bordered(b.points, np.concatenate(floors), unit, s) else kind
         out.append(kind)
     return out
+
+
+def _bordered(sheet: Array, floor: Array, unit: float, s: StructureSettings) -> bool:
+    """Return whether floor is seen beside a sheet: what no floor surrounds is the floor. Shape (N, 3) each."""
+    from scipy.spatial import cKDTree
+
+    cell = s.beside_m * unit / 3.0
+    cells = np.unique(np.floor(sheet[:, :2] / cell).astype(np.int64), axis=0)
+    filled = {(x, y) for x, y in cells.tolist()}
+    around = ((1, 0), (-1, 0), (0, 1), (0, -1))
+    outline = [c for c in cells.tolist() if any((c[0] + x, c[1] + y) not in filled for x, y in around)]
+    away, _ = cKDTree(floor[:, :2]).query((np.array(outline) + 0.5) * cell, distance_upper_bound=s.beside_m * unit)
+    return float(np.isfinite(away).mean()) >= s.bordered
 
 
 def flagged_only(instances: Sequence[InstanceGeometry]) -> list[str | None]:
