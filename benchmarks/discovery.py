@@ -112,9 +112,9 @@ def make(method: str, settings: InstanceSettings, film: Film, weights: Path | No
         return GeometricDiscoverer(settings)
     if method == "true":
         return TrueDiscoverer(film)
-    from list3r.instances.learned.discovery import LearnedDiscoverer, LearnedSettings
+    from list3r.instances.learned.discovery import LearnedDiscoverer
 
-    return LearnedDiscoverer(settings, weights, LearnedSettings(least_name=0.0))
+    return LearnedDiscoverer(settings, weights)
 
 
 class TrueDiscoverer:

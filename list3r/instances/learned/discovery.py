@@ -30,7 +30,9 @@ Features = NDArray[np.float32]
 OFF_WALL = 4.0
 """Voxels, besides three deviations of depth, from which a point lies off the plane of a wall or floor."""
 MOST_NAMES = 3
-"""Names that are told of one thing at most."""
+"""Names that are told of one thing at most,"""
+LEAST_NAME = 0.02
+"""and how probable they are at least."""
 FLAT = 0.85
 """Share of a thing's voxels near its plane from which it is a flat surface."""
 
@@ -44,8 +46,6 @@ class LearnedSettings:
     where recall and precision meet near it."""
     least_scrap: float = 0.1
     """Things that are less probably one whole are not even kept."""
-    least_name: float = 0.5
-    """Names that are less probable are not told."""
     plane_area_m2: float = 0.25
     """Smallest flat surface looked for, from which gravity is told and structure is parted."""
     cut: CutSettings = field(default_factory=CutSettings)
@@ -89,9 +89,9 @@ class LearnedDiscoverer(CloudDiscoverer):
         listed = (cut.told.whole >= self._learned.least_confidence) | (cut.told.structure > 0.5)
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(self._weights)
-        kept, features = _described(cloud, parted, up, views.unit, names, self._learned.least_name)
+        kept, features = _described(cloud, parted, up, views.unit, names)
         scraps = cut.only(~listed & (cut.told.whole >= self._learned.least_scrap))
-        self._scraps = _described(cloud, scraps, up, views.unit, names, self._learned.least_name)
+        self._scraps = _described(cloud, scraps, up, views.unit, names)
         return cloud, kept, features
 
     def _as_sure_as_depth(
@@ -138,24 +138,27 @@ def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> li
     return faces
 
 
-def _named(told: ThingVerdicts, names: Sequence[str], least: float) -> list[tuple[tuple[str, float], ...]]:
-    """The likeliest names of each thing with their probabilities; none for structure and where none is sure enough."""
+def _named(told: ThingVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
+    """The likeliest names of each thing with their probabilities; none for structure.
+
+    Unsure ones are told, too: what a thing is called is decided when all chunks have spoken.
+    """
     out: list[tuple[tuple[str, float], ...]] = []
     for row, structure in zip(told.names, told.structure, strict=True):
         best = np.argsort(-row, kind="stable")[:MOST_NAMES]
-        sure = structure <= 0.5 and row[best[0]] >= least
-        out.append(tuple((names[k], round(float(row[k]), 4)) for k in best if row[k] >= 0.02) if sure else ())
+        likely = [(names[k], round(float(row[k]), 4)) for k in best if row[k] >= LEAST_NAME]
+        out.append(tuple(likely) if structure <= 0.5 else ())
     return out
 
 
 def _described(
-    cloud: Cloud, cut: CloudCut, up: NDArray[np.float64], unit: float, names: Sequence[str], least_name: float
+    cloud: Cloud, cut: CloudCut, up: NDArray[np.float64], unit: float, names: Sequence[str]
 ) -> tuple[Segmentation, Features]:
     """The segments of a cut and their features."""
     rgb, count = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8), len(cut.told.structure)
     order = np.argsort(cut.labels, kind="stable")
     bounds = np.searchsorted(cut.labels[order], np.arange(count + 1))
-    segments, features, named = [], np.zeros((count, 64), np.float32), _named(cut.told, names, least_name)
+    segments, features, named = [], np.zeros((count, 64), np.float32), _named(cut.told, names)
     for number in range(count):
         mine = order[bounds[number] : bounds[number + 1]]
         structure = bool(cut.told.structure[number] > 0.5)

@@ -83,7 +83,8 @@ def votes_of_names(names: Iterable[tuple[str, float]]) -> Votes:
 OWN_NAMES = "learned"
 """The source of names that the learned discoverer tells; every other source overrules it."""
 _OWN_LOOKS = 1.5
-"""Pictures that all views of a chunk together count as, where their names were pooled already."""
+"""Pictures that all views of a chunk together count as, where their names were pooled already. One network judges the
+same thing in every chunk, with the same mistakes: several chunks are as sure as they are in the mean, no surer."""
 
 
 def votes_of_probabilities(named: Iterable[tuple[str, float]], likeness: float = LabelSettings.likeness) -> Votes:
@@ -108,7 +109,7 @@ def decide(
     odds: dict[str, float] = {}
     found: dict[str, float] = {}
     for name in sorted({c for v in votes.values() for c in v.classes}):
-        said = [_said(v, name, (known or {}).get(source), s.likeness) for source, v in sorted(votes.items())]
+        said = [_said(v, name, source, (known or {}).get(source), s.likeness) for source, v in sorted(votes.items())]
         odds[name] = PRIOR_ODDS + sum(evidence for _, evidence in said)
         found[name] = sum(pictures for pictures, _ in said)
     if not odds:
@@ -130,13 +131,16 @@ def decide_by_rank(
     return decide(others, known, settings) or decide(votes, known, settings)
 
 
-def _said(votes: Votes, name: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:
+def _said(
+    votes: Votes, name: str, source: str, known: Collection[str] | None, likeness: float
+) -> tuple[float, float]:
     """Return pictures in which a source found a class, and its log odds for it; one that it does not know is not
     missed.
     """
     found, got = votes.classes.get(name, (0.0, 0.0))
     missed = votes.missed if known is None or name in known else 0.0
-    return found, (got - missed) / (1.0 + likeness * max(votes.looks - 1.0, 0.0))
+    chunks = max(votes.looks / _OWN_LOOKS, 1.0) if source == OWN_NAMES else 1.0
+    return found, (got - missed) / chunks / (1.0 + likeness * max(votes.looks / chunks - 1.0, 0.0))
 
 
 def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str, Any]:
