@@ -74,7 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="31,32,33")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--discovery", default="", help="such as geometric,learned; without it the default")
+    parser.add_argument("--discovery", default="", help="such as learned,sam2; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
     parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
     parser.add_argument("--hard", action="store_true", help="... with wider turns, and through door frames")

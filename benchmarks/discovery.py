@@ -29,7 +29,6 @@ from list3r.instances.base import Discoverer, Proposals
 from list3r.instances.geometric.support import thin, without_fliers
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
 from list3r.instances.library import select_prompts
-from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings, MaskTrackSettings
 from list3r.memory.geometry import OrientedBox, upright_box
 from list3r.memory.relations.instance_geometry import fit_box, without_strays
@@ -47,7 +46,7 @@ SMALL_M = 0.3
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="6001-6010", help="such as 6001-6010 or 3,5,8")
-    parser.add_argument("--methods", default="geometric,learned,true", help="of geometric, learned, true")
+    parser.add_argument("--methods", default="learned,true", help="of learned, true")
     parser.add_argument("--sensor", help="structured, tof, lidar or computed; without it each world draws one")
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
     parser.add_argument("--house", type=Path, help="folder of aws-robomaker-small-house-world; walks there, not worlds")
@@ -108,8 +107,6 @@ def judge(film: tuple[Film, int], seed: int, method: str, weights: Path | None) 
 
 def make(method: str, settings: InstanceSettings, film: Film, weights: Path | None) -> Discoverer:
     """The discoverer of a name."""
-    if method == "geometric":
-        return GeometricDiscoverer(settings)
     if method == "true":
         return TrueDiscoverer(film)
     from list3r.instances.learned.discovery import LearnedDiscoverer

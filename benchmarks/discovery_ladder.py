@@ -125,7 +125,7 @@ def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, 
 
 def proposed(discoverer: LearnedDiscoverer, chunk: Chunk, labels: Labels, flat: NDArray[np.bool_], p: int) -> Proposals:
     """Clusters as masks on an anchor; `flat` are those that are structure."""
-    segments = tuple(Segment("thing", None, bool(f), 1.0) for f in flat)
+    segments = tuple(Segment(None, bool(f), 1.0) for f in flat)
     cut = Segmentation(np.asarray(labels + 1, np.int32), segments, chunk.surface.around.up)
     image = discoverer._label_view(chunk.views, p, chunk.cloud, cut)
     camera = chunk.views.reconstruction.camera

@@ -44,7 +44,7 @@ SENSORS = ("structured", "lidar", "tof")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="5101-5103")
-    parser.add_argument("--methods", default="geometric,learned")
+    parser.add_argument("--methods", default="learned")
     parser.add_argument("--house", type=Path)
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
     parser.add_argument("--keep", type=Path, help="folder in which walks are kept")

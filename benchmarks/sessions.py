@@ -52,7 +52,7 @@ class ReturnWalk(ChangedWalk):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3,4,5")
-    parser.add_argument("--discovery", default="", help="such as geometric,learned; without it the default")
+    parser.add_argument("--discovery", default="", help="such as learned,sam2; without it the default")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     parser.add_argument("--workers", default="1")

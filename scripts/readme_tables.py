@@ -145,7 +145,7 @@ def discovery() -> str:
     """Return the table of discovery: rules, the learned one and true masks on worlds left out and in a house; and what
     is lost where the networks see less.
     """
-    methods = {"geometric": "rules", "learned": "learned (default)", "true": "true masks"}
+    methods = {"geometric": "rules (taken out since)", "learned": "learned (default)", "true": "true masks"}
     places = {
         "discovery": "10 left-out worlds",
         "discovery-fitted": "6 left-out rooms with what is built in",

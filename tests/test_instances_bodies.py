@@ -7,7 +7,6 @@ import pytest
 
 from list3r.frames.base import Frame
 from list3r.instances.library import build_library
-from list3r.instances.rules.furniture import _rename
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary
 from tests.test_instances_library import FLOOR, WALL, Block, look_at, reconstruction_of, render, world_points
@@ -92,8 +91,3 @@ def test_floor_and_wall_stay_structure(room: tuple[list[Frame], LocalLibrary]) -
     frames, library = room
     assert _find(library, frames, FLOOR).structure and _find(library, frames, WALL).structure
     assert sum(i.structure for i in library.instances) == 2
-
-
-def test_labels_joined_before_can_be_joined_again() -> None:
-    labels = np.array([0, 1, 2, 1], np.int32)
-    assert _rename(labels, {1: 1, 2: 1, 5: 2}).tolist() == [0, 1, 1, 1]

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -14,8 +11,6 @@ from list3r.instances.geometric.cloud import neighbour_pairs, pack, unpack
 from list3r.instances.geometric.features import mean_feature, object_feature
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings
-from list3r.instances.rules.segments import _plane_of
-from list3r.instances.rules.sheets import merge_regions
 from list3r.instances.tracking.reprojection import encode_labels
 from list3r.memory.masks import decode_mask, encode_mask
 from list3r.reconstruction.base import Reconstruction
@@ -56,15 +51,6 @@ def test_label_images_are_coded_like_their_masks(labels: np.ndarray) -> None:
         assert rows.min() <= center[1] <= rows.max()
 
 
-def test_regions_part_at_a_colour_edge_and_not_in_a_shade() -> None:
-    color = np.zeros((30, 40, 3), np.float32)
-    color[:, :20, 1] = 40.0
-    color[..., 0] = np.linspace(0.0, 15.0, 40)[None]
-    regions = merge_regions(color, np.ones((30, 40), bool), 20)
-    assert len(np.unique(regions)) == 2
-    assert len(np.unique(regions[:, :20])) == len(np.unique(regions[:, 20:])) == 1
-
-
 def _cylinder(rgb: tuple[int, int, int], start: float, stop: float) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     angle, height = rng.uniform(start, stop, 2000), rng.uniform(0.0, 0.1, 2000)
@@ -102,11 +88,3 @@ def test_anchors_laid_on_one_another_undo_drift() -> None:
     before = np.linalg.norm(given[-1][:3, 3] - given[0][:3, 3])
     after = np.linalg.norm((np.linalg.inv(found[0]) @ found[-1])[:3, 3])
     assert after < 0.5 * before
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_a_sheet_of_few_voxels_has_a_plane(count: int) -> None:
-    points = np.array([[0.1, 0.2, 1.0], [0.3, 0.2, 1.0], [0.1, 0.5, 1.0], [0.3, 0.5, 1.0], [0.2, 0.3, 1.0]], np.float32)
-    scene = SimpleNamespace(cloud=SimpleNamespace(points=points))
-    plane = _plane_of(scene, np.arange(5) < count, np.array([0.0, 0.0, 1.0]))  # type: ignore[arg-type]
-    assert np.allclose(plane, [0.0, 0.0, 1.0, -1.0], atol=1e-6)

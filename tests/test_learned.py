@@ -105,7 +105,7 @@ def test_weights_come_back_and_damage_is_said(tmp_path: Path) -> None:
     for name, word in (("none", "missing"), ("old", "version 0"), ("hit", "damaged"), ("cut", "cannot be read")):
         with pytest.raises(OptionError, match=word) as said:
             load_weights(tmp_path / f"{name}.npz")
-        assert "\n" not in str(said.value) and "--discovery geometric" in str(said.value)
+        assert "\n" not in str(said.value) and "write it anew" in str(said.value)
 
 
 def test_shipped_weights_are_small_and_whole() -> None:
@@ -137,20 +137,17 @@ def test_it_is_asked_for_by_name() -> None:
     assert isinstance(found, LearnedDiscoverer)
 
 
-def test_it_is_taken_where_a_sensor_measures_depth_and_damage_to_its_weights_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_the_default_and_damage_to_its_weights_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
     assert settings_asked(BuildRequest(), depth, "any")[0].discovery == "learned"
-    assert settings_asked(BuildRequest(discovery="geometric"), depth, "any")[0].discovery == "geometric"
-    assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "geometric"
-    assert settings_asked(BuildRequest(reconstruction="sfm"), depth, "any")[0].discovery == "geometric"
+    assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "learned"
+    assert settings_asked(BuildRequest(discovery="eomt"), depth, "any")[0].discovery == "eomt"
     load_weights.cache_clear()
     monkeypatch.setattr("list3r.instances.learned.weights.SHIPPED", tmp_path / "weights.npz")
     with pytest.raises(OptionError, match=r"weights\.npz") as said:
         settings_asked(BuildRequest(), depth, "any")
     assert "\n" not in str(said.value)
-    assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "geometric"
+    assert settings_asked(BuildRequest(discovery="eomt"), depth, "any")[0].discovery == "eomt"
     load_weights.cache_clear()
 
 

@@ -155,7 +155,7 @@ def test_a_walk_with_a_phone_becomes_a_memory(tmp_path: Path, monkeypatch: pytes
     own = camera.fx, camera.fy, camera.cx, camera.cy
     sent = [message(seen.color, seen.depth, T, own) for seen, T in drawn]
     told: list[str] = []
-    watch, request = Watch(note=told.append), BuildRequest(chunk=8, overlap=3, discovery="geometric")
+    watch, request = Watch(note=told.append), BuildRequest(chunk=8, overlap=3)
     with usbmuxd([sent[:14], sent[14:]], monkeypatch, tmp_path):
         report = build_live("record3d:", tmp_path / "m.l3r", settings=request, live=QUICK, watch=watch)
     assert report.live is not None and (report.live.received, report.live.reconnects) == (24, 2)

@@ -17,7 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 import list3r
-from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS, WITHOUT_DOWNLOAD
+from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
 from list3r.memory.errors import OptionError
 from list3r.models.cache import (
     cache_folder,
@@ -85,7 +85,7 @@ def card(code: Licence = APACHE, *weights: Weights) -> ModelCard:
 
 def test_every_adapter_has_a_card_and_every_card_an_adapter() -> None:
     known = {("geometry", m) for m in MODELS if m not in ("rgbd", "sfm", "precomputed")}
-    known |= {("discovery", d) for d in DISCOVERERS if d not in (*WITHOUT_DOWNLOAD, "precomputed")}
+    known |= {("discovery", d) for d in DISCOVERERS if d not in ("learned", "precomputed")}
     known |= {("tracking", t) for t in TRACKERS if t != "reprojection"}
     known |= {("features", f) for f in FEATURES if f not in ("geometric", "own")}
     carded = {(c.part, c.name) for c in CARDS}
@@ -295,7 +295,7 @@ def test_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
 
 
 def test_presets_choose_and_say_why() -> None:
-    assert select("cpu", has_depth=True, profile="any", gpu=None) == ModelSelection(why="preset cpu: no weights")
+    assert select("cpu", has_depth=True, profile="any", gpu=None) == ModelSelection(why="preset cpu: nothing to fetch")
     light = select("light", has_depth=False, profile="permissive", gpu=None)
     assert all(c.commercial for _, c in light.cards()) and len(light.cards()) == 4
     assert select("light", has_depth=True, profile="permissive", gpu=None).reconstruction == "auto"
@@ -306,11 +306,11 @@ def test_presets_choose_and_say_why() -> None:
 
 def test_auto_takes_what_is_installed_fetched_and_allowed() -> None:
     nothing = select("auto", has_depth=True, profile="any", gpu=None)
-    assert nothing.discovery == "geometric" and "no GPU" in nothing.why
+    assert nothing.discovery == "learned" and "no GPU" in nothing.why
     bare = select("auto", has_depth=False, profile="any", gpu=GPU)
     assert (bare.reconstruction, bare.discovery, bare.tracking, bare.features) == (
         "auto",
-        "geometric",
+        "learned",
         "reprojection",
         "geometric",
     )

@@ -25,12 +25,14 @@ def test_one_chunk_gives_the_probability_that_it_was_told(probability: float) ->
     assert said[1] == pytest.approx(probability * (1 - LabelSettings().always_wrong), abs=0.01)
 
 
-def test_what_is_unsure_stays_unnamed_and_two_chunks_are_surer_than_one() -> None:
+def test_what_is_unsure_stays_unnamed_and_several_chunks_are_as_sure_as_in_the_mean() -> None:
     one = votes_of_probabilities([("chair", 0.45), ("stool", 0.3)])
     assert decide({OWN_NAMES: one}) is None
     sure = votes_of_probabilities([("chair", 0.7)])
     single, double = decide({OWN_NAMES: sure}), decide({OWN_NAMES: sure + sure})
-    assert single is not None and double is not None and double[1] > single[1]
+    assert single is not None and double is not None and double[1] == pytest.approx(single[1])
+    doubted = decide({OWN_NAMES: sure + one})
+    assert doubted is not None and doubted[1] < single[1]
 
 
 def test_a_detector_overrules_the_discoverer() -> None:

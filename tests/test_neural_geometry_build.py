@@ -138,8 +138,8 @@ def test_errors_are_one_line(pictures: Path, tmp_path: Path, capsys: pytest.Capt
 def test_explicit_options_win_over_the_preset(pictures: Path) -> None:
     info = open_source(pictures).info
     settings, told = settings_asked(BuildRequest(preset="cpu"), info, "research")
-    assert (settings.reconstruction, settings.discovery, settings.features) == ("auto", "geometric", "geometric")
-    assert told == ["preset cpu: no weights"] and settings.chunks == ChunkSettings()
+    assert (settings.reconstruction, settings.discovery, settings.features) == ("auto", "learned", "geometric")
+    assert told == ["preset cpu: nothing to fetch"] and settings.chunks == ChunkSettings()
     settings, told = settings_asked(BuildRequest(preset="cpu", discovery="eomt", chunk=50), info, "research")
     assert (settings.discovery, settings.features, settings.chunks) == ("eomt", "own", ChunkSettings(50, 15))
     assert settings.instance_weights == (("discovery/eomt", "tue-mps/coco_panoptic_eomt_large_640"),)

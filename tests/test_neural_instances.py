@@ -13,13 +13,13 @@ pytest.importorskip("transformers")
 
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.views import chunk_views
+from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.library import build_library
 from list3r.instances.neural.appearance import Appearance, WithAppearance, label_shares
 from list3r.instances.neural.candidates import SoftMasks, bounds_the_room, choose_candidates
 from list3r.instances.neural.query_segmenter import QuerySegmenter
 from list3r.instances.neural.sam_masks import SamMasks
 from list3r.instances.registry import check_choice, make_discoverer, make_tracker
-from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import CandidateSettings, InstanceSettings, SamMaskSettings, VideoTrackerSettings
 from list3r.instances.tracking.video_tracker import VideoTracker, _Things
 from list3r.memory.errors import OptionError
@@ -74,10 +74,10 @@ def test_tracker_follows_prompts_through_the_chunk(model: str, checkpoints: dict
     frames, reconstruction = chunk
     settings = InstanceSettings(anchor_step=5)
     tracker = VideoTracker(model, checkpoints[f"tracking/{model}"], "cpu", settings)
-    library = build_library(frames, reconstruction, settings, GeometricDiscoverer(settings), tracker)
+    library = build_library(frames, reconstruction, settings, LearnedDiscoverer(settings), tracker)
     assert isinstance(library, LocalLibrary)
     assert library.feature_space == settings.feature_space
-    again = build_library(frames, reconstruction, settings, GeometricDiscoverer(settings), tracker)
+    again = build_library(frames, reconstruction, settings, LearnedDiscoverer(settings), tracker)
     assert [len(i.track.frames) for i in library.instances] == [len(i.track.frames) for i in again.instances]
 
 
@@ -103,7 +103,7 @@ def test_every_network_runs_in_half_precision(
         made = [found.probability, found.score, found.features]
     else:
         tracker = VideoTracker(model, checkpoints[name], "cpu", InstanceSettings(anchor_step=5))
-        proposals = [GeometricDiscoverer(tracker._settings)(frames, reconstruction, p) for p in (0, 5)]
+        proposals = [LearnedDiscoverer(tracker._settings)(frames, reconstruction, p) for p in (0, 5)]
         things = _Things(proposals, chunk_views(frames, reconstruction, tracker._settings), tracker._tracker)
         swept = tracker._sweep(frames, range(2), things, forwards=True)  # a CPU takes long over bfloat16
         made = [logits for _, masks in swept for logits in masks.values()]
@@ -157,7 +157,7 @@ def test_live_things_are_capped(checkpoints: dict[str, Path], chunk) -> None:
 def test_features_are_pooled_inside_masks(model: str, checkpoints: dict[str, Path], chunk) -> None:
     frames, reconstruction = chunk
     appearance = Appearance(model, checkpoints[f"features/{model}"], "cpu", long_side=112)
-    found = WithAppearance(GeometricDiscoverer(), appearance)(frames, reconstruction, 5)
+    found = WithAppearance(LearnedDiscoverer(), appearance)(frames, reconstruction, 5)
     assert found.features.shape == (len(found.score), 32)
     np.testing.assert_allclose(np.linalg.norm(found.features, axis=1), 1.0, rtol=1e-5)
     whole = np.ones(frames[0].color.shape[:2], np.int32)
@@ -177,7 +177,7 @@ def test_shares_count_every_pixel_once() -> None:
 def test_registry_makes_what_is_named(checkpoints: dict[str, Path]) -> None:
     folders = tuple((name, str(folder)) for name, folder in checkpoints.items())
     settings = InstanceSettings()
-    found = make_discoverer("geometric", "dinov2", folders, "cpu", settings)
+    found = make_discoverer("learned", "dinov2", folders, "cpu", settings)
     assert found.feature_space.startswith("dinov2@")
     assert isinstance(make_tracker("edgetam", folders, "cpu", settings), VideoTracker)
     for wrong in (("eomt", "reprojection", "geometric"), ("magic", "reprojection", "own"), ("eomt", "magic", "own")):
@@ -255,7 +255,7 @@ def test_better_masks_take_the_pixels_and_redundant_ones_go(chunk) -> None:
 
 def test_flat_masks_carry_their_plane(chunk) -> None:
     frames, reconstruction = chunk
-    geometric = GeometricDiscoverer()(frames, reconstruction, 5)
+    geometric = LearnedDiscoverer()(frames, reconstruction, 5)
     flat = [k for k in range(len(geometric.score)) if np.isfinite(geometric.plane[k]).all()]
     views = chunk_views(frames, reconstruction, InstanceSettings())
     probability = np.stack([(geometric.labels == k + 1).astype(np.float32) for k in flat])

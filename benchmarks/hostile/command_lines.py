@@ -57,7 +57,7 @@ _PATHS = (
     "out.usda",
     "new.l3r",
 )
-_WORDS = ("rgbd", "sfm", "given", "estimate", "prior", "tum", "images", "video", "geometric", "learned", "cpu", "cuda")
+_WORDS = ("rgbd", "sfm", "given", "estimate", "prior", "tum", "images", "video", "learned", "eomt", "cpu", "cuda")
 _WORDS += ("on", "left_of", "between", "any", "present", "white", "camera", "commercial", "research", "icp", "none")
 
 

@@ -33,9 +33,6 @@ class Proposals:
     """The thing each candidate is a view of, where the discoverer knows it across anchors. Shape (N,)."""
     structure: NDArray[np.bool_] | None = None
     """Candidates that bound the room (floor, wall, ceiling), where the discoverer knows. Shape (N,)."""
-    base: NDArray[np.float64] | None = None
-    """Plane, in camera coordinates of the anchor, of the wall or floor that a flat candidate lies on, NaN for the
-    others, where the discoverer knows. Shape (N, 4)."""
     names: tuple[str, ...] | None = None
     """Class name of each candidate, where the discoverer has names. N of them."""
     whole: NDArray[np.float32] | None = None

@@ -10,7 +10,7 @@ import numpy as np
 from list3r.frames.base import Frame
 from list3r.instances.base import Discoverer, Proposals, Tracker
 from list3r.instances.geometric.views import chunk_views, forget_views
-from list3r.instances.rules.discovery import GeometricDiscoverer
+from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.movers import with_movers
 from list3r.instances.tracking.reprojection import ReprojectionTracker
@@ -30,12 +30,12 @@ def build_library(
 ) -> LocalLibrary:
     """Find the things of a chunk and follow them through it.
 
-    `frames` are the chunk's frames in the order of the reconstruction. Without a discoverer and a tracker the ones
-    that need no weights are used. What the reconstruction found to move of its own is added as instances that are
-    `dynamic`; the others do not see it, for it has no depth there.
+    `frames` are the chunk's frames in the order of the reconstruction. Without a discoverer and a tracker those
+    are used that need no weights from elsewhere. What the reconstruction found to move of its own is added as
+    instances that are `dynamic`; the others do not see it, for it has no depth there.
     """
     settings = settings or InstanceSettings()
-    discoverer = discoverer or GeometricDiscoverer(settings)
+    discoverer = discoverer or LearnedDiscoverer(settings)
     tracker = tracker or ReprojectionTracker(settings)
     try:
         views = chunk_views(frames, reconstruction, settings)
@@ -64,7 +64,6 @@ def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposal
         plane=proposals.plane[keep],
         identity=None if proposals.identity is None else proposals.identity[keep],
         structure=None if proposals.structure is None else proposals.structure[keep],
-        base=None if proposals.base is None else proposals.base[keep],
         names=None if proposals.names is None else tuple(proposals.names[k] for k in keep.tolist()),
         whole=None if proposals.whole is None else proposals.whole[keep],
         named=None if proposals.named is None else tuple(proposals.named[k] for k in keep.tolist()),

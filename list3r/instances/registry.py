@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from list3r.instances.base import Discoverer, Tracker
-from list3r.instances.rules.discovery import GeometricDiscoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.reprojection import ReprojectionTracker
 from list3r.memory.errors import OptionError
@@ -15,12 +14,10 @@ from list3r.memory.errors import OptionError
 if TYPE_CHECKING:
     from list3r.instances.neural.appearance import Appearance
 
-DISCOVERERS = ("geometric", "learned", "eomt", "mask2former", "sam2", "sam3", "precomputed")
-WITHOUT_DOWNLOAD = ("geometric", "learned")
-"""Discoverers that need no weights from elsewhere; their features are the geometric ones."""
+DISCOVERERS = ("learned", "eomt", "mask2former", "sam2", "sam3", "precomputed")
 TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
 FEATURES = ("geometric", "own", "dinov2", "dinov3")
-"""`own` are those of a neural discoverer; geometric ones belong to the geometric discoverer."""
+"""`own` are those of a neural discoverer; geometric ones (colour and shape) belong to the learned discoverer."""
 
 
 def check_choice(discovery: str, tracking: str, features: str) -> None:
@@ -32,12 +29,9 @@ def check_choice(discovery: str, tracking: str, features: str) -> None:
     ):
         if value not in known:
             raise OptionError(f"--{option} {value} is not known; choose one of {', '.join(known)}")
-    ours = discovery in WITHOUT_DOWNLOAD
-    if features == "geometric" and not ours:
-        raise OptionError(
-            f"--features geometric needs --discovery geometric or learned; with {discovery} use own or dinov2"
-        )
-    if features == "own" and ours:
+    if features == "geometric" and discovery != "learned":
+        raise OptionError(f"--features geometric needs --discovery learned; with {discovery} use own or dinov2")
+    if features == "own" and discovery == "learned":
         raise OptionError(f"--features own are those of a neural discoverer; with {discovery} use geometric or dinov2")
 
 
@@ -46,13 +40,11 @@ def make_discoverer(
 ) -> Discoverer:
     """The discoverer of that name; `folders` are (part/model, folder of its weights). Raises `OptionError`.
 
-    Networks are loaded once in a process; the geometric discoverer is made anew, for it holds on to its chunk.
+    Networks are loaded once in a process; the learned discoverer is made anew, for it holds on to its chunk.
     """
     where = dict(folders)
     found: Discoverer
-    if discovery == "geometric":
-        found = GeometricDiscoverer(settings)
-    elif discovery == "learned":
+    if discovery == "learned":
         from list3r.instances.learned.discovery import LearnedDiscoverer
 
         found = LearnedDiscoverer(settings)

@@ -43,19 +43,6 @@ class SegmentSettings:
 
     voxel_m: float = 0.01
     """Grain of the chunk's cloud."""
-    plane_area_m2: float = 0.03
-    """Smallest flat surface looked for."""
-    big_plane_area_m2: float = 0.7
-    """A flat surface at least this large is an instance of its own."""
-    support_area_m2: float = 0.06
-    """Smallest level surface that parts the things above it from those below."""
-    thing_size_m: float = 0.035
-    """Smallest diameter of a thing that stands out of a surface."""
-    flat_area_m2: float = 0.008
-    """Smallest sheet that is told from the surface under it by colour alone (a postcard is 0.015)."""
-    least_spread: float = 0.75
-    """Of computed depth: deviation of a thing's points along the second of its axes, over that of its depth; a bar as
-    wide as what its depth may be off by to either side has 0.58."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from list3r.models.device import Gpu
 from list3r.models.licences import objection
 
 PRESETS = ("cpu", "light", "paper", "auto")
-"""cpu: no weights. light: small networks free for any use. paper: the paper's models. auto: what this machine has."""
+"""cpu: nothing to fetch. light: small networks, free for any use. paper: the paper's. auto: what this machine has."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class ModelSelection:
 
     reconstruction: str = "auto"
     """`auto`: rgbd where there is depth, else sfm."""
-    discovery: str = "geometric"
+    discovery: str = "learned"
     tracking: str = "reprojection"
     features: str = "geometric"
     why: str = ""
@@ -42,7 +42,7 @@ class ModelSelection:
 def select(preset: str, *, has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelection:
     """Return the models of a preset for a source. Raises `OptionError` for a preset that is not known."""
     if preset == "cpu":
-        return ModelSelection(why="preset cpu: no weights")
+        return ModelSelection(why="preset cpu: nothing to fetch")
     if preset == "light":
         geometry = "auto" if has_depth else "da3"
         return ModelSelection(geometry, "eomt", "edgetam", "dinov2", "preset light: small networks, free for any use")
@@ -73,7 +73,7 @@ def _by_machine(has_depth: bool, profile: str, gpu: Gpu | None) -> ModelSelectio
             reasons.append(usable)
         elif candidates:
             reasons.append(f"no {part} network ({candidates[0]}: {why_not[candidates[0]]})")
-    if chosen.features == "geometric" and chosen.discovery != "geometric":
+    if chosen.features == "geometric" and chosen.discovery != "learned":
         chosen = replace(chosen, features="own")
     where = f"{gpu.name}, {gpu.free_mb / 1024:.1f} GB free"
     return replace(chosen, why=f"preset auto on {where}: {', '.join(reasons)}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings
-from list3r.instances.registry import WITHOUT_DOWNLOAD
+from list3r.instances.registry import DISCOVERERS
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.models.cards import ModelCard, find_card, find_weights
@@ -41,8 +41,6 @@ MODEL_CHOICES = (
 """Fields of `BuildSettings` that say which models run."""
 _NAMING = ("reconstruction", "preset", "discovery", "tracking", "features", "device", "weights", "local_features")
 """Fields of `BuildRequest` that choose them."""
-SENSED = ("auto", "rgbd")
-"""Reconstructions that take depth as the sensor measured it, where there is any."""
 
 
 def settings_asked(request: BuildRequest, info: SourceInfo, licence: str) -> tuple[BuildSettings, list[str]]:
@@ -69,6 +67,11 @@ def settings_resumed(
     if any(getattr(request, name) != getattr(default, name) for name in _NAMING):
         named, notes = _models_asked(request, info, licence)
         settings = replace(settings, **{name: getattr(named, name) for name in MODEL_CHOICES})
+    if settings.discovery not in DISCOVERERS:
+        raise OptionError(
+            f"this session was begun with --discovery {settings.discovery}, which this version does not have; "
+            "go on with --discovery learned"
+        )
     if request.chunk is not None or request.overlap is not None:
         settings = replace(settings, chunks=_cut(settings, request.chunk, request.overlap))
     return settings, notes
@@ -166,16 +169,13 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
     if request.preset is not None:
         gpu = find_gpu(request.device) if request.preset == "auto" else None
         chosen = select(request.preset, has_depth=info.has_depth, profile=licence, gpu=gpu)
-    sensed = info.has_depth and (request.reconstruction or chosen.reconstruction) in SENSED
-    if request.discovery is None and chosen.discovery == "geometric" and sensed:
-        chosen = replace(chosen, discovery="learned")
     given = {k: getattr(request, k) for k in ("reconstruction", "discovery", "tracking", "features")}
     named = {k: str(v) for k, v in given.items() if v is not None}
     if "discovery" in named and "features" not in named:
-        neural = named["discovery"] not in WITHOUT_DOWNLOAD
-        if neural and chosen.features == "geometric":
+        learned = named["discovery"] == "learned"
+        if not learned and chosen.features == "geometric":
             named["features"] = "own"
-        elif not neural and chosen.features == "own":
+        elif learned and chosen.features == "own":
             named["features"] = "geometric"
     if named and chosen.why:
         named["why"] = f"{chosen.why}; {', '.join(f'--{k} {v}' for k, v in named.items())} as asked"

@@ -49,7 +49,7 @@ class BuildRequest:
     preset: str | None = field(
         default=None,
         metadata=option(
-            "cpu (no weights), light (small networks, free for any use), paper, or auto (what this machine has)."
+            "cpu (nothing to fetch), light (small networks, free for any use), paper, or auto (what this machine has)."
         ),
     )
     discovery: str | None = field(

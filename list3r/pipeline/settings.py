@@ -73,7 +73,7 @@ class BuildSettings:
     """Where neural models run: cpu, cuda, or auto, the first GPU where there is one."""
     weights: str | None = None
     """Weights of the reconstruction model instead of its own."""
-    discovery: str = "geometric"
+    discovery: str = "learned"
     """What finds things on anchor frames."""
     tracking: str = "reprojection"
     """What follows them through the chunk."""

@@ -121,12 +121,6 @@ def neighbour_pairs(keys: NDArray[np.int64], radius: int) -> tuple[NDArray[np.in
     return np.concatenate(left), np.concatenate(right)
 
 
-def linked_components(keys: NDArray[np.int64], radius: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Connected components of voxels with neighbours within `radius`: each one's number and the sizes. Keys ascend."""
-    left, right = neighbour_pairs(keys, radius)
-    return component_numbers(left, right, len(keys))
-
-
 def component_numbers(
     left: NDArray[np.int64], right: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -22,16 +22,12 @@ from list3r.reconstruction.base import Reconstruction
 class Segment:
     """One thing of the chunk."""
 
-    kind: str
-    """surface, sheet, thing."""
     plane: NDArray[np.float64] | None
     """Its plane in chunk coordinates where it is flat. Shape (4,)."""
     structure: bool
     """A surface that bounds the room."""
     score: float
     """How sure it is one thing, in [0, 1]."""
-    base: NDArray[np.float64] | None = None
-    """Plane of the wall or floor that a panel lies on, chunk coordinates, n towards the cameras. Shape (4,)."""
     named: tuple[tuple[str, float], ...] = ()
     """Names that it may have, with their probabilities."""
 
@@ -117,13 +113,11 @@ def proposals_of(
     renumber = np.zeros(len(cut.segments) + 1, np.int32)
     renumber[order + 1] = np.arange(1, len(order) + 1)
     full = np.repeat(np.repeat(renumber[labels], stride, axis=0), stride, axis=1)[: shape[0], : shape[1]]
-    planes, bases = np.full((len(order), 4), np.nan), np.full((len(order), 4), np.nan)
+    planes = np.full((len(order), 4), np.nan)
     for row, number in enumerate(order):
         segment = cut.segments[number]
         if segment.plane is not None:
             planes[row] = segment.plane @ view.T_chunk_cam
-        if segment.base is not None:
-            bases[row] = segment.base @ view.T_chunk_cam
     structure = np.array([cut.segments[number].structure for number in order], bool)
     named = tuple(cut.segments[number].named for number in order.tolist())
     return Proposals(
@@ -134,6 +128,5 @@ def proposals_of(
         plane=planes,
         identity=order.astype(np.int64),
         structure=structure,
-        base=bases,
         named=named if any(named) else None,
     )

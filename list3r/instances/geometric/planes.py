@@ -50,9 +50,6 @@ class Plane:
     """Voxels of the cloud, ascending. Shape (M,)."""
     area: float
     """Square chunk units."""
-    raster: Raster
-    footprint: NDArray[np.uint8]
-    """1 where the surface is, small holes filled. Shape of the raster."""
 
     @property
     def normal(self) -> NDArray[np.float64]:
@@ -62,11 +59,6 @@ class Plane:
     def height(self, points: Float) -> Float:
         """Signed distance of points, positive on the cameras' side. Shape (N, 3) -> (N,)."""
         return np.asarray(points @ self.equation[:3] + self.equation[3], dtype=np.float32)
-
-    def extent(self) -> NDArray[np.float64]:
-        """Lengths of the least rectangle round the footprint, longer first, chunk units. Shape (2,)."""
-        rc = np.argwhere(self.footprint > 0).astype(np.float32)
-        return np.sort(np.asarray(cv2.minAreaRect(rc)[1]) + 1.0)[::-1] * self.raster.cell
 
 
 def plane_tolerance(cloud: Cloud) -> Float:
@@ -155,8 +147,7 @@ def _pieces(
         mask = (labels == label).astype(np.uint8)
         area = float((mask & image).sum()) * cell**2
         if area >= min_area:
-            footprint = _fill_holes(mask, 0.25 * unit / cell)
-            out.append(Plane(equation, inliers[own == label], area, raster, footprint))
+            out.append(Plane(equation, inliers[own == label], area))
     return sorted(out, key=lambda plane: -plane.area)
 
 
@@ -166,15 +157,6 @@ def _paint(equation: NDArray[np.float64], points: Float, cell: float) -> tuple[R
     image = np.zeros(raster.shape, np.uint8)
     image[rc[:, 0], rc[:, 1]] = 1
     return raster, image
-
-
-def footprint_of(
-    equation: NDArray[np.float64], points: Float, cell: float, unit: float
-) -> tuple[Raster, NDArray[np.uint8]]:
-    """A raster on the plane and 1 where the points are, small gaps and holes filled."""
-    raster, image = _paint(equation, points, cell)
-    closed = np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
-    return raster, _fill_holes(closed, 0.25 * unit / cell)
 
 
 def plane_raster(equation: NDArray[np.float64], points: Float, cell: float) -> Raster:
@@ -188,17 +170,6 @@ def plane_raster(equation: NDArray[np.float64], points: Float, cell: float) -> R
     size = np.ceil((local.max(axis=0) + 3.0 * cell - low) / cell).astype(int) + 1
     origin = low @ axes - equation[3] * n
     return Raster(origin, axes, cell, (int(size[1]), int(size[0])))
-
-
-def _fill_holes(mask: NDArray[np.uint8], size: float) -> NDArray[np.uint8]:
-    """The mask with enclosed holes filled that are at most `size` cells across."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((1 - mask).astype(np.uint8), connectivity=4)
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    out = mask.copy()
-    for label in range(1, count):
-        if label not in border and stats[label, cv2.CC_STAT_AREA] <= size**2 and not mask[labels == label].any():
-            out[labels == label] = 1
-    return out
 
 
 def estimate_up(planes: list[Plane], T_chunk_cam: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,15 +17,11 @@ def collect_supports(
     views: ChunkViews,
     proposals: Sequence[Proposals],
     images: Sequence[NDArray[np.int32]],
-    bases: NDArray[np.float64],
+    count: int,
     max_points: int,
 ) -> list[Support]:
-    """Support of each instance from label images (instance + 1) of the anchors, thinned by voxels.
-
-    `bases` (count, 4) are the planes, in chunk coordinates, of the walls and floors that flat instances lie on, NaN for
-    the others.
-    """
-    points, rgb, confidence, owner, noise = [], [], [], [], []
+    """Support of each of `count` instances from label images (instance + 1) of the anchors, thinned by voxels."""
+    points, rgb, confidence, owner = [], [], [], []
     for candidates, image in zip(proposals, images, strict=True):
         view = views.view(candidates.position)
         mask = (image > 0) & view.confirmed
@@ -34,21 +30,16 @@ def collect_supports(
         rgb.append(view.rgb[mask])
         confidence.append(single[mask].astype(np.float32))
         owner.append(image[mask] - 1)
-        noise.append(view.reading[mask])
     if not points:
         return []
-    xyz, colors, sure, owners, sigma = (np.concatenate(part) for part in (points, rgb, confidence, owner, noise))
-    count = len(bases)
+    xyz, colors, sure, owners = (np.concatenate(part) for part in (points, rgb, confidence, owner))
     order = np.argsort(owners, kind="stable")
     bounds = np.searchsorted(owners[order], np.arange(count + 1))
     out = []
     for number in range(count):
         mine = order[bounds[number] : bounds[number + 1]]
         mine = mine[without_fliers(xyz[mine], views.unit)]
-        flat = len(mine) > 0 and np.isfinite(bases[number]).all()
-        places = _press(xyz[mine], sigma[mine], bases[number]) if flat else xyz[mine]
-        support = thin(places, colors[mine], sure[mine], views.unit, max_points)
-        out.append(_set_on(support, bases[number]) if flat else support)
+        out.append(thin(xyz[mine], colors[mine], sure[mine], views.unit, max_points))
     return out
 
 
@@ -72,26 +63,6 @@ def without_fliers(points: NDArray[np.float32], unit: float) -> NDArray[np.int64
     usual = float(np.median(held)) if len(held) else 0.0
     keep = np.flatnonzero(held >= max(2.0 if usual >= 4.0 else 1.0, FLIER_SHARE * usual))
     return keep if len(keep) >= 10 else np.arange(len(points))
-
-
-def _press(points: NDArray[np.float32], sigma: NDArray[np.float32], base: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Points of a flat thing with what may be noise of their depth taken off their height over its base."""
-    height = points @ base[:3] + base[3]
-    away = height - np.median(height)
-    off = np.clip(away, -2.0 * sigma, 2.0 * sigma)
-    return np.asarray(points - off[:, None] * base[:3], np.float32)
-
-
-def _set_on(support: Support, base: NDArray[np.float64]) -> Support:
-    """Support of a flat thing with every fourth point repeated on the base: it reaches down to what it lies on."""
-    some = support.points[::4]
-    height = some @ base[:3] + base[3]
-    foot = (some - np.maximum(height, 0.0)[:, None] * base[:3]).astype(np.float32)
-    return Support(
-        np.concatenate([support.points, foot]),
-        np.concatenate([support.confidence, 0.5 * support.confidence[::4]]).astype(np.float32),
-        np.concatenate([support.rgb, support.rgb[::4]]),
-    )
 
 
 def thin(

@@ -81,6 +81,9 @@ class LearnedDiscoverer(CloudDiscoverer):
         planes = find_planes(cloud, self._learned.plane_area_m2 * views.unit**2, views.unit)
         up = estimate_up(planes, poses)
         height = float(np.median(poses[:, :3, 3] @ up))
+        if not len(cloud.keys):
+            self._scraps = None
+            return cloud, Segmentation(np.zeros(0, np.int32), (), up), np.zeros((0, 64), np.float32)
         around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
         surface = chunk_surface(cloud, shown, around)
         cut = cut_cloud(surface, self._weights, self._learned.cut)
@@ -164,9 +167,8 @@ def _described(
         structure = bool(cut.told.structure[number] > 0.5)
         features[number] = object_feature(cloud.points[mine], rgb[mine], up, unit)
         plane = _plane_of(cloud, mine, unit)
-        kind = "surface" if structure and plane is not None else "thing"
         score = 0.95 if structure else float(cut.told.whole[number])
-        segments.append(Segment(kind, plane, structure, score, named=named[number]))
+        segments.append(Segment(plane, structure, score, named=named[number]))
     return Segmentation(np.asarray(cut.labels + 1, np.int32), tuple(segments), up), features
 
 

@@ -71,8 +71,7 @@ class ReprojectionTracker:
         joined = join_candidates(views, proposals)
         count = max((int(j.max()) + 1 for j in joined if len(j)), default=0)
         images = [_instance_image(views, p, j) for p, j in zip(proposals, joined, strict=True)]
-        bases = _bases(views, proposals, joined, count)
-        supports = collect_supports(views, proposals, images, bases, self.settings.track.support_points)
+        supports = collect_supports(views, proposals, images, count, self.settings.track.support_points)
         positions = np.array([p.position for p in proposals], np.int64)
 
         def labels_of(position: int) -> NDArray[np.int32]:
@@ -280,18 +279,6 @@ def _surface(
                 T_cam_chunk = np.linalg.inv(views.pose(candidates.position))
                 return np.asarray(candidates.plane[n] @ T_cam_chunk), structure
     return None, structure
-
-
-def _bases(
-    views: ChunkViews, proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], count: int
-) -> NDArray[np.float64]:
-    """Plane of the wall or floor that each flat instance lies on, chunk coordinates, NaN for the others. (count, 4)."""
-    out = np.full((count, 4), np.nan)
-    for candidates, owner in zip(proposals, joined, strict=True):
-        if candidates.base is not None:
-            known = np.isfinite(candidates.base).all(axis=1) & np.isnan(out[owner, 0])
-            out[owner[known]] = candidates.base[known] @ np.linalg.inv(views.pose(candidates.position))
-    return out
 
 
 def _names(

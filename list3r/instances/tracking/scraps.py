@@ -30,8 +30,7 @@ def scrap_instances(
     stride, images = views.stride, dict[int, NDArray[np.int32]]()
     for p, n in told:
         images[p.position] = np.append(0, n + 1).astype(np.int32)[p.labels[::stride, ::stride]]
-    nowhere = np.full((count, 4), np.nan)
-    supports = collect_supports(views, kept, list(images.values()), nowhere, s.support_points)
+    supports = collect_supports(views, kept, list(images.values()), count, s.support_points)
     tracks = LabelledChunk(views, kept, numbers, supports, settings).follow(images.__getitem__, sorted(images))
     whole = {k: float(v) for p, n in told for k, v in zip(n.tolist(), p.score, strict=True)}
     feature = {k: v for p, n in told for k, v in zip(n.tolist(), p.features, strict=True)}

@@ -78,8 +78,7 @@ class VideoTracker:
             for position, masks in self._sweep(frames, order[::-1], things, forwards=False):
                 things.keep(position, masks)
         images = [things.labels(p.position) for p in proposals]
-        bases = np.full((things.count, 4), np.nan)
-        supports = collect_supports(views, proposals, images, bases, self._settings.track.support_points)
+        supports = collect_supports(views, proposals, images, things.count, self._settings.track.support_points)
         chunk = LabelledChunk(views, proposals, things.joined, supports, self._settings)
         return chunk.library(things.labels, feature_space)
 

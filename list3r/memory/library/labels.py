@@ -131,9 +131,7 @@ def decide_by_rank(
     return decide(others, known, settings) or decide(votes, known, settings)
 
 
-def _said(
-    votes: Votes, name: str, source: str, known: Collection[str] | None, likeness: float
-) -> tuple[float, float]:
+def _said(votes: Votes, name: str, source: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:
     """Return pictures in which a source found a class, and its log odds for it; one that it does not know is not
     missed.
     """
