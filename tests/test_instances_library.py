@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
+from list3r.instances.geometric.kernels import without_lone
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.library import InstanceSettings, build_library
@@ -276,3 +277,12 @@ def test_every_instance_shows_in_a_kept_picture(
         store.keyframes.add(chunk, kept[1:])
         assert set(store.keyframes.with_picture(1)) == pictured - {0}
         assert store.keyframes.descriptors([1])[0][:, 1].tolist() == [0]
+
+
+def test_lone_pixels_lose_their_label() -> None:
+    labels = np.random.default_rng(1).integers(0, 3, (9, 7)).astype(np.int32)
+    framed = np.pad(labels, 1, constant_values=-1)
+    near = [framed[1 + y : 10 + y, 1 + x : 8 + x] for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y]
+    kept, most = without_lone(labels)
+    assert np.array_equal(most, np.max(near, axis=0))
+    assert np.array_equal(kept, np.where(sum(n == labels for n in near) >= 3, labels, 0))

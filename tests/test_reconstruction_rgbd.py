@@ -14,7 +14,9 @@ from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.reconstruction.base import backproject
+from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
+from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import sense
@@ -46,6 +48,12 @@ def test_the_same_frames_give_the_same_result(frames: list[Frame]) -> None:
     a, b = (RgbdReconstructor()(frames[:15], CAMERA) for _ in range(2))
     assert np.array_equal(a.T_chunk_cam, b.T_chunk_cam)
     assert np.array_equal(a.confidence, b.confidence)
+
+
+def test_confidence_is_that_of_each_depth_image_by_itself(frames: list[Frame]) -> None:
+    found = RgbdReconstructor()(frames[:4], CAMERA)
+    for depth, confidence in zip(found.depth, found.confidence, strict=True):
+        assert np.array_equal(confidence, depth_confidence(depth, CAMERA, ConfidenceSettings()))
 
 
 def test_given_poses_are_kept_and_bad_ones_are_not_used(frames: list[Frame], truth: np.ndarray) -> None:

@@ -9,19 +9,25 @@ from numpy.typing import NDArray
 from list3r.compiled import compiled
 from list3r.frames.base import Camera
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
-from list3r.reconstruction.rgbd.view import Floats, shrink_depth, surface
+from list3r.reconstruction.rgbd.view import Floats, cosines, shrink_depth, surface
 
 _BEYOND = 1e6
 """Farther than any depth, metres."""
 
 
-def depth_confidence(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> NDArray[np.float16]:
-    """Confidence in [0, 1] of each pixel, 0 where depth is unknown. Shape (H, W)."""
+def depth_confidence(
+    depth: Floats, camera: Camera, settings: ConfidenceSettings, cosine: Floats | None = None
+) -> NDArray[np.float16]:
+    """Confidence in [0, 1] of each pixel, 0 where depth is unknown. Shape (H, W).
+
+    `cosine` is what `cosines` says of the depth at a small size, where that is known already.
+    """
     window, noise = np.ones((3, 3), np.uint8), settings.noise
     lowest = cv2.erode(np.where(depth > 0, depth, np.float32(_BEYOND)), window)
     law = noise.constant_m, noise.quadratic_per_m, noise.nearest_m, settings.half_sigma_m
     edge = 2 * settings.edge_step, settings.edge_confidence
-    found = _confidence(depth, cv2.dilate(depth, window) - lowest, _facing(depth, camera, settings), law, edge)
+    facing = _facing(_cosines(depth, camera, settings) if cosine is None else cosine, camera, settings)
+    found = _confidence(depth, cv2.dilate(depth, window) - lowest, facing, law, edge)
     return found.astype(np.float16)
 
 
@@ -45,13 +51,14 @@ def _confidence(
     return out
 
 
-def _facing(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> Floats:
-    """Factor of the grazing angle, measured on a small image. Shape (H, W)."""
+def _cosines(depth: Floats, camera: Camera, settings: ConfidenceSettings) -> Floats:
     small = camera.shrunk(settings.working_width)
-    points, normals, valid = surface(shrink_depth(depth, small, settings.noise), small)
-    distance = np.sqrt(np.einsum("...i,...i->...", points, points))
-    cosine = -np.einsum("...i,...i->...", points, normals) / np.maximum(distance, 1e-6)
-    factor = np.where(valid, np.clip(cosine / settings.full_cosine, 0.0, 1.0), 0.5).astype(np.float32)
+    return cosines(*surface(shrink_depth(depth, small, settings.noise), small))
+
+
+def _facing(cosine: Floats, camera: Camera, settings: ConfidenceSettings) -> Floats:
+    """Factor of the grazing angle, from small cosines (h, w). Shape (H, W)."""
+    factor = np.where(np.isnan(cosine), 0.5, np.clip(cosine / settings.full_cosine, 0.0, 1.0)).astype(np.float32)
     return np.asarray(cv2.resize(factor, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 

@@ -24,7 +24,7 @@ from list3r.reconstruction.prior import given_step
 from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
-from list3r.reconstruction.rgbd.view import WorkingFrame, make_view
+from list3r.reconstruction.rgbd.view import Floats, WorkingFrame, cosines, make_view
 
 Pose = NDArray[np.float64]
 
@@ -61,6 +61,8 @@ class CameraTracker:
         self.frames, self.camera, self.settings = frames, camera, settings
         self.small = camera.shrunk(settings.working_width)
         self.segments: list[TrackedSegment] = []
+        self.cosines: dict[int, Floats] = {}
+        """How the surfaces of each frame with depth are faced, by position. Shape (h, w) each."""
         self._prior = prior
         self._features: dict[int, Features] = {}
         self._views: dict[int, WorkingFrame] = {}
@@ -88,7 +90,9 @@ class CameraTracker:
             self._views.clear()
             frame = self.frames[position]
             assert frame.depth is not None
-            self._views[position] = make_view(frame.color, frame.depth, self.small, self.settings.noise)
+            view = make_view(frame.color, frame.depth, self.small, self.settings.noise)
+            self._views[position] = view
+            self.cosines[position] = cosines(view.points, view.normals, view.valid)
         return self._views[position]
 
     @property

@@ -24,6 +24,7 @@ from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker
 from list3r.reconstruction.rgbd.settings import RgbdSettings
+from list3r.reconstruction.rgbd.view import Floats
 
 
 def make(options: ModelOptions) -> RgbdReconstructor:
@@ -60,22 +61,25 @@ class RgbdReconstructor:
         for k, frame in enumerate(frames):
             if frame.depth is not None:
                 depth[k] = frame.depth
+        faced: Mapping[int, Floats] = {}
         if self.poses == "given":
             T, posed = given_poses(frames)
             keyframes = select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry.keyframes)
             moving = self._moving(frames, T, posed, camera, {})
         else:
-            T, posed, keyframes, left_out = self._estimate(frames, camera)
-            moving = self._moving(frames, T, posed, camera, left_out)
+            T, posed, keyframes, tracker = self._estimate(frames, camera)
+            moving = self._moving(frames, T, posed, camera, tracker.moving)
             if moving is not None:
                 known = {k: _rim(m > 0) for k, m in enumerate(moving) if m.any()}
-                T, posed, keyframes, left_out = self._estimate(frames, camera, known)
-                moving = self._moving(frames, T, posed, camera, left_out)
+                T, posed, keyframes, tracker = self._estimate(frames, camera, known)
+                moving = self._moving(frames, T, posed, camera, tracker.moving)
+            faced = tracker.cosines
         if moving is not None:
             _take_out(depth, moving)
+            faced = {k: cosine for k, cosine in faced.items() if not moving[k].any()}
         confidence = np.zeros(depth.shape, np.float16)
         for k, image in enumerate(depth):
-            confidence[k] = depth_confidence(image, camera, self.settings.confidence)
+            confidence[k] = depth_confidence(image, camera, self.settings.confidence, faced.get(k))
         return Reconstruction(
             frame_indices=np.array([frame.index for frame in frames], np.int64),
             posed=posed,
@@ -106,8 +110,8 @@ class RgbdReconstructor:
 
     def _estimate(
         self, frames: Sequence[Frame], camera: Camera, known: Mapping[int, NDArray[np.bool_]] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], Mapping[int, NDArray[np.bool_]]]:
-        """Poses, which frames have one, keyframes, and what was left out of each frame; without what `known` holds."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], CameraTracker]:
+        """Poses, which frames have one, keyframes, and what followed the camera; without what `known` holds."""
         tracker = CameraTracker(frames, camera, self.settings.odometry, known, prior=self.poses == "prior")
         segments = tracker.run()
         if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
@@ -123,7 +127,7 @@ class RgbdReconstructor:
             given = stacked([f.T_source_cam for f in frames])
             T_source_chunk = source_from_chunk(T, posed, given, self.settings.odometry.prior)
             T[posed] = T[posed] if T_source_chunk is None else T_source_chunk @ T[posed]
-        return T, posed, segments[0].keyframes, tracker.moving
+        return T, posed, segments[0].keyframes, tracker
 
 
 def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

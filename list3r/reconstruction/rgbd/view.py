@@ -85,6 +85,13 @@ def surface(depth: Floats, camera: Camera) -> tuple[Floats, Floats, NDArray[np.b
     return points, _unit(np.ascontiguousarray(cv2.blur(normals, (3, 3)))), valid
 
 
+def cosines(points: Floats, normals: Floats, valid: NDArray[np.bool_]) -> Floats:
+    """Cosine of the angle between the ray to the camera and the normal, NaN where unknown. Shape (h, w)."""
+    distance = np.sqrt(np.einsum("...i,...i->...", points, points))
+    cosine = -np.einsum("...i,...i->...", points, normals) / np.maximum(distance, 1e-6)
+    return np.where(valid, cosine, np.float32(np.nan))
+
+
 @compiled
 def _surface(depth: Floats, rays: Floats, valid: NDArray[np.bool_], steepest: float) -> tuple[Floats, Floats]:
     """Points and unit normals of a depth image; `valid` is taken back, in place, where depth is too steep."""
