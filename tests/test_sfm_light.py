@@ -12,7 +12,7 @@ import pytest
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.calibration import _agreeing, _Estimate, _parted
 from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, CornerSettings
-from list3r.reconstruction.sfm.tracks import as_bright, follow_corners
+from list3r.reconstruction.sfm.tracks import as_bright, follow_corners, smoothed, values_at
 
 
 def wall(count: int = 24) -> list[np.ndarray]:
@@ -36,11 +36,16 @@ def test_corners_live_as_long_when_the_exposure_swings() -> None:
     assert life(swinging, least_brightening=256.0) < 0.7 * life(steady)
 
 
+def around(*seen: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Grey values of pictures around places in them."""
+    return tuple(values_at(smoothed(picture), xy) for picture, xy in seen)
+
+
 def test_nothing_is_done_to_pictures_of_one_exposure() -> None:
     first, *_, last = wall(6)
     assert as_bright(first, last) is first
     xy = np.random.default_rng(102).uniform(20, 200, (80, 2)).astype(np.float32)
-    assert as_bright(first, last, places=(xy + np.float32([15, 0]), xy)) is first
+    assert as_bright(first, last, values=around((first, xy + np.float32([15, 0])), (last, xy))) is first
     black = np.zeros_like(first)
     assert as_bright(black, first) is black and as_bright(first, black) is first
 
@@ -53,7 +58,7 @@ def test_brightness_and_contrast_are_told_by_places_that_show_the_same(gain: flo
     xy = rng.uniform(8, [310, 230], (120, 2)).astype(np.float32)
     there = xy.copy()
     there[:20] = rng.uniform(8, [310, 230], (20, 2))  # wrongly followed
-    made = as_bright(old, new, places=(xy, there)).astype(float)
+    made = as_bright(old, new, values=around((old, xy), (new, there))).astype(float)
     assert np.abs(made - new)[(new > 10) & (new < 245)].mean() < 4.0
 
 

@@ -35,6 +35,8 @@ class CornerSettings:
     """Largest mean difference of grey values between a corner and where it was first seen."""
     least_brightening: float = 3.0
     """Grey values that a picture has to be brighter or darker than another to be brought to its brightness first."""
+    brightness_samples: int = 512
+    """About so many corners at the most tell that."""
     keyframe_flow: float = 0.05
     """A frame is a keyframe when half of the corners of the last one have moved so far, by the longer side."""
     keyframe_survival: float = 0.55

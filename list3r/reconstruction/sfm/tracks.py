@@ -55,20 +55,18 @@ def follow_corners(grays: Sequence[Gray], settings: CornerSettings | None = None
 
 
 def as_bright(
-    old: Gray, new: Gray, least: float = 3.0, places: tuple[Floats, Floats] | None = None, samples: int = 512
+    old: Gray, new: Gray, least: float = 3.0, values: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 ) -> Gray:
     """`old` with the brightness and contrast of `new`, as a camera changes them between two frames; `old` itself where
     they differ by less than `least` grey values.
 
-    Pixels that show the same are told by `places`, (N, 2) px in either; without, all pixels are compared by rank, as of
-    frames that follow each other. What is black or blown out in either tells nothing.
+    `values` are grey values of both where they show the same, (N,) each; without, all pixels are compared by rank, as
+    of frames that follow each other. What is black or blown out in either tells nothing.
     """
-    if places is None:
+    if values is None:
         ranks = np.linspace(0.02, 0.98, 49)
-        a, b = (np.quantile(p[::8, ::8], ranks) for p in (old, new))
-    else:
-        step = max(1, len(places[0]) // samples)
-        a, b = (_around(p, xy[::step]) for p, xy in zip((old, new), places, strict=True))
+        values = np.quantile(old[::8, ::8], ranks), np.quantile(new[::8, ::8], ranks)
+    a, b = values
     told = (a > _BLACK) & (a < _WHITE) & (b > _BLACK) & (b < _WHITE)
     if told.sum() < _LEAST_TOLD:
         return old
@@ -100,10 +98,15 @@ _GAINS = (0.25, 4.0)
 """Changes of contrast that are believed."""
 
 
-def _around(gray: Gray, xy: Floats) -> NDArray[np.float64]:
-    """Mean grey values of the 7 x 7 px round places (N, 2); those outside count as the rim. Shape (N,)."""
-    x, y = np.clip(np.rint(xy), 0, np.array(gray.shape[::-1]) - 1).astype(int).T
-    return np.asarray(cv2.blur(gray, (7, 7))[y, x], np.float64)
+def smoothed(gray: Gray) -> Gray:
+    """Mean grey values of the 7 x 7 px round each pixel."""
+    return np.asarray(cv2.blur(gray, (7, 7)), np.uint8)
+
+
+def values_at(image: Gray, xy: Floats) -> NDArray[np.float64]:
+    """Values of the pixels nearest to places (N, 2); those outside count as the rim. Shape (N,)."""
+    x, y = np.clip(np.rint(xy), 0, np.array(image.shape[::-1]) - 1).astype(int).T
+    return np.asarray(image[y, x], np.float64)
 
 
 @dataclass
@@ -132,6 +135,8 @@ class _Follower:
     alive: _Alive = field(default_factory=_Alive.none)
     pictures: dict[int, Gray] = field(default_factory=dict)
     """Pictures that corners alive were first seen in, and the last one that was followed."""
+    smooth: dict[int, Gray] = field(default_factory=dict)
+    """Some of them `smoothed`."""
     last: int = -1
     """Position of the last frame that was followed."""
     ids: list[Ints] = field(default_factory=list)
@@ -190,6 +195,7 @@ class _Follower:
     def _keep(self, gray: Gray, position: int) -> None:
         wanted = set(np.unique(self.alive.origin).tolist())
         self.pictures = {k: picture for k, picture in self.pictures.items() if k in wanted}
+        self.smooth = {k: picture for k, picture in self.smooth.items() if k in wanted}
         self.pictures[position], self.last = gray, position
 
     def _append(self, seen: _Alive, flow: float) -> None:
@@ -218,15 +224,17 @@ class _Follower:
         )  # fmt: skip
         good = (found.ravel() > 0) & (returned.ravel() > 0)
         good &= np.linalg.norm(back - alive.xy, axis=1) < s.most_back_px
-        refined = xy.copy()
+        refined, smooth = xy.copy(), smoothed(gray)
         for origin in np.unique(alive.origin[good]).tolist():
             mine = np.flatnonzero(good & (alive.origin == origin))
             if origin == self.last:
                 continue
-            first = self.pictures[origin]
-            first = as_bright(
-                first, gray, s.least_brightening, (alive.origin_xy[mine], np.asarray(xy[mine], np.float32))
-            )
+            if origin not in self.smooth:
+                self.smooth[origin] = smoothed(self.pictures[origin])
+            some = mine[:: max(1, len(mine) // s.brightness_samples)]
+            there = np.asarray(xy[some], np.float32)
+            values = values_at(self.smooth[origin], alive.origin_xy[some]), values_at(smooth, there)
+            first = as_bright(self.pictures[origin], gray, s.least_brightening, values)
             place, found, difference = cv2.calcOpticalFlowPyrLK(
                 first, gray, alive.origin_xy[mine], xy[mine].copy(), winSize=size, maxLevel=0,
                 criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
