@@ -1,18 +1,25 @@
-"""Chunks that see nothing new: what is derived without them is what is derived with them, and costs no more."""
+"""What was seen often enough: what is derived without it is what is derived with them, and costs no more."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import ConsolidationReport, consolidate
+from list3r.memory.library.labels import apply_labels, put_votes
 from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
 from list3r.memory.maintenance import edits
-from list3r.memory.records import ChunkResult
+from list3r.memory.overlap.summaries import chunk_summaries
+from list3r.memory.overlap.voxels import coverage, lies_on
+from list3r.memory.records import ChunkResult, Votes
+from list3r.memory.runs import runs_seen, seen_together
 from list3r.memory.store.store import Store
 from tests.test_growth import _Undone, begin, tables, visit, walks
 
@@ -86,3 +93,81 @@ def test_redundant_chunks_follow_edits_and_moves(walks: ModuleType, tmp_path: Pa
         assert store.library.redundant.chunks() == set()
         assert len({o.instance_id for o in store.observations.all() if o.chunk_id == 6}) >= 12
         assert store.verify() == []
+
+
+def with_thing(walks: ModuleType, made: ChunkResult, number: int) -> ChunkResult:
+    """A chunk in which one more thing has come to stand."""
+    frames, count = made.frame_indices, len(made.library.instances)
+    rng = np.random.default_rng([3, made.index])
+    thing = walks.thing(count, number, 1, np.zeros(3), frames, rng)
+    return replace(made, library=replace(made.library, instances=(*made.library.instances, thing)))
+
+
+def test_what_is_new_in_a_place_that_was_seen_often_is_found(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "cull.l3r") as store:
+        begin(store)
+        for index in range(8):
+            made = visit(walks, index, 0, "corridor")
+            add(store, with_thing(walks, made, 14) if index >= 4 else made)
+        redundant = store.library.redundant
+        assert (redundant.chunks(), redundant.partly()) == ({3, 4, 7, 8}, {5, 6})
+        assert {row.key[1] for row in redundant.of([5, 6])} == set(range(13))
+        fresh = store.observations.owners([(5, 13)])[5, 13]
+        assert [(o.chunk_id, o.local_id) for o in store.observations.of(fresh)] == [(k, 13) for k in (5, 6, 7, 8)]
+        assert store.instances.get(fresh).observations == len({f for k in range(4, 8) for f in frames_of(walks, k)})
+        grown = tables(store) | {"redundant": store.connection.rows("SELECT * FROM redundant ORDER BY 1, 2")}
+        assert whole(store) == grown
+        known = store.observations.owners([(6, 2)])[6, 2]
+        edits.split(store, known, [(6, 2)], "somebody")
+        assert 2 not in {row.key[1] for row in redundant.of([6])}
+        assert store.observations.owners([(6, 2)]).get((6, 2)) != known
+        assert store.verify() == []
+
+
+def frames_of(walks: ModuleType, index: int) -> range:
+    return range(walks.HOP * index, walks.HOP * index + walks.FRAMES)
+
+
+@given(st.lists(st.sets(st.integers(0, 40)), max_size=4))
+def test_runs_hold_the_frames_that_they_were_made_of(seen: list[set[int]]) -> None:
+    runs = seen_together([runs_seen(k, np.array(sorted(s), np.int32)) for k, s in enumerate(seen, start=1)])
+    frames = [f for a, b in runs.runs.tolist() for f in range(a, b)]
+    assert frames == sorted(set().union(*seen))
+    assert not frames or (frames[0] in seen[runs.first - 1] and frames[-1] in seen[runs.last - 1])
+
+
+def test_some_instances_of_a_chunk_meet_others_as_all_of_them_do(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "two.l3r") as store:
+        begin(store)
+        for index in range(2):
+            add(store, visit(walks, index, index, "corridor"))
+        a, b = (chunk_summaries(store)[k].shapes for k in (1, 2))
+    every = coverage(a, b, Sim3.identity())
+    kept = np.arange(len(a.local_id)) % 3 > 0
+    assert np.array_equal(coverage(a.only(kept), b, Sim3.identity()), every[kept])
+    assert np.array_equal(coverage(b, a.only(kept), Sim3.identity()), coverage(b, a, Sim3.identity())[:, kept])
+    for n in np.flatnonzero(np.isnan(b.plane).any(axis=1)):
+        on = lies_on(a.points, b.only(np.arange(len(b.local_id)) == n))
+        assert np.allclose(np.bincount(a.owner, on) / np.bincount(a.owner), every[:, n])
+
+
+def test_votes_for_what_is_redundant_count_as_they_come_and_all_at_once(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "cull.l3r") as store:
+        begin(store)
+        for index in range(7):
+            made = visit(walks, index, 0, "corridor")
+            with store.transaction():
+                chunk_id = store.chunks.add(1, made)
+                store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
+                told = Votes(1.0, {"cup" if index > 2 else "book": (4.0 + index, 20.0)}, 4.0)
+                put_votes(store, chunk_id, "net", {n: told for n in range(0, 12, 2)}, fresh=True)
+                apply_labels(store, written=consolidate(store, chunk_id, CULL).written)
+        assert store.library.redundant.chunks() == {3, 4, 5, 6, 7}
+        grown = store.detected_labels.all()
+        assert {label.label for label in grown.values()} == {"cup"}
+        with store.transaction():
+            assert apply_labels(store).keys() == grown.keys() and store.detected_labels.all() == grown
+            for chunk_id in (5, 6, 7):
+                put_votes(store, chunk_id, "net", {})
+            apply_labels(store)
+        assert {label.label for label in store.detected_labels.all().values()} == {"book"}

@@ -79,7 +79,7 @@ class Grouping:
         than before; where one does, the group at its other end is taken in and the set is grouped again.
         """
         keys = self.region.keys_of(self.dirty.chunks)
-        keys |= {k for k in (*self.dirty.edited, *seeds) if k[0] in self.region.rows}
+        keys |= {k for k in (*self.dirty.edited, *seeds) if self.region.takes_part(k)}
         keys = self._closed(keys)
         keys = self._closed(keys | self._tied(keys, keys))
         while True:

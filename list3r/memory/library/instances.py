@@ -116,6 +116,8 @@ class Members:
     """Those that show it where it is now."""
     chunks: Mapping[int, tuple[ChunkShapes, Sim3, NDArray[np.bool_]]]
     """Shapes, settled pose in the world and dropped points of each chunk."""
+    marks: Mapping[int, bytes]
+    """What tells apart what each chunk measured, and where it lies."""
     component: int
     upright: bool
     """Whether z is up there."""
@@ -146,7 +148,7 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
     """Return an instance, derived from its members unless it was just so before."""
     m, cache = members, store.derived.of(InstanceCache)
     shown_by = m.of(m.shown_by)
-    key = (instance_id, m.component, m.upright, _digest(store, m, shown_by), m.mover, settings)
+    key = (instance_id, m.component, m.upright, _digest(m, shown_by), m.mover, settings)
     kept = cache.get(key)
     if kept is not None:
         return kept
@@ -160,7 +162,7 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
     return cache.put(key, replace(found, geometry=replace(found.geometry, stamp=next(cache.stamps))))
 
 
-def _digest(store: Store, members: Members, shown_by: Sequence[Member]) -> bytes:
+def _digest(members: Members, shown_by: Sequence[Member]) -> bytes:
     """Return what tells apart all that an instance is derived from: who its members are, where their chunks lie, and
     which of their points belong to something else.
     """
@@ -168,7 +170,7 @@ def _digest(store: Store, members: Members, shown_by: Sequence[Member]) -> bytes
     for keys in (members.group, members.shown_by):
         digest.update(np.array([(len(keys), -1), *keys], np.int64).tobytes())
     for k in sorted({k for k, _ in members.group}):
-        digest.update(np.int64(store.chunks.checksum(k)).tobytes() + members.chunks[k][1].as_matrix().tobytes())
+        digest.update(members.marks[k])
     for member in shown_by:
         digest.update(np.packbits(member.dropped[slice(*member.span)]).tobytes())
     return digest.digest()

@@ -15,6 +15,7 @@ from typing import Any
 from list3r.memory.constraints import Key
 from list3r.memory.records import DetectedLabel, Instance, Votes
 from list3r.memory.settings import stored_settings
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 _SCORES = (0.02, 0.98)
@@ -41,11 +42,18 @@ class LabelSettings:
 
 
 def put_votes(
-    store: Store, chunk_id: int, source: str, votes: Mapping[int, Votes], class_names: Iterable[str] | None = None
+    store: Store,
+    chunk_id: int,
+    source: str,
+    votes: Mapping[int, Votes],
+    class_names: Iterable[str] | None = None,
+    *,
+    fresh: bool = False,
 ) -> None:
     """Keep what a source saw of a chunk, instead of what the same one saw before. Call inside `transaction()`.
 
-    `class_names` are the classes that it knows, where that is a closed list: it says nothing against others.
+    `class_names` are the classes that it knows, where that is a closed list: it says nothing against others. `fresh`
+    are votes of a chunk that has just come in.
     """
     store.votes.put(
         chunk_id,
@@ -58,6 +66,7 @@ def put_votes(
             )
             for n, v in votes.items()
         },
+        fresh=fresh,
     )
     known = dict(store.facts.label_classes or {})
     names = None if class_names is None else sorted(class_names)
@@ -165,18 +174,16 @@ def apply_labels(
     settings = settings or stored_settings(store, LabelSettings, "library", "labels")
     before = store.detected_labels.all()
     instances = store.instances.all() if written is None else store.instances.of(sorted(written))
-    home = _home(store, None if written is None else [i.id for i in instances])
+    members = {i.id: _members(store, i.id) for i in instances}
+    home = {key: n for n, keys in members.items() for key in keys}
     votes = {chunk_id: store.votes.of(chunk_id) for chunk_id in sorted({k for k, _ in home})}
     spoken = _named_by_operators(store, home)
-    members: dict[int, list[Key]] = {}
-    for key, n in home.items():
-        members.setdefault(n, []).append(key)
     out: dict[int, DetectedLabel] = {}
     changed: dict[int, str | None] = {}
     for i in instances:
         if i.id in spoken:
             continue
-        label = None if i.structure is not None else _label(members.get(i.id, ()), votes, known, settings)
+        label = None if i.structure is not None else _label(store, members[i.id], votes, known, settings)
         if label is not None:
             out[i.id] = label
         text = None if label is None else label.label
@@ -190,13 +197,51 @@ def apply_labels(
     return out
 
 
-def _home(store: Store, ids: Iterable[int] | None) -> dict[Key, int]:
-    """Return which instance each local instance belongs to, of all instances or of some."""
-    rows = store.observations.all() if ids is None else [o for n in ids for o in store.observations.of(n)]
-    return {(o.chunk_id, o.local_id): o.instance_id for o in rows}
+def _members(store: Store, instance_id: int) -> list[Key]:
+    """Return the local instances that an instance was derived of; others are like one of these."""
+    group = store.library.members.group_of(instance_id)
+    return group or [(o.chunk_id, o.local_id) for o in store.observations.of(instance_id)]
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What was told of redundant local instances that are like one, up to some chunk."""
+
+    through: int
+    votes: Mapping[str, Votes]
+    stamp: tuple[int, int]
+
+
+class _ToldCache(LruCache[Key, _Told]):
+    """By the local instance that they are like: a stay has more of them with every chunk."""
+
+    def __init__(self) -> None:
+        super().__init__(10_000)
+
+
+def _told_of_like(store: Store, key: Key) -> Mapping[str, Votes]:
+    """Return the votes for redundant local instances that are like one, added up in the order of their chunks."""
+    cache, redundant = store.derived.of(_ToldCache), store.library.redundant
+    redundant.chunks()
+    stamp = (redundant.turned, store.votes.turned)
+    before = cache.get(key)
+    if before is None or before.stamp != stamp:
+        before = _Told(0, {}, stamp)
+    votes, through = dict(before.votes), before.through
+    for row in redundant.like([key], before.through):
+        _add(votes, store.votes.of(row.key[0]), row.key[1])
+        through = row.key[0]
+    return cache.put(key, _Told(through, votes, stamp)).votes
+
+
+def _add(total: dict[str, Votes], votes: Mapping[str, Mapping[int, Votes]], local_id: int) -> None:
+    for source, found in votes.items():
+        if local_id in found:
+            total[source] = total.get(source, Votes(0.0, {})) + found[local_id]
 
 
 def _label(
+    store: Store,
     keys: Iterable[Key],
     votes: Mapping[int, Mapping[str, Mapping[int, Votes]]],
     known: Mapping[str, Collection[str] | None],
@@ -204,9 +249,9 @@ def _label(
 ) -> DetectedLabel | None:
     total: dict[str, Votes] = {}
     for chunk_id, local_id in sorted(keys):
-        for source, found in votes.get(chunk_id, {}).items():
-            if local_id in found:
-                total[source] = total.get(source, Votes(0.0, {})) + found[local_id]
+        _add(total, votes.get(chunk_id, {}), local_id)
+        for source, found in _told_of_like(store, (chunk_id, local_id)).items():
+            total[source] = total.get(source, Votes(0.0, {})) + found
     chosen = decide_by_rank(total, known, settings)
     if chosen is None:
         return None

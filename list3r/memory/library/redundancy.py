@@ -1,9 +1,10 @@
-"""Chunks that add nothing to what others of their session saw.
+"""Local instances that add nothing to what others of their session saw.
 
 A camera that stays in one room comes to the same things again and again. As ORB-SLAM (IEEE T-RO 2015) culls keyframes
-whose points enough other keyframes see, a chunk all of whose local instances lie on what enough earlier chunks of its
-session saw is redundant: no group is formed, weighed or derived with it, so that a chunk costs what is near, not how
-often it was seen (decision 0113). What it saw counts among the observations of the instances that it saw.
+whose points enough other keyframes see, a local instance is redundant whose surface enough earlier chunks of its
+session saw, as one thing or in pieces: no group is formed, weighed or derived with it, so that a chunk costs what is
+new in it, not how often its place was seen (decisions 0113 and 0118). A redundant one counts among the observations of
+the instance that it is like.
 
 It is decided when a chunk settles, of what was settled before it; what was not redundant once stays so.
 """
@@ -14,13 +15,20 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.memory.library.region import Region
 from list3r.memory.merging.edges import NONE, links_of
-from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.overlap.voxels import Ints
+from list3r.memory.merging.nodes import Nodes
+from list3r.memory.overlap.pair_scores import Key, pair_scores
+from list3r.memory.overlap.summaries import ChunkSummary
+from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints, lies_on
 from list3r.memory.records import Instance, Observation
+from list3r.memory.runs import runs_seen, seen_together
 from list3r.memory.store.tables.library import RedundantInstance
+
+_COMPARED = 3
+"""Chunks with which a redundant local instance is compared, to find what it is like: those that saw most of it."""
 
 
 @dataclass(frozen=True)
@@ -39,67 +47,113 @@ class SeenSpan:
 
 @dataclass(frozen=True)
 class Culled:
-    """What came of deciding which chunks are redundant."""
+    """What came of deciding which local instances are redundant."""
 
     settled: frozenset[int]
-    """Chunks that are not, and are new, moved, or were redundant before."""
+    """Chunks that take part, and are new, moved, or had others that are redundant before."""
     like: frozenset[Key]
-    """Local instances that what redundant chunks see, or saw before, is like."""
+    """Local instances that redundant ones are like, or were before."""
 
 
 def cull(region: Region, moved: Collection[int], edited: Iterable[Key]) -> Culled:
-    """Decide which of the chunks are redundant that moved, or of which edits named a local instance."""
+    """Decide which local instances are redundant of the chunks that moved, or of which edits named a redundant one."""
     table, links = region.store.library.redundant, region.store.edits.constraints().links
+    known = {row.key: row for row in table.of(sorted({*moved, *(k for k, _ in edited)}))}
+    asked = {*moved, *(k for k, _ in known)}
     like: set[Key] = set()
-    asked = {*moved, *({k for k, _ in edited} & table.chunks())}
     for k in sorted(asked):
-        before = table.of([k]) if k in table.chunks() else []
+        before = [row for row in known.values() if row.key[0] == k]
         if not before and region.store.library.members.of([k]):
             continue
         found = _redundant(region, k) if k in moved else before
-        if any(links.forbids(row.key, row.like) for row in found):
-            found = []
+        found = [row for row in found if not before or row.key in known]
+        found = [row for row in found if not links.forbids(row.key, row.like)]
         if found or before:
-            table.put(k, found)
-            region.leave(k) if found else region.enter(k)
-            like.update(row.like for row in (*before, *found) if row.like[0] != k)
+            every = len(found) == len(region.summaries[k].shapes.local_id)
+            table.put(k, found, all_of_it=every)
+            region.look_again(k)
+            like.update(row.like for row in (*before, *found) if row.like != row.key)
     return Culled(frozenset(asked & region.rows.keys()), frozenset(like))
 
 
 def _redundant(region: Region, k: int) -> list[RedundantInstance]:
-    """Return the local instances of a redundant chunk; none of a chunk that is not."""
-    settings, shapes = region.settings.redundancy, region.shapes(k)
-    if settings.chunks == 0 or region.summary(k).motions or not len(shapes.points):
-        return []
+    """Return the redundant local instances of a chunk; what moves is none of them."""
+    settings, summary = region.settings.redundancy, region.summaries[k]
     session = region.store.chunks.get(k).session_id
     earlier = [u for u in region.near(k) if u < k and region.store.chunks.get(u).session_id == session]
-    if len(earlier) < settings.chunks:
+    if settings.chunks == 0 or len(earlier) < settings.chunks:
         return []
-    seen = np.zeros(len(shapes.local_id), np.int64)
-    seen[np.setdiff1d(np.arange(len(seen)), shapes.owner)] = settings.chunks
-    like: dict[int, tuple[float, Key]] = {}
-    for u in reversed(earlier):
-        p = region.score(u, k)
-        seen[np.unique(p.j[p.j_on_i >= settings.covered])] += 1
-        links = links_of(region.nodes_of(u), region.nodes_of(k), p, region.settings.merging)
-        still = ~np.isin(region.shapes(u).local_id[p.i], list(region.summary(u).motions))
-        for n in np.flatnonzero((links.kind != NONE) & still).tolist():
-            best = float(links.score[n]), (u, int(region.shapes(u).local_id[p.i[n]]))
-            like[int(p.j[n])] = max(best, like.get(int(p.j[n]), best))
-        if seen.min() >= settings.chunks:
-            return [
-                RedundantInstance((k, n), like[j][1] if j in like else (k, n), shapes.frames[j].astype(np.int32))
-                for j, n in enumerate(shapes.local_id.tolist())
-            ]
-    return []
+    shapes = summary.shapes
+    known, beside = _seen_before(region, k, earlier)
+    known &= ~np.isin(shapes.local_id, list(summary.motions))
+    if not len(shapes.points) or not known[shapes.owner].any():
+        return []
+    like = _like(region, k, shapes.only(known), beside)
+    return [
+        RedundantInstance((k, n), like.get(n, (k, n)), frames.astype(np.int32))
+        for n, frames, redundant in zip(shapes.local_id.tolist(), shapes.frames, known.tolist(), strict=True)
+        if redundant
+    ]
+
+
+def _seen_before(region: Region, k: int, earlier: Sequence[int]) -> tuple[NDArray[np.bool_], list[int]]:
+    """Return of which local instances of a chunk enough of some earlier chunks saw the surface, and the chunks that saw
+    most of the surface of one of them.
+    """
+    settings, shapes = region.settings.redundancy, region.summaries[k].shapes
+    points = region.settled[k].S_graph_chunk.apply(shapes.points)
+    total = np.bincount(shapes.owner, minlength=len(shapes.local_id))
+    times, known = np.zeros(len(points), np.int64), total == 0
+    met: dict[int, Ints] = {}
+    for u in earlier:
+        row = region.rows[u]
+        asked = ~known[shapes.owner] & (times < settings.chunks)
+        asked &= ((points >= row.extent[0]) & (points <= row.extent[1])).all(axis=1)
+        at = np.flatnonzero(asked)
+        if not len(at):
+            continue
+        seen = at[lies_on(row.S_graph_chunk.inverse().apply(points[at]), _still(region.summary(u)))]
+        times[seen] += 1
+        met[u] = np.bincount(shapes.owner[seen], minlength=len(total))
+        often = np.bincount(shapes.owner, times >= settings.chunks, minlength=len(total))
+        known = often >= settings.covered * total
+        if known.all():
+            break
+    order = np.argsort(
+        -np.array([*met.values()], np.int64).reshape(len(met), len(total))[:, known], axis=0, kind="stable"
+    )
+    best = np.unique(order[:_COMPARED])
+    return known, [u for n, u in enumerate(met) if n in best]
+
+
+def _still(summary: ChunkSummary) -> ChunkShapes:
+    """Return what does not move."""
+    shapes = summary.shapes
+    return shapes.only(~np.isin(shapes.local_id, list(summary.motions))) if summary.motions else shapes
+
+
+def _like(region: Region, k: int, shapes: ChunkShapes, beside: Sequence[int]) -> dict[int, Key]:
+    """Return the local instances of other chunks that some of a chunk are most like, by local id."""
+    own, grown = Nodes.of([shapes], {k: region.pose(k)}), region.store.derived.of(GrownCells)
+    best: dict[int, tuple[float, Key]] = {}
+    for u in beside:
+        other = _still(region.summary(u))
+        S_u_k = region.settled[u].S_graph_chunk.inverse() @ region.settled[k].S_graph_chunk
+        p = pair_scores(other, shapes, S_u_k, grown)
+        links = links_of(Nodes.of([other], {u: region.pose(u)}), own, p, region.settings.merging)
+        for n in np.flatnonzero(links.kind != NONE).tolist():
+            found = float(links.score[n]), (u, int(other.local_id[p.i[n]]))
+            local_id = int(shapes.local_id[p.j[n]])
+            best[local_id] = max(found, best.get(local_id, found))
+    return {local_id: key for local_id, (_, key) in best.items()}
 
 
 def follow(region: Region, moved: Collection[int], culled: Culled, written: Collection[int]) -> set[int]:
-    """Write which instances redundant chunks that moved belong to, and when those were seen that were not `written`
-    anew; return their ids.
+    """Write which instances the redundant local instances of chunks that moved belong to, and when those were seen that
+    were not `written` anew; return their ids.
     """
     store = region.store
-    rows = store.library.redundant.of(sorted(store.library.redundant.chunks() & set(moved)))
+    rows = store.library.redundant.of(sorted(moved))
     owners = store.observations.owners(sorted(culled.like))
     store.observations.forget(row.key for row in rows if row.like not in owners)
     store.observations.set(Observation(owners[row.like], *row.key) for row in rows if row.like in owners)
@@ -110,24 +164,21 @@ def follow(region: Region, moved: Collection[int], culled: Culled, written: Coll
 
 
 def _members(region: Region, instance_id: int) -> list[Key]:
-    found = ((o.chunk_id, o.local_id) for o in region.store.observations.of(instance_id))
-    return [key for key in found if key[0] in region.rows]
+    group = region.store.library.members.group_of(instance_id)
+    return [key for key in group if region.takes_part(key)]
 
 
 def sightings(region: Region, group: Sequence[Key]) -> SeenSpan | None:
-    """Return when a group is seen, with the redundant chunks that saw it."""
-    frames: dict[int, list[Ints]] = {}
-    holder: dict[tuple[int, int], int] = {}
-    like = region.store.library.redundant.like(group)
-    seen = [(key[0], region.frames_of(key)) for key in group] + [(row.key[0], row.frames) for row in like]
-    for k, indices in seen:
-        session = region.store.chunks.get(k).session_id
-        if len(indices):
-            frames.setdefault(session, []).append(indices.astype(np.int64))
-            holder |= {(session, int(indices.min())): k, (session, int(indices.max())): k}
-    if not frames:
-        return None
-    every = {session: np.unique(np.concatenate(parts)) for session, parts in frames.items()}
-    ends = [(session, int(f)) for session, held in every.items() for f in (held[0], held[-1])]
-    times = [region.times_of(holder[end]).get(end, 0.0) for end in ends]
-    return SeenSpan(sum(map(len, every.values())), min(times), max(times))
+    """Return when a group is seen, with the redundant local instances that are like it."""
+    sessions: dict[int, list[Key]] = {}
+    for key in group:
+        sessions.setdefault(region.store.chunks.get(key[0]).session_id, []).append(key)
+    count, times = 0, list[float]()
+    for session, keys in sessions.items():
+        own = [runs_seen(key[0], region.frames_of(key)) for key in keys]
+        seen = seen_together([*own, *map(region.store.library.redundant.seen_like, keys)])
+        if len(seen.runs):
+            count += int(np.diff(seen.runs).sum())
+            ends = (seen.first, int(seen.runs[0, 0])), (seen.last, int(seen.runs[-1, 1]) - 1)
+            times += [region.times_of(k).get((session, frame), 0.0) for k, frame in ends]
+    return SeenSpan(count, min(times), max(times)) if times else None

@@ -16,7 +16,7 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.rows import pack_scores, unpack_scores
 from list3r.memory.library.rules import ConsolidationSettings, World
-from list3r.memory.library.settled_poses import neighbours
+from list3r.memory.library.settled_poses import extent_of, neighbours
 from list3r.memory.merging.edges import Links, links_of
 from list3r.memory.merging.moving import PlacedChunks, Tracks, without_moving
 from list3r.memory.merging.nodes import Nodes
@@ -90,7 +90,7 @@ class Region:
         """The settled chunks by id."""
         redundant = store.library.redundant.chunks()
         self.rows = _Chunks(store.path, {k: r for k, r in self.settled.items() if k not in redundant})
-        """Those of them that are not redundant."""
+        """Those of them that are not redundant as a whole."""
         if self.settled and not self.rows:
             file = store.path
             raise MemoryFileError(f"every chunk of {file} is said to be redundant; `list3r repair {file}` mends that")
@@ -101,6 +101,7 @@ class Region:
         """Whether any local instance was seen moving."""
         self._summary: dict[int, ChunkSummary] = {}
         self._poses: dict[int, Sim3] = {}
+        self._marks: dict[int, bytes] = {}
         self._nodes: dict[int, Nodes] = {}
         self._times: dict[int, dict[tuple[int, int], float]] = {}
         self._pairs: dict[tuple[int, int], _LinkedPair] = {}
@@ -111,10 +112,15 @@ class Region:
     # ------------------------------------------------------------------ one chunk
 
     def summary(self, chunk_id: int) -> ChunkSummary:
-        """Return the summary of a chunk."""
+        """Return the summary of what takes part of a chunk: its local instances that are not redundant."""
         if chunk_id not in self._summary:
-            self._summary[chunk_id] = self.summaries[chunk_id]
+            left_out = frozenset(row.key[1] for row in self.store.library.redundant.of([chunk_id]))
+            self._summary[chunk_id] = self.summaries.without(chunk_id, left_out)
         return self._summary[chunk_id]
+
+    def takes_part(self, key: Key) -> bool:
+        """Return whether there is such a local instance, and it is not redundant."""
+        return key[0] in self.rows and key[1] in self.shapes(key[0]).local_id
 
     def shapes(self, chunk_id: int) -> ChunkShapes:
         """Return the local instances of a chunk."""
@@ -134,6 +140,13 @@ class Region:
         if chunk_id not in self._poses:
             self._poses[chunk_id] = self._T_world_graph @ self.settled[chunk_id].S_graph_chunk
         return self._poses[chunk_id]
+
+    def mark(self, chunk_id: int) -> bytes:
+        """Return what tells apart what a chunk measured and where it is settled."""
+        if chunk_id not in self._marks:
+            crc = np.int64(self.store.chunks.checksum(chunk_id))
+            self._marks[chunk_id] = crc.tobytes() + self.pose(chunk_id).as_matrix().tobytes()
+        return self._marks[chunk_id]
 
     def pose_before(self, row: SettledRow) -> Sim3:
         """Return S_world_chunk of where a chunk was settled before."""
@@ -155,16 +168,18 @@ class Region:
             self._extents = np.array([r.extent for r in self.rows.values()]).reshape(-1, 2, 3)
         return neighbours(self.rows, chunk_id, here or self.settled[chunk_id], self._extents)
 
-    def leave(self, chunk_id: int) -> None:
-        """Take out a chunk that is redundant."""
-        self.rows.pop(chunk_id, None)
+    def look_again(self, chunk_id: int) -> None:
+        """Take note that others of a chunk's local instances are redundant than before."""
+        for kept in (self._summary, self._nodes, self.rows):
+            kept.pop(chunk_id, None)
         self._extents = None
-
-    def enter(self, chunk_id: int) -> None:
-        """Take in a chunk that is not redundant any more."""
-        rows = {**self.rows, chunk_id: self.settled[chunk_id]}
-        self.rows = _Chunks(self.store.path, dict(sorted(rows.items())))
-        self._extents = None
+        if chunk_id in self.store.library.redundant.chunks():
+            return
+        row = self.settled[chunk_id]
+        row = replace(row, extent=extent_of(self.summary(chunk_id), row.S_graph_chunk))
+        self.store.library.settled.put({chunk_id: row})
+        self.settled[chunk_id] = row
+        self.rows = _Chunks(self.store.path, dict(sorted({**self.rows, chunk_id: row}.items())))
 
     def components(self, keys: Iterable[Key]) -> dict[int, int]:
         """Return the connected component of each chunk that has one of these local instances."""

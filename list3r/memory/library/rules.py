@@ -33,12 +33,12 @@ _POSED = 80
 
 @dataclass(frozen=True)
 class RedundancySettings:
-    """When a chunk adds nothing to what others of its session saw."""
+    """When a local instance adds nothing to what other chunks of its session saw."""
 
     chunks: int = 8
-    """Earlier chunks that must have seen each of its local instances; 0: no chunk is redundant."""
+    """Earlier chunks that must have seen its surface, as one thing or in pieces; 0: none is redundant."""
     covered: float = 0.75
-    """Share of a local instance's surface that lies on one of another chunk, for that to have seen it."""
+    """Share of its surface that so many must have seen."""
 
 
 @dataclass(frozen=True)

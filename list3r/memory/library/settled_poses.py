@@ -50,8 +50,7 @@ def settle(
         S_graph_chunk, row = T_graph_world @ c.S_world_chunk, before.get(c.chunk_id)
         unit = float(S_graph_chunk.scale) * (1.0 if c.scale_kind == "metric" else summaries[c.chunk_id].unit)
         if row is None or row.component != c.component or not _near(row.S_graph_chunk, S_graph_chunk, unit, s):
-            extent = _extent(summaries[c.chunk_id], S_graph_chunk, 0.5 * _FAR_M * unit)
-            fresh[c.chunk_id] = SettledRow(c.component, S_graph_chunk, extent)
+            fresh[c.chunk_id] = SettledRow(c.component, S_graph_chunk, extent_of(summaries[c.chunk_id], S_graph_chunk))
     if fresh:
         store.library.settled.put(fresh)
     return frozenset(fresh)
@@ -74,8 +73,11 @@ def _near(a: Sim3, b: Sim3, unit: float, s: HysteresisSettings) -> bool:
     return bool(moved <= s.move_m * unit and np.degrees(turn) <= s.turn_deg and grown <= s.scale)
 
 
-def _extent(summary: ChunkSummary, S_graph_chunk: Sim3, slack: float) -> Array:
-    """Return the axis-aligned box of a chunk's points in the graph's frame, grown. Shape (2, 3)."""
+def extent_of(summary: ChunkSummary, S_graph_chunk: Sim3) -> Array:
+    """Return the axis-aligned box of a summary's points in the graph's frame, grown by half of what lies near. Shape
+    (2, 3).
+    """
+    slack = 0.5 * _FAR_M * float(S_graph_chunk.scale) * summary.unit
     if len(summary.shapes.points) == 0:
         return np.array([[np.inf] * 3, [-np.inf] * 3])
     p = S_graph_chunk.apply(summary.shapes.points)

@@ -54,8 +54,7 @@ class Writer:
         fresh = {n: g for g, n in of.items() if n is not None and g in weighed.evidence}
         for g in recut - weighed.evidence.keys():
             fresh |= dict.fromkeys(store.observations.owners(g[:1]).values(), g)
-        like = {row.key: row.like for row in store.library.redundant.like(k for g in weighed.evidence for k in g)}
-        before = store.observations.owners([*(k for g in weighed.evidence for k in g), *like])
+        before = store.observations.owners([k for g in weighed.evidence for k in g])
         known = store.instances.states().keys() if self._g.dirty.whole else set(before.values())
         gone = sorted(known - fresh.keys() - set(of.values()))
         was = {i.id: i for i in store.instances.of([*sorted(fresh), *gone])}
@@ -65,6 +64,9 @@ class Writer:
         for n in gone:
             store.instances.drop(n, dict(ids.aliases).get(n))
         now = {key: n for n, g in fresh.items() for key in g}
+        turned = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+        like = {row.key: row.like for row in store.library.redundant.like(turned)}
+        before |= store.observations.owners(list(like))
         now |= {key: now[other] for key, other in like.items() if other in now}
         store.observations.forget(before.keys() - now.keys())
         store.observations.set(Observation(n, *key) for key, n in now.items() if before.get(key) != n)
@@ -97,7 +99,8 @@ class Writer:
         here = group if mover is not None else self._g.ledger.current(group)
         component = region.rows[group[0][0]].component
         upright = self._world.upright and component == self._world.first
-        members = Members(group, here, chunks, component, upright, mover)
+        marks = {k: region.mark(k) for k in chunks}
+        members = Members(group, here, chunks, marks, component, upright, mover)
         found = derived_instance(self._store, instance_id, members, self._s.derive)
         return replace(found, geometry=replace(found.geometry, structure=structure))
 
@@ -139,8 +142,7 @@ class Writer:
         return {of[groups[at]]: text for at, text in found.items() if groups[at] in of}
 
     def _group_of(self, n: int) -> Group:
-        found = ((o.chunk_id, o.local_id) for o in self._store.observations.of(n))
-        return tuple(key for key in found if key[0] in self._region.rows)
+        return tuple(key for key in self._store.library.members.group_of(n) if self._region.takes_part(key))
 
     def _put(self, ids: Sequence[int], groups: Mapping[int, Group], labels: Mapping[int, str | None]) -> None:
         store = self._store

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from list3r.memory.library.instances import Member, derive_instance
 from list3r.memory.library.rows import record_of
 from list3r.memory.library.rules import WORLD, ConsolidationSettings, World, settings_of
-from list3r.memory.library.settled_poses import neighbours
+from list3r.memory.library.settled_poses import extent_of, neighbours
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes, coverage
@@ -63,7 +63,10 @@ class _Placed:
 
     def __init__(self, store: Store, keys: Sequence[Key], settings: ConsolidationSettings) -> None:
         self._store, self._settings = store, settings
-        self._settled, self._summaries = store.library.settled.all(), chunk_summaries(store, settings.shapes)
+        self._summaries, self._settled = chunk_summaries(store, settings.shapes), dict(store.library.settled.all())
+        for k in sorted(store.library.redundant.partly() & self._settled.keys()):
+            row = self._settled[k]
+            self._settled[k] = replace(row, extent=extent_of(self._summaries[k], row.S_graph_chunk))
         self._grown = GrownCells()
         self.shapes = {k: self._shapes_of(k) for k in sorted({k for k, _ in keys} & self._settled.keys())}
         """Scraps by chunk."""

@@ -60,8 +60,8 @@ def _bytes_of(summary: ChunkSummary) -> int:
     return sum(p.nbytes + 100 for p in parts if isinstance(p, np.ndarray))
 
 
-class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None], ChunkSummary]):
-    """Summaries by chunk id, checksum of what the chunk measured, and settings."""
+class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None, frozenset[int]], ChunkSummary]):
+    """Summaries by chunk id, checksum of what the chunk measured, settings, and local instances that are left out."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, _bytes_of)
@@ -81,11 +81,22 @@ class Summaries(Mapping[int, ChunkSummary]):
         self._checked: dict[int, int] = {}
 
     def __getitem__(self, chunk_id: int) -> ChunkSummary:
+        return self._found(chunk_id, frozenset())
+
+    def without(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
+        """Return a summary without some of the local instances, by local id; if there are any, without planes."""
+        return self._found(chunk_id, left_out)
+
+    def _found(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
         if chunk_id not in self._checked:
             self._checked[chunk_id] = self._store.chunks.checksum(chunk_id)
-        key = chunk_id, self._checked[chunk_id], self._settings
+        key = chunk_id, self._checked[chunk_id], self._settings, left_out
         found = self._known.get(key)
-        return found or self._known.put(key, _summary(self._store, self._store.chunks.get(chunk_id), self._settings))
+        if found is not None:
+            return found
+        if left_out:
+            return self._known.put(key, _without(self[chunk_id], left_out))
+        return self._known.put(key, _summary(self._store, self._store.chunks.get(chunk_id), self._settings))
 
     @property
     def metre(self) -> float | None:
@@ -140,6 +151,14 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
     motions = {n: store.local_instances.motion_track(chunk.chunk_id, n) for n in moves}
     return ChunkSummary(shapes, planes, store.chunks.cannot_links(chunk.chunk_id), unit, motions)
+
+
+def _without(summary: ChunkSummary, left_out: frozenset[int]) -> ChunkSummary:
+    gone, links = list(left_out), summary.cannot_link
+    shapes = summary.shapes.only(~np.isin(summary.shapes.local_id, gone))
+    links = links[~np.isin(links, gone).any(axis=1)]
+    motions = {n: motion for n, motion in summary.motions.items() if n not in left_out}
+    return ChunkSummary(shapes, chunk_planes([]), links, summary.unit, motions)
 
 
 def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import compress, pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,13 @@ _REACH = np.array(
     dtype=np.int64,
 )
 """What to add to a key to get the cells whose centres lie within two cells: the tolerance."""
+_NEAREST = _REACH[
+    np.argsort(
+        [i * i + j * j + k * k for i in _SPAN for j in _SPAN for k in _SPAN if i * i + j * j + k * k <= 4],
+        kind="stable",
+    )
+].tolist()
+"""The same, the nearest first."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +124,28 @@ class ChunkShapes:
     sample_owner: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
 
+    def only(self, kept: NDArray[np.bool_]) -> ChunkShapes:
+        """Return some of the instances, (N,). Samples of the others still belong to something: they have the numbers
+        after those that are kept.
+        """
+        number = np.empty(len(kept), np.int64)
+        number[np.concatenate([np.flatnonzero(kept), np.flatnonzero(~kept)])] = np.arange(len(kept))
+        points, cells = kept[self.owner], kept[self.occupied_owner]
+        rows: dict[str, Any] = {name: getattr(self, name)[kept] for name in _ROWS}
+        lists: dict[str, Any] = {name: tuple(compress(getattr(self, name), kept)) for name in _LISTS}
+        owners = np.append(number, -1).astype(np.int32)[self.sample_owner]
+        return replace(
+            self,
+            points=self.points[points],
+            rgb=self.rgb[points],
+            owner=number[self.owner[points]],
+            occupied=self.occupied[cells],
+            occupied_owner=number[self.occupied_owner[cells]].astype(np.int32),
+            sample_owner=owners,
+            **rows,
+            **lists,
+        )
+
     def spans(self, S_world_chunk: Sim3) -> tuple[Array, Array]:
         """Return corners of the boxes of the instances' points, world; the origin of the chunk for those without any.
         Shape (N, 3) each.
@@ -128,6 +158,13 @@ class ChunkShapes:
             low[self.owner[first]] = np.minimum.reduceat(p, first)
             high[self.owner[first]] = np.maximum.reduceat(p, first)
         return low, high
+
+
+_ROWS = (
+    *("local_id", "level", "center", "size", "cell_count", "plane", "truncated", "lab"),
+    *("structure", "stability", "feature"),
+)
+_LISTS = ("frames", "boxes_xyxy", "areas_px", "visible_fraction")
 
 
 def chunk_shapes(
@@ -234,6 +271,22 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, gr
         hits += np.bincount(source.owner[which[on]] * shape[1] + at[on], minlength=len(hits))
     total = np.bincount(source.owner, minlength=shape[0])
     return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
+
+
+def lies_on(points: Array, target: ChunkShapes) -> NDArray[np.bool_]:
+    """Return which points, in the frame of a chunk, lie within the tolerance of any of its instances. Shape (P,)."""
+    found, occupied = np.zeros(len(points), bool), np.sort(target.occupied)
+    if len(occupied) == 0:
+        return found
+    for level in np.unique(target.level).tolist():
+        left = np.flatnonzero(~found)
+        keys = _key(np.floor(points[left] / (target.grain * 2.0**level)).astype(np.int64), level)
+        for reach in _NEAREST:
+            at = np.minimum(np.searchsorted(occupied, keys + reach), len(occupied) - 1)
+            met = occupied[at] == keys + reach
+            found[left[met]] = True
+            left, keys = left[~met], keys[~met]
+    return found
 
 
 _KEPT_BYTES = 8 << 20

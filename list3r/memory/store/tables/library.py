@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Shape
+from list3r.memory.runs import SeenRuns, runs_seen, seen_together
 from list3r.memory.store.connection import Connection
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.rows.columns import Columns, joined, nested
 from list3r.memory.store.rows.table import Table, batches
 
@@ -71,7 +73,7 @@ class GroupMember:
 
 @dataclass(frozen=True)
 class RedundantInstance:
-    """A local instance of a chunk that adds nothing to what other chunks of its session saw."""
+    """A local instance whose surface enough other chunks of its session saw."""
 
     key: Key
     like: Key
@@ -184,6 +186,14 @@ class GroupMembers:
         """Return all members of a group, in order; none where there is no such group."""
         return [row.key for row in self._rows.all("first_chunk = ? AND first_local = ?", first)]
 
+    def group_of(self, instance_id: int) -> list[Key]:
+        """Return all members of the group that is an instance, in order; none where there is no such instance."""
+        query = (
+            "SELECT m.first_chunk, m.first_local FROM observations o JOIN members m USING (chunk_id, local_id) "
+            "WHERE o.instance = ? ORDER BY o.chunk_id, o.local_id LIMIT 1"
+        )
+        return [key for first in self._connection.rows(query, (instance_id,)) for key in self.group(first)]
+
     def put(self, members: Iterable[GroupMember]) -> None:
         """Write of local instances which group they are in; they leave those that they were in."""
         self._rows.put(members)
@@ -193,47 +203,84 @@ class GroupMembers:
         return self._rows.count("shown = 0 AND chunk_id = first_chunk AND local_id = first_local")
 
 
+_KEPT_BYTES = 4 << 20
+
+
+class _SeenCache(LruCache[Key, SeenRuns]):
+    """By the local instance that they are like."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, lambda seen: 200 + seen.runs.nbytes)
+
+
 _LIKE = joined(("like_chunk", "like_local"), ("like",), tuple, lambda *key: (key,))
 
 
 class Redundant:
-    """The table of redundant chunks. What writes is called inside `transaction()`."""
+    """The table of redundant local instances. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         columns = Columns.of(RedundantInstance, _KEY, _LIKE)
         self._rows = Table(connection, "redundant", columns, "chunk_id, local_id")
         self._known: set[int] | None = None
+        self._seen = _SeenCache()
+        self.turned = 0
+        """Grows when rows of chunks that had any are others."""
         self._version = -1
         connection.on_forget(self.forget)
 
     def chunks(self) -> Set[int]:
-        """Return the ids of all redundant chunks, none of which is in a group; not to be changed."""
+        """Return the ids of the chunks of which no local instance is in a group; not to be changed."""
         version = self._connection.data_version
         if self._known is None or version != self._version:
             grouped = "SELECT 1 FROM members m WHERE m.chunk_id = r.chunk_id"
             rows = self._connection.rows(f"SELECT DISTINCT chunk_id FROM redundant r WHERE NOT EXISTS ({grouped})")
             self._known, self._version = {k for (k,) in rows}, version
+            self._turn()
         return self._known
 
+    def partly(self) -> Set[int]:
+        """Return the ids of the chunks of which some local instances are redundant and others are not."""
+        rows = self._connection.rows("SELECT DISTINCT chunk_id FROM redundant")
+        return {k for (k,) in rows} - self.chunks()
+
     def of(self, chunk_ids: Sequence[int]) -> list[RedundantInstance]:
-        """Return the local instances of some redundant chunks, in no order."""
-        return self._rows.among("chunk_id", chunk_ids)
+        """Return the redundant local instances of some chunks, none of which is in a group, in no order."""
+        grouped = "SELECT 1 FROM members m WHERE m.chunk_id = redundant.chunk_id AND m.local_id = redundant.local_id"
+        return self._rows.among("chunk_id", chunk_ids, f"NOT EXISTS ({grouped})")
 
-    def like(self, keys: Iterable[Key]) -> list[RedundantInstance]:
-        """Return those that are the same instance as one of these local instances, in order."""
-        return [row for key in keys for row in self._rows.all("like_chunk = ? AND like_local = ?", key)]
+    def like(self, keys: Iterable[Key], after: int = 0) -> list[RedundantInstance]:
+        """Return those of chunks `after` one that are the same instance as one of these local instances, in order."""
+        where = "like_chunk = ? AND like_local = ? AND chunk_id > ?"
+        return [row for key in keys for row in self._rows.all(where, (*key, after))]
 
-    def put(self, chunk_id: int, instances: Sequence[RedundantInstance]) -> None:
-        """Say what a chunk adds nothing to; without any it is not redundant."""
+    def seen_like(self, key: Key) -> SeenRuns:
+        """Return when those are seen that are the same instance as a local instance."""
+        self.chunks()
+        return self._seen.get(key) or self._seen.put(
+            key, seen_together([runs_seen(row.key[0], row.frames) for row in self.like([key])])
+        )
+
+    def put(self, chunk_id: int, instances: Sequence[RedundantInstance], *, all_of_it: bool) -> None:
+        """Say which local instances of a chunk are redundant, and whether these are `all_of_it`."""
         known = set(self.chunks())
-        self._rows.delete("chunk_id = ?", (chunk_id,))
+        if self._rows.delete("chunk_id = ?", (chunk_id,)):
+            self._turn()
         self._rows.add_all(instances)
-        self._known = known | {chunk_id} if instances else known - {chunk_id}
+        for row in instances:
+            if (seen := self._seen.get(row.like)) is not None:
+                self._seen.put(row.like, seen_together([seen, runs_seen(row.key[0], row.frames)]))
+        self._known = known | {chunk_id} if all_of_it else known - {chunk_id}
 
     def forget(self) -> None:
         """Read the rows again when they are next asked for."""
         self._known = None
+        self._turn()
+
+    def _turn(self) -> None:
+        self._seen = _SeenCache()
+        self.turned += 1
 
 
 @dataclass(frozen=True)
