@@ -146,6 +146,9 @@ def test_some_instances_of_a_chunk_meet_others_as_all_of_them_do(walks: ModuleTy
     kept = np.arange(len(a.local_id)) % 3 > 0
     assert np.array_equal(coverage(a.only(kept), b, Sim3.identity()), every[kept])
     assert np.array_equal(coverage(b, a.only(kept), Sim3.identity()), coverage(b, a, Sim3.identity())[:, kept])
+    for n in range(len(kept)):
+        one = np.arange(len(kept)) == n
+        assert np.array_equal(coverage(a.only(one), b, Sim3.identity()), every[one])
     for n in np.flatnonzero(np.isnan(b.plane).any(axis=1)):
         on = lies_on(a.points, b.only(np.arange(len(b.local_id)) == n))
         assert np.allclose(np.bincount(a.owner, on) / np.bincount(a.owner), every[:, n])

@@ -45,7 +45,7 @@ class ChunkSummary:
         return lab_from_rgb(rgb[:: max(1, len(rgb) // _COLORS)])
 
 
-_KEPT_BYTES = 48 << 20
+_KEPT_BYTES = 32 << 20
 """Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
 with chunks. Of a chunk with 12 instances it takes 0.2 MB, of one with 50 a megabyte."""
 _SAMPLED = 64

@@ -255,8 +255,15 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, gr
     shape = (len(source.local_id), len(target.local_id))
     if len(source.points) == 0 or len(target.occupied) == 0:
         return np.zeros(shape)
-    cells, cell_owner = (GrownCells() if grown is None else grown).of(target)
     p = S_target_source.apply(source.points)
+    if _FEW * len(p) < len(target.points):
+        low, high = _reached(target)
+        near = ((low <= p.max(axis=0)) & (high >= p.min(axis=0))).all(axis=1)
+        if not near.all():
+            out = np.zeros(shape)
+            out[:, near] = coverage(source, target.only(near), S_target_source)
+            return out
+    cells, cell_owner = (GrownCells() if grown is None else grown).of(target)
     hits = np.zeros(shape[0] * shape[1])
     for level in np.unique(target.level):
         keys = _key(np.floor(p / (target.grain * 2.0**level)).astype(np.int64), int(level))
@@ -271,6 +278,23 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, gr
         hits += np.bincount(source.owner[which[on]] * shape[1] + at[on], minlength=len(hits))
     total = np.bincount(source.owner, minlength=shape[0])
     return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
+
+
+_FEW = 4
+"""So many times as many points as of a source are looked at by what lies near the source alone."""
+
+
+def _reached(target: ChunkShapes) -> tuple[Array, Array]:
+    """Return corners of the boxes of the grown cells of each instance, (N, 3) each; from 0 to -1 where it has none."""
+    edge = target.grain * 2.0**target.level
+    low, high = np.zeros((len(edge), 3)), np.full((len(edge), 3), -1.0)
+    first = np.flatnonzero(np.diff(target.occupied_owner, prepend=-1))
+    held = target.occupied_owner[first]
+    for axis, shift in enumerate((2 * _BITS, _BITS, 0)):
+        cell = (target.occupied >> shift & (1 << _BITS) - 1) - _HALF
+        low[held, axis] = (np.minimum.reduceat(cell, first) + _SPAN[0]) * edge[held]
+        high[held, axis] = (np.maximum.reduceat(cell, first) + _SPAN[-1] + 1) * edge[held]
+    return low, high
 
 
 def lies_on(points: Array, target: ChunkShapes) -> NDArray[np.bool_]:
