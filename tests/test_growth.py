@@ -151,6 +151,16 @@ def test_a_grown_library_is_the_one_derived_as_a_whole(walks: ModuleType, store:
     check(store)
 
 
+def test_chunks_that_are_derived_together_are_derived_as_a_whole(walks: ModuleType, store: Store) -> None:
+    for index, place in enumerate(ORDERS["there and back"]):
+        with store.transaction():
+            chunk_id = store.chunks.add(1, visit(walks, index, place))
+            store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
+            if index % 3 == 1:
+                consolidate(store, chunk_id, GROW)
+    check(store)
+
+
 def test_what_neighbours_of_computed_depth_miss_grows_alike(walks: ModuleType, store: Store) -> None:
     with store.transaction():
         store.facts.scale_kind = "relative"

@@ -215,7 +215,8 @@ def add_chunks(
             bad.update(index for index, _ in found)
             check_bad_share(len(bad), count, found[0][1] if found else "")
             for part in (p for p in results if p.index not in known):
-                add_chunk(store, session, part, joint, how, library=library, debug_dir=watch.debug_dir)
+                due = library and _library_due(len(store.chunks.all()) + 1, how)
+                add_chunk(store, session, part, joint, how, library=due, debug_dir=watch.debug_dir)
                 note_lost(store, session, part)
                 added(part)
             watch.show(task.span.stop, count)
@@ -223,6 +224,11 @@ def add_chunks(
         from list3r.association.whole_map.loops import write_revisits
 
         write_revisits(store, session, plan.whole, how.revisits.search.suppress_frames)
+
+
+def _library_due(chunks: int, how: AssociationSettings) -> bool:
+    """Return whether the library is derived with the last of so many chunks: the same after a kill as without."""
+    return chunks <= how.library_always or chunks % how.library_every == 0
 
 
 MOST_DEPTH_EVERY = 8

@@ -35,7 +35,7 @@ _POSED = 80
 class RedundancySettings:
     """When a local instance adds nothing to what other chunks of its session saw."""
 
-    chunks: int = 8
+    chunks: int = 12
     """Earlier chunks that must have seen its surface, as one thing or in pieces; 0: none is redundant."""
     covered: float = 0.75
     """Share of its surface that so many must have seen."""
@@ -190,7 +190,7 @@ def _floor(store: Store, inside: list[ChunkRow], summaries: Summaries, unit: flo
         return None if estimate.floor_height is None else 0.0
     some = sample_of(inside)
     cameras = cameras_of(store, some).translation
-    planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in some])
+    planes = place_planes([(summaries.planes(c.chunk_id), c.S_world_chunk) for c in some])
     return floor_height(np.array([0.0, 0.0, 1.0]), planes, cameras, unit) if len(cameras) else None
 
 

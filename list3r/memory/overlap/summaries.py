@@ -45,7 +45,7 @@ class ChunkSummary:
         return lab_from_rgb(rgb[:: max(1, len(rgb) // _COLORS)])
 
 
-_KEPT_BYTES = 32 << 20
+_KEPT_BYTES = 48 << 20
 """Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
 with chunks. Of a chunk with 12 instances it takes 0.2 MB, of one with 50 a megabyte."""
 _SAMPLED = 64
@@ -65,6 +65,15 @@ class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None, frozenset[int]
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, _bytes_of)
+
+
+class PlanesCache(LruCache[tuple[int, int], Planes]):
+    """Planes by chunk id and checksum of what the chunk measured: of up to 64 chunks they are asked for with every new
+    one, when much of what those saw is left out of their summaries.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_SAMPLED * 2)
 
 
 class Summaries(Mapping[int, ChunkSummary]):
@@ -88,15 +97,23 @@ class Summaries(Mapping[int, ChunkSummary]):
         return self._found(chunk_id, left_out)
 
     def _found(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
-        if chunk_id not in self._checked:
-            self._checked[chunk_id] = self._store.chunks.checksum(chunk_id)
-        key = chunk_id, self._checked[chunk_id], self._settings, left_out
+        key = chunk_id, self._checksum(chunk_id), self._settings, left_out
         found = self._known.get(key)
         if found is not None:
             return found
         if left_out:
             return self._known.put(key, _without(self[chunk_id], left_out))
         return self._known.put(key, _summary(self._store, self._store.chunks.get(chunk_id), self._settings))
+
+    def planes(self, chunk_id: int) -> Planes:
+        """Return the planes of a chunk."""
+        known, key = self._store.derived.of(PlanesCache), (chunk_id, self._checksum(chunk_id))
+        return known.get(key) or known.put(key, self[chunk_id].planes)
+
+    def _checksum(self, chunk_id: int) -> int:
+        if chunk_id not in self._checked:
+            self._checked[chunk_id] = self._store.chunks.checksum(chunk_id)
+        return self._checked[chunk_id]
 
     @property
     def metre(self) -> float | None:

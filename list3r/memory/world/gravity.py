@@ -212,7 +212,7 @@ def estimate_gravity(
     summaries = chunk_summaries(store)
     rows = sample_of([c for c in chunks if components[c.chunk_id] == component])
     inside = [replace(c, component=component, S_world_chunk=S_graph_chunk[c.chunk_id]) for c in rows]
-    planes = place_planes([(summaries[c.chunk_id].planes, c.S_world_chunk) for c in inside])
+    planes = place_planes([(summaries.planes(c.chunk_id), c.S_world_chunk) for c in inside])
     unit = world_unit(inside, summaries)
     if summaries.metre is not None:
         unit *= float(inside[0].S_world_chunk.scale) / float(rows[0].S_world_chunk.scale)
