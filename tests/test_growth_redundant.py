@@ -149,7 +149,7 @@ def test_some_instances_of_a_chunk_meet_others_as_all_of_them_do(walks: ModuleTy
     for n in range(len(kept)):
         one = np.arange(len(kept)) == n
         assert np.array_equal(coverage(a.only(one), b, Sim3.identity()), every[one])
-    for n in np.flatnonzero(np.isnan(b.plane).any(axis=1)):
+    for n in np.flatnonzero(np.isnan(b.plane).any(axis=1)).tolist():
         on = lies_on(a.points, b.only(np.arange(len(b.local_id)) == n))
         assert np.allclose(np.bincount(a.owner, on) / np.bincount(a.owner), every[:, n])
 
