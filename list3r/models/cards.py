@@ -301,7 +301,7 @@ CARDS: tuple[ModelCard, ...] = (
 
 
 def find_card(name: str, part: str) -> ModelCard | None:
-    """Return the card of a model, None for one that needs no weights (rgbd, sfm, geometric, ...)."""
+    """Return the card of a model, None for one whose weights nobody fetches (rgbd, sfm, learned, ...)."""
     return next((c for c in CARDS if c.name == name and c.part == part), None)
 
 

@@ -54,10 +54,7 @@ class BuildRequest:
     )
     discovery: str | None = field(
         default=None,
-        metadata=option(
-            "What finds things: geometric, learned, eomt, mask2former, sam2, sam3 or precomputed; when left out, "
-            "learned with a sensor's depth, else geometric."
-        ),
+        metadata=option("What finds things: learned (the default), eomt, mask2former, sam2, sam3 or precomputed."),
     )
     tracking: str | None = field(
         default=None, metadata=option("What follows things from frame to frame: reprojection, sam2, sam3 or edgetam.")
