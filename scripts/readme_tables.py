@@ -324,6 +324,19 @@ def exports() -> str:
     return _table(["format", *(f"{n:,}" for n in counts)], [[n, *(cell(n, c) for c in counts)] for n in formats])
 
 
+def receivers() -> str:
+    """Return what others read in the exports of whole memories."""
+    names = {"redkitchen": "redkitchen, 1,000 frames", "home-1": "the demo", "home-7": "`demo --seed 7`"}
+    rows = []
+    for r in _read("receivers")["rows"]:
+        agree = f"{sum(r['agree'].values())} of {len(r['agree'])}"
+        said = f"{r['usd_core_errors']}, {'none' if r['nvidia_sound'] else 'some'}"
+        counts = [f"{r['instances']}, {r['relations']}", agree, f"{r['box_mm']:.3f} mm"]
+        rows.append([names[r["memory"]], *counts, said, f"{r['props_passed']} of {r['props']}"])
+    heads = ["instances, relations", "formats agree", "boxes off by", "usd-core, NVIDIA say", "props that pass"]
+    return _table(["memory", *heads], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "summary": summary,
     "kitchen": kitchen,
@@ -338,8 +351,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "relations": relations,
     "pack": pack,
     "exports": exports,
+    "receivers": receivers,
 }
-PAGES = ("README.md", "docs/measured.md", "docs/prompt.md", "docs/commands.md")
+PAGES = ("README.md", "docs/measured.md", "docs/prompt.md", "docs/commands.md", "docs/usd.md")
 """The pages with tables."""
 
 
