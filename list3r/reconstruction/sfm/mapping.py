@@ -104,7 +104,9 @@ def build_maps(
     for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.told])):
         maps = _grown(cache, problem, camera, free_camera, pair, chosen)
         grown.append(_without_beside(maps, problem))
-        if agreed(grown, chosen) or (not maps and pair is None and _turns(problem, problem.views, camera, chosen)):
+        if agreed(grown, chosen) or (maps and all(steady(m, chosen.steady) for m in maps)):
+            break
+        if not maps and pair is None and _turns(problem, problem.views, camera, chosen):
             break
     best = best_of(grown, chosen.alike)
     held = {key for found in best for key in found.T_map_cam}
@@ -164,6 +166,21 @@ def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[Spar
         if len(poses) >= 2:
             left.append(replace(found, T_map_cam=poses, seen=seen))
     return sorted(left, key=lambda m: (-len(m.T_map_cam), min(m.T_map_cam)))
+
+
+def steady(found: SparseMap, most: float) -> bool:
+    """Return whether what keyframes see lies as deep as what the next one sees, within a factor.
+
+    A map whose scale was lost where the camera turned explains the pictures as well, but there depth jumps (decision
+    0128).
+    """
+    if most <= 1.0:
+        return False
+    deep = []
+    for key, T in sorted(found.T_map_cam.items()):
+        points = np.array([found.points[n] for n in found.seen[key].ids.tolist()]).reshape(-1, 3)
+        deep += [float(np.median(np.linalg.norm(points - T[:3, 3], axis=1)))] if len(points) else []
+    return bool(np.abs(np.diff(np.log(deep))).max(initial=0.0) <= np.log(most))
 
 
 def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:

@@ -139,6 +139,9 @@ class MappingSettings:
     """Keyframes from the first to the second that are told, at least and at most."""
     told: int = 2
     """Pairs that are told at most, besides that of the mapper's own choice."""
+    steady: float = 0.0
+    """... and none is where the depth of what is seen changes by less than this factor from each keyframe to the next;
+    0 for maps that are always compared with others."""
     same_error: float = 1.005
     """Two maps whose errors are that near are the same, and no third is grown: right ones of one chunk differ by 0.1 to
     0.7 %, bent ones are 9 to 12 % off (simulated walks 101 to 104)."""
