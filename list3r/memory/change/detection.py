@@ -19,6 +19,7 @@ from list3r.memory.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.change.places import Places
 from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
+from list3r.memory.change.surface_colors import other_surfaces
 from list3r.memory.geometry import Sim3
 from list3r.memory.merging.edges import Key, PairScores
 from list3r.memory.overlap.summaries import ChunkSummary
@@ -52,11 +53,15 @@ def across_sessions(
         whole &= np.maximum(size_a, size_b) < settings.small_m
         color = np.linalg.norm((a.lab[p.i] - b.lab[p.j]) * _LIGHTNESS, axis=1)
         ratio = np.maximum(size_a, size_b) / np.maximum(np.minimum(size_a, size_b), 1e-9)
-        changed = seen.shares(a, b, p, S_graph_chunk[v].inverse() @ S_graph_chunk[u])
-        keep = ~(whole & ((color > settings.other_color) | (ratio > settings.other_size)))
+        S_v_u = S_graph_chunk[v].inverse() @ S_graph_chunk[u]
+        changed = seen.shares(a, b, p, S_v_u)
+        keep = ~other_surfaces(a, b, p, S_v_u, settings)
+        keep &= ~(whole & ((color > settings.other_color) | (ratio > settings.other_size)))
         one, both = np.maximum(*changed), np.minimum(*changed)
         keep &= (one < settings.seen_through) | (~whole & (both < settings.seen_through / 2))
-        out[u, v] = PairScores(*(x[keep] for x in (p.i, p.j, p.i_on_j, p.j_on_i, p.shared, p.frame_iou)))
+        # What the other session sees through does not lie on a surface that it saw.
+        i_on_j, j_on_i = np.minimum(p.i_on_j, 1.0 - changed[0]), np.minimum(p.j_on_i, 1.0 - changed[1])
+        out[u, v] = PairScores(p.i[keep], p.j[keep], i_on_j[keep], j_on_i[keep], p.shared[keep], p.frame_iou[keep])
     return out
 
 

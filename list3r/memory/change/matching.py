@@ -9,6 +9,7 @@ import numpy as np
 
 from list3r.memory.change.places import Places, difference
 from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
+from list3r.memory.change.surface_colors import palette_distance
 from list3r.memory.constraints import Constraints
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
@@ -53,7 +54,7 @@ class ChangeMatching:
         self._counts = [bool(show) and loose for show, loose in zip(found.shown, self._movable, strict=True)]
         self._placed = {n: _PlacedInstance([n], n) for n in range(len(places.groups))}
         self._instead: set[int] = set()
-        """New instances that stand where others stood."""
+        """New instances that stand where others stood, and those others."""
         self._events: list[tuple[int, Change]] = []
         self._decisions: list[MergeDecision] = []
 
@@ -87,7 +88,8 @@ class ChangeMatching:
                     self._remove(placed, session, found)
         came = {n: box for n, box in came.items() if looks[n].verdict == "gone" or n in replaced}
         for n in fresh:
-            if n in came and not self._scrap(n, came, session, before=False):
+            scrap = n in came and self._scrap(n, came, session, before=False)
+            if n in came and not scrap and not any(self._came_along(n, *way, session) for way in ways):
                 self._add(n, session, looks[n])
 
     def _replaces(self, n: int, left: dict[int, OrientedBox], session: int) -> bool:
@@ -123,7 +125,7 @@ class ChangeMatching:
         found = p.look_after(placed.now, session)
         other = self._displaced_by(placed.now, fresh, session)
         if found.verdict == "gone" or other is not None or self._taken(placed.now, found, fresh, session):
-            self._instead.update([] if other is None else [other])
+            self._instead.update([] if other is None else [other, placed.now])
             return found
         if found.verdict == "there" and self._counts[placed.now]:
             self._still_there(placed, session, found)
@@ -141,14 +143,17 @@ class ChangeMatching:
     def _displaced_by(self, n: int, fresh: Sequence[int], session: int) -> int | None:
         """Something new of other looks that is where most of an instance was: two instances are never at one place."""
         p, s = self._p, self._s
-        old = p.looks(n, session, before=True).feature
+        old = p.looks(n, session, before=True).palette
         for m in fresh:
-            if p.component[m] == p.component[n] and p.changed(m, session, before=False) >= s.mostly_new:
+            if p.component[m] != p.component[n]:
+                continue
+            if p.other_surface(n, m, session):
+                return m
+            if p.changed(m, session, before=False) >= s.mostly_new:
                 box = p.box(m, session, before=False, stayed=True)
-                if (
-                    p.inside(n, box, 0.0, session, before=True) >= s.displaced
-                    and float(old @ p.looks(m, session, before=False).feature) < s.moved_cosine
-                ):
+                new = p.looks(m, session, before=False).palette
+                inside = p.inside(n, box, 0.0, session, before=True) >= s.displaced
+                if inside and palette_distance(old, new) > s.other_palette:
                     return m
         return None
 
@@ -176,6 +181,15 @@ class ChangeMatching:
         way, taller = new.center - old.center, _height(new) - _height(old)
         boxes = [replace(new, center=new.center - way - np.array([0.0, 0.0, end * taller / 2])) for end in (-1.0, 1.0)]
         return any(p.inside(n, box, s.replaced_link_m, session, before=True) >= s.part for box in boxes)
+
+    def _came_along(self, n: int, place: int, old: OrientedBox, new: OrientedBox, session: int) -> bool:
+        """Return whether it is a part of an instance that moved, of which another part was found in its new place."""
+        p, s = self._p, self._s
+        if p.component[n] != p.component[place]:
+            return False
+        sides = np.maximum(np.sort(old.size[:2]), np.sort(new.size[:2]))[np.argsort(np.argsort(new.size[:2]))]
+        whole = replace(new, size=np.array([*sides, max(old.size[2], new.size[2])]))
+        return p.inside(n, whole, s.replaced_link_m, session, before=False) >= s.part
 
     def _seen(self, placed: _PlacedInstance, places: list[int], session: int) -> None:
         p = self._p
@@ -265,9 +279,9 @@ class ChangeMatching:
             return []
         p = self._p
         cost = np.full((len(gone), len(fresh)), _NEVER)
-        new = [p.looks(n, session, before=False) for n in fresh]
+        new = [p.looks(n, session, before=False, stayed=n in self._instead) for n in fresh]
         for i, (placed, _) in enumerate(gone):
-            old = p.looks(placed.now, session, before=True)
+            old = p.looks(placed.now, session, before=True, stayed=placed.now in self._instead)
             taken = {s for n in placed.places for s in p.sessions[n]}
             own = [k for n in placed.places for k in p.groups[n]]
             for j, n in enumerate(fresh):
@@ -279,10 +293,10 @@ class ChangeMatching:
                     cost[i, j] = min(difference(old, new[j], self._s, p.unit), _NEVER)
         # For every instance that is gone there is one more column: that it was not found, at the price of the limit.
         rest = np.full((len(gone), len(gone)), _NEVER)
-        np.fill_diagonal(rest, self._s.moved_most)
+        np.fill_diagonal(rest, self._s.most_deviations)
         rows, columns = linear_sum_assignment(np.hstack([cost, rest]))
         return [
-            _Move(gone[i][0], fresh[j], float(cost[i, j]), _chance(cost, i, j, self._s.moved_most))
+            _Move(gone[i][0], fresh[j], float(cost[i, j]), _chance(cost, i, j, self._s.most_deviations))
             for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
             if j < len(fresh) and cost[i, j] < _NEVER
         ]

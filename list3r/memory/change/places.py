@@ -7,8 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.memory.change.records import ChangeSettings
+from list3r.memory.change.surface_colors import (
+    SAME_LIGHT,
+    Colors,
+    LightBetween,
+    color_distance,
+    hue_distance,
+    lab,
+    meeting,
+    palette_distance,
+)
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
 from list3r.memory.overlap.summaries import ChunkSummary, world_unit
@@ -29,17 +40,21 @@ class GroupLooks:
 
     extent: Array
     """Larger and smaller side of the footprint, height; world units, upright where gravity is known. Shape (3,)."""
-    feature: NDArray[np.float32]
-    """Unit length. Shape (D,)."""
+    palette: Array
+    """Colours of its surface, CIE L*a*b*, lightness at half weight, in the light of the later session. Shape (N, 3)."""
 
 
 def difference(a: GroupLooks, b: GroupLooks, s: ChangeSettings, unit: float = 1.0) -> float:
     """Return the sum of squared deviations between two looks; infinite for two that cannot be one instance."""
-    deviation = np.array(s.moved_share) * (a.extent + b.extent) / 2 + s.moved_m * unit
-    sides = np.minimum(((a.extent - b.extent) / deviation) ** 2, s.moved_side_most)
-    cosine = float(a.feature @ b.feature)
-    total = float(sides.sum()) + (1.0 - cosine) / s.moved_feature
-    return total if cosine >= s.moved_cosine and total <= s.moved_most else float("inf")
+    deviation = np.array(s.side_share) * (a.extent + b.extent) / 2 + np.array(s.side_m) * unit
+    sides = (a.extent - b.extent) / deviation
+    off = sides[sides**2 > s.side_most]
+    if len(off) and (off > 0).all() != (off > 0).any():  # neither is a part of the other
+        return float("inf")
+    sides = np.minimum(sides**2, s.side_most)
+    color = (palette_distance(a.palette, b.palette) / s.palette) ** 2 + hue_distance(a.palette, b.palette) / s.hues
+    total = float(sides.sum()) + color
+    return total if total <= s.most_deviations else float("inf")
 
 
 class Places:
@@ -62,6 +77,7 @@ class Places:
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
         self._views: dict[tuple[int, int], list[DepthView]] = {}
+        self._light: dict[int, LightBetween] = {}
         self._share: dict[tuple[Key, int, bool], float] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
@@ -107,7 +123,8 @@ class Places:
         """Return the box of what was seen of it; unless it has stayed, of what of that has changed."""
         points = self.points(n, session, before=before, stayed=stayed)
         if not stayed:
-            points = self._without_what_stayed(points, self._views_across(n, session, before=before))
+            views = self._views_across(n, session, before=before)
+            points = self._with_foot(points, self._changed_rows(points, views))
         upright = self._upright and self.component[n] == self._first
         return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
 
@@ -183,17 +200,52 @@ class Places:
         """Return whether an earlier session lies in the same world, so that an instance can be new to it."""
         return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
 
-    def looks(self, n: int, session: int, *, before: bool) -> GroupLooks:
-        """Return its looks, the views that show most of it first; what is there all along is left out of its size.
+    def looks(self, n: int, session: int, *, before: bool, stayed: bool = False) -> GroupLooks:
+        """Return its looks, the views that show most of it first; what is there all along is left out of its size,
+        unless that has other colours now, so that it has not `stayed` where depth says so.
 
         `before` a session that does not show it there any more, else in the first session that does.
         """
-        keys = self.members(n, session, before=before)
+        keys = self.members(n, session, before=before, stayed=stayed)
         weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
-        feature = np.average([self.shapes[k].feature[self._at(k, i)] for k, i in keys], axis=0, weights=weight)
-        length = float(np.linalg.norm(feature))
-        views = self._views_across(n, session, before=before)
-        return GroupLooks(self._extent(keys, weight, views), np.asarray(feature / max(length, 1e-12), np.float32))
+        views = [] if stayed else self._views_across(n, session, before=before)
+        rgb = [self._colors_of(key)[self._changed_rows(self._points_of(key), views)] for key in keys]
+        light = self.light(session) if before else SAME_LIGHT
+        return GroupLooks(self._extent(keys, weight, views), light.lab(np.concatenate(rgb)))
+
+    def light(self, session: int) -> LightBetween:
+        """Return how the colours of the sessions before come out in a session, by what both have seen."""
+        if session not in self._light:
+            before, after = [np.zeros((0, 3), np.uint8)], [np.zeros((0, 3), np.uint8)]
+            for n, sessions in enumerate(self.sessions):
+                if session in sessions and sessions[0] < session:
+                    a, b = self._meeting(n, n, session)
+                    before.append(a)
+                    after.append(b)
+            light = LightBetween.of(np.concatenate(before), np.concatenate(after))
+            self._light[session] = light or SAME_LIGHT
+        return self._light[session]
+
+    def other_surface(self, n: int, m: int, session: int) -> bool:
+        """Return whether a new instance `m` lies where the surface of `n` was, in other colours."""
+        a, b = self._meeting(n, m, session)
+        light = self.light(session)
+        if len(a) < self._s.displaced * sum(len(self._points_of(k)) for k in self._surface(n, session, before=True)):
+            return False
+        return len(a) > 0 and float(np.median(color_distance(light.lab(a), lab(b)))) > light.limit(self._s)
+
+    def _meeting(self, n: int, m: int, session: int) -> tuple[Colors, Colors]:
+        """Return the colours of the points of `n` before a session that meet `m` in it, and of what they meet."""
+        old, new = self._surface(n, session, before=True), self._surface(m, session, before=False)
+        points = [np.concatenate([self._points_of(k) for k in keys]) for keys in (old, new)]
+        rgb = [np.concatenate([self._colors_of(k) for k in keys]) for keys in (old, new)]
+        if not len(points[0]) or not len(points[1]):
+            return rgb[0][:0], rgb[1][:0]
+        near, at = meeting(cKDTree(points[1]), points[0], self._s.meets_m * self.unit)
+        return rgb[0][near], rgb[1][at]
+
+    def _surface(self, n: int, session: int, *, before: bool) -> list[Key]:
+        return self.members(n, session, before=before, stayed=True)
 
     def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[DepthView]) -> Array:
         """Return the weighted median over its whole views, so that what one view took from its surroundings does not
@@ -203,7 +255,7 @@ class Places:
         sizes, weights = [], []
         for key, is_whole, w in zip(keys, whole, weight, strict=True):
             points = self._points_of(key)
-            points = self._without_what_stayed(points, views)
+            points = self._with_foot(points, self._changed_rows(points, views))
             if len(points) and (is_whole or not any(whole)):
                 sizes.append(self._sides(fit_box(points, upright=self._upright, trim=_SPREAD)))
                 weights.append(w)
@@ -217,10 +269,21 @@ class Places:
         """
         return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
 
-    def _without_what_stayed(self, points: Array, views: Sequence[DepthView]) -> Array:
-        """Return the points that have changed, where that is enough of them."""
-        changed = points[changed_points(points, views, self._s.visibility)]
-        return changed if len(changed) >= self._s.least_changed * len(points) else points
+    def _changed_rows(self, points: Array, views: Sequence[DepthView]) -> NDArray[np.bool_]:
+        """Return which points have changed, where that is enough of them; else all. Shape (N,)."""
+        changed = changed_points(points, views, self._s.visibility)
+        return changed if changed.sum() >= self._s.least_changed * len(points) else np.ones(len(points), bool)
+
+    def _with_foot(self, points: Array, changed: NDArray[np.bool_]) -> Array:
+        """Return the points that have changed, and those below that depth does not tell from what they stand on."""
+        if not self._upright or changed.all() or not changed.any():
+            return points[changed]
+        box = fit_box(points[changed], upright=True, trim=_SPREAD)
+        off = np.abs((points - box.center) @ box.rotation)[:, :2]
+        lowest = float(box.center[2] - box.size[2] / 2)
+        foot = (off <= box.size[:2] / 2).all(axis=1) & (points[:, 2] < lowest)
+        foot &= points[:, 2] > lowest - self._s.foot_m * self.unit
+        return points[changed | foot]
 
     def _sides(self, box: OrientedBox) -> Array:
         if not self._upright:
@@ -265,6 +328,11 @@ class Places:
         shape, at = self.shapes[key[0]], self._at(*key)
         start, stop = np.searchsorted(shape.owner, [at, at + 1])
         return np.asarray(self.rows[key[0]].S_world_chunk.apply(shape.points[start:stop]))
+
+    def _colors_of(self, key: Key) -> Colors:
+        shape, at = self.shapes[key[0]], self._at(*key)
+        start, stop = np.searchsorted(shape.owner, [at, at + 1])
+        return shape.rgb[start:stop]
 
     def _at(self, chunk_id: int, local_id: int) -> int:
         return int(np.searchsorted(self.shapes[chunk_id].local_id, local_id))

@@ -26,23 +26,37 @@ class ChangeSettings:
     """Between median colours (CIE L*a*b*, lightness at half weight) of two whole instances that are not one;"""
     other_size: float = 2.0
     """or the ratio of their diagonals."""
+    meets: float = 0.2
+    """Share of an instance's surface that lies on another one, from which the colours of what meets are compared;"""
+    meets_m: float = 0.03
+    """points within this meet."""
+    other_surface: float = 15.0
+    """Median distance of colours where surfaces of two sessions meet (CIE L*a*b*, lightness at half weight), from which
+    they are two surfaces: of one it is 3.7, and 7 in 95 of 100 (decision 0059);"""
+    other_surface_noise: float = 4.0
+    """but so many times what all that meets has, where the light has changed."""
     seen_through: float = 0.2
     """Share of an instance's surface that another session sees through, from which nothing found there is it."""
     pure: float = 0.5
     """Share of what is seen through, beside the mean of all members, from which a member tells of what changed."""
-    moved_share: tuple[float, float, float] = (0.1, 0.35, 0.1)
+    side_share: tuple[float, float, float] = (0.04, 0.04, 0.02)
     """Deviation of larger side, smaller side and height of one instance in two places, as a share of them,"""
-    moved_m: float = 0.01
+    side_m: tuple[float, float, float] = (0.012, 0.012, 0.008)
     """and beside that."""
-    moved_side_most: float = 3.0
-    """Squared deviations that one side counts at most: what hides a part of an instance says nothing against it."""
+    other_palette: float = 10.0
+    """Distance of colours, see `palette_distance`, of two instances that are not one."""
+    side_most: float = 3.0
+    """Squared deviations that one side counts at most: what hides a part of an instance says nothing against it, as
+    long as no side of the part is longer than that of the whole by more."""
     least_changed: float = 0.3
     """Share of an instance's points that must have changed, for the others to be left out of its size."""
-    moved_feature: float = 0.01
-    """What 1 - cosine of the features counts as one squared deviation;"""
-    moved_cosine: float = 0.9
-    """and what the cosine must be at least."""
-    moved_most: float = 9.5
+    foot_m: float = 0.04
+    """Height above what it stands on up to which depth does not tell that an instance came or went."""
+    palette: float = 4.0
+    """Deviation of the colours of one instance in two places, see `palette_distance`."""
+    hues: float = 0.04
+    """What of `hue_distance` counts as one squared deviation."""
+    most_deviations: float = 11.0
     """Sum of squared deviations up to which two are one instance."""
     placed_deviations: float = 2.0
     """Deviations of how surely the sessions lie on each other: within so many nothing has moved, and what is gone must
