@@ -48,7 +48,7 @@ def difference(a: GroupLooks, b: GroupLooks, s: ChangeSettings, unit: float = 1.
     """Return the sum of squared deviations between two looks; infinite for two that cannot be one instance."""
     deviation = np.array(s.side_share) * (a.extent + b.extent) / 2 + np.array(s.side_m) * unit
     sides = (a.extent - b.extent) / deviation
-    off = sides[sides**2 > s.side_most]
+    off = sides[np.abs(sides) > s.side_longer]
     if len(off) and (off > 0).all() != (off > 0).any():  # neither is a part of the other
         return float("inf")
     sides = np.minimum(sides**2, s.side_most)

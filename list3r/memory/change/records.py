@@ -46,8 +46,9 @@ class ChangeSettings:
     other_palette: float = 10.0
     """Distance of colours, see `palette_distance`, of two instances that are not one."""
     side_most: float = 3.0
-    """Squared deviations that one side counts at most: what hides a part of an instance says nothing against it, as
-    long as no side of the part is longer than that of the whole by more."""
+    """Squared deviations that one side counts at most: what hides a part of an instance says nothing against it,"""
+    side_longer: float = 3.0
+    """unless another side is longer than that of the whole by so many deviations."""
     least_changed: float = 0.3
     """Share of an instance's points that must have changed, for the others to be left out of its size."""
     foot_m: float = 0.04
@@ -56,7 +57,7 @@ class ChangeSettings:
     """Deviation of the colours of one instance in two places, see `palette_distance`."""
     hues: float = 0.04
     """What of `hue_distance` counts as one squared deviation."""
-    most_deviations: float = 11.0
+    most_deviations: float = 12.5
     """Sum of squared deviations up to which two are one instance."""
     placed_deviations: float = 2.0
     """Deviations of how surely the sessions lie on each other: within so many nothing has moved, and what is gone must
