@@ -126,7 +126,7 @@ def walks() -> str:
             "recall, precision; means over walks",
             "colour and depth, 6 walks",
             "the same by the rules, before",
-            "colour alone (rules), 3 walks",
+            "colour alone, 3 walks",
         ],
         [
             ["instances at box IoU 0.25", boxes(depth, "0.25"), boxes(rules, "0.25"), boxes(colour, "0.25", "box_")],

@@ -130,19 +130,23 @@ class Sheet:
 def _outline(points: list[list[float]]) -> list[tuple[float, float]]:
     """Return the corners of the convex hull in order, by Andrew's monotone chain: for eight points ten times as fast as
     Qhull."""
-    chain: list[tuple[float, float]] = []
     ordered = sorted({(x, y) for x, y in points})
-    for half in (ordered, ordered[::-1]):
-        start = len(chain)
-        for x, y in half:
-            while len(chain) > start + 1:
-                (ax, ay), (bx, by) = chain[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                    break
-                chain.pop()
-            chain.append((x, y))
-        chain.pop()
+    return _half(ordered)[:-1] + _half(ordered[::-1])[:-1]
+
+
+def _half(ordered: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the corners on one side, from the first point to the last."""
+    chain: list[tuple[float, float]] = []
+    for x, y in ordered:
+        while len(chain) > 1 and _turn(chain[-2], chain[-1], x, y) <= 0:
+            chain.pop()
+        chain.append((x, y))
     return chain
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], x: float, y: float) -> float:
+    """Return twice the area of a triangle, positive to the left."""
+    return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
 
 
 def font_of(size_px: int) -> Font:
