@@ -49,7 +49,7 @@ Filmer = Callable[[Visit, int, int], Film]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="7001-7006")
-    parser.add_argument("--methods", default="learned", help="of geometric, learned")
+    parser.add_argument("--methods", default="learned", help="such as learned,sam2")
     parser.add_argument("--house", type=Path, help="folder of aws-robomaker-small-house-world")
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     parser.add_argument("--json", type=Path)
