@@ -24,8 +24,9 @@ from list3r.instances.learned.weights import SHIPPED, load_weights, write_weight
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings
 from list3r.memory.errors import OptionError
-from list3r.pipeline.choice import settings_asked
+from list3r.pipeline.choice import settings_asked, settings_resumed
 from list3r.pipeline.request import BuildRequest
+from list3r.pipeline.settings import BuildSettings
 from tests.test_instances_library import SCENE, render, walk
 
 
@@ -149,6 +150,14 @@ def test_it_is_the_default_and_damage_to_its_weights_is_said(tmp_path: Path, mon
     assert "\n" not in str(said.value)
     assert settings_asked(BuildRequest(discovery="eomt"), depth, "any")[0].discovery == "eomt"
     load_weights.cache_clear()
+
+
+def test_a_session_of_a_discoverer_that_is_gone_says_how_to_go_on() -> None:
+    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
+    begun = BuildSettings(discovery="geometric")
+    with pytest.raises(OptionError, match="go on with --discovery learned"):
+        settings_resumed(BuildRequest(), begun, depth, "any")
+    assert settings_resumed(BuildRequest(discovery="learned"), begun, depth, "any")[0].discovery == "learned"
 
 
 def test_points_of_none_go_to_what_a_way_without_a_gap_leads_to() -> None:
