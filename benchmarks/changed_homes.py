@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.simulation.walks import HomeSessionWalk
-from list3r.association.revisits.verification import verify
+from list3r.association.revisits.verification import VerificationSettings, verify
+from list3r.association.revisits.whole_chunks.all_keyframes import place_by_all_keyframes
 from list3r.evaluation.trajectory import Trajectory, associate, read_tum
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Keyframe
@@ -50,7 +51,9 @@ def main() -> None:
     words = parser.parse_args()
     first, last = (int(n) for n in words.seeds.split("-"))
     if words.strangers:
-        print(json.dumps(strangers([words.keep / str(seed) / "two.l3r" for seed in range(first, last + 1)])))
+        found = strangers([words.keep / str(seed) / "two.l3r" for seed in range(first, last + 1)])
+        print(json.dumps(found))
+        write_json(words.json, {"strangers": found})
         return
     rows = json.loads(words.json.read_text())["homes"] if words.json and words.json.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
@@ -118,12 +121,18 @@ def offset(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[flo
 
 
 def strangers(memories: Sequence[Path]) -> dict[str, int]:
-    """How many pairs of keyframes of different homes are believed to show one place, of how many; the same at home."""
+    """How many pairs of keyframes of different homes are believed to show one place, of how many; the same at home.
+
+    And in how many pairs of sessions all keyframes of both place one beside the other.
+    """
     keyframes = [_keyframes(path) for path in memories if path.exists()]
-    counts = {"pairs": 0, "believed": 0, "pairs_at_home": 0, "believed_at_home": 0}
+    counts = dict.fromkeys(("sessions", "placed", "pairs", "believed"), 0)
+    counts |= {f"{name}_at_home": 0 for name in counts}
     for (a, (first, _)), (b, (_, second)) in itertools.product(enumerate(keyframes), repeat=2):
-        edges = [verify(u, v, 0, 1) for u in first for v in second]
+        edges = [verify(u, v, 0, 1, later=True) for u in first for v in second]
         where = "_at_home" if a == b else ""
+        counts[f"sessions{where}"] += 1
+        counts[f"placed{where}"] += bool(place_by_all_keyframes((0, first), (1, second), VerificationSettings()))
         counts[f"pairs{where}"] += len(edges)
         counts[f"believed{where}"] += sum(e.accepted for e in edges)
     return counts

@@ -40,6 +40,12 @@ from list3r.association.revisits.joint_window import (
 from list3r.association.revisits.scaled_verification import verify_scaled
 from list3r.association.revisits.second_looks import SecondLookSettings, are_two, seeing_the_same
 from list3r.association.revisits.verification import VerificationSettings, verify
+from list3r.association.revisits.whole_chunks.all_keyframes import (
+    WITNESSED,
+    AllKeyframesSettings,
+    contradicted,
+    place_by_all_keyframes,
+)
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, Keyframe
@@ -87,6 +93,8 @@ class RevisitSettings:
     """Where frames that look alike do not suffice."""
     second_looks: SecondLookSettings = field(default_factory=SecondLookSettings)
     """Where a single relation ties a session to another."""
+    all_keyframes: AllKeyframesSettings = field(default_factory=AllKeyframesSettings)
+    """Where frames that look alike do not place a session."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +148,8 @@ def _by_frames(
         edges.append(_with_scores(edge, scored))
     if chosen.verified and (alone := look.alone(edges)) is not None:
         edges += look.second_looks(alone, {e.frames for e in edges if e.u == alone.u})
+    if chosen.verified and chosen.all_keyframes.chunks:
+        edges = look.by_all_keyframes(edges)
     return look.unambiguous(edges) if chosen.verified else edges
 
 
@@ -174,9 +184,11 @@ def _with_scores(edge: Edge, scored: _Scored) -> Edge:
 def _objected(edge: Edge, objection: Objection) -> Edge:
     """Return an edge, rejected where there is an objection."""
     against = objection(edge.S_v_u) if edge.accepted else None
-    if against is None:
-        return edge
-    return replace(edge, accepted=False, weight=0.0, reason=f"{against} ({edge.reason})")
+    return edge if against is None else _rejected(edge, against)
+
+
+def _rejected(edge: Edge, why: str) -> Edge:
+    return replace(edge, accepted=False, weight=0.0, reason=f"{why} ({edge.reason})")
 
 
 def _tells(keyframe: Keyframe) -> bool:
@@ -291,6 +303,43 @@ class _Lookout:
                 break
         return out
 
+    def by_all_keyframes(self, edges: Sequence[Edge]) -> list[Edge]:
+        """Return the edges with those that all keyframes find to other sessions, where frames that look alike do not
+        place this one (docs/decisions/0134). What they contradict is rejected, what they find again replaced."""
+        s, here, session = self._settings, self._rows[self._id], {k: r.session_id for k, r in self._rows.items()}
+        others = [e for e in edges if session[e.u] != here.session_id and self._apart(e.u)]
+        alike = sorted(others, key=lambda e: (not e.accepted, -e.scores.get("s_det", 0.0), e.u))
+        metric = [e.u for e in alike if self._rows[e.u].scale_kind == here.scale_kind == "metric"]
+        sure = [e for e in alike if e.accepted and e.u in metric]
+        agree = [
+            e
+            for e, f in itertools.combinations(sure, 2)
+            if are_two(e, f, session, s.second_looks.apart) and self._agree(e, f)
+        ]
+        if agree and not contradicted(agree[0], self._told_by(agree[0].u), self._told_by(self._id), s.all_keyframes):
+            return list(edges)
+        out = list(edges)
+        for u in list(dict.fromkeys(metric))[: s.all_keyframes.chunks]:
+            ends = (u, self._told_by(u)), (self._id, self._told_by(self._id))
+            found = place_by_all_keyframes(*ends, s.verification, s.all_keyframes)
+            again = {e.frames for e in found}
+            rest = [e for e in out if e.u != u or e.frames not in again]
+            out = [self._contradicted(e, found) for e in rest] + found
+        if agree and not any(WITNESSED in e.scores for e in out):
+            wrong, why = {(e.u, e.frames) for e in sure}, "the rest of both chunks contradicts it"
+            out = [_rejected(e, why) if (e.u, e.frames) in wrong else e for e in out]
+        return out
+
+    def _told_by(self, chunk_id: int) -> list[Keyframe]:
+        """Return the keyframes of a chunk that have features and depth."""
+        return [f for f in self._store.keyframes.of(chunk_id) if _tells(f)]
+
+    def _contradicted(self, edge: Edge, found: Sequence[Edge]) -> Edge:
+        """Return an edge, rejected where it disagrees with what the whole of two chunks speaks for."""
+        if not edge.accepted or not found or self._agree(found[0], edge):
+            return edge
+        return _rejected(edge, "the whole of both chunks says otherwise")
+
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
         """Return the edges without those that join what was apart in more than one way.
 
@@ -308,7 +357,7 @@ class _Lookout:
         out = list(edges)
         for k in across if others and unsure else others:
             why = "it fits several places as well" if unsure else "more relations say otherwise"
-            out[k] = replace(edges[k], accepted=False, weight=0.0, reason=f"{why} ({edges[k].reason})")
+            out[k] = _rejected(edges[k], why)
         return out
 
     def _agree(self, one: Edge, other: Edge) -> bool:

@@ -1,6 +1,7 @@
 """Decide whether a session is placed in the world of another: by two relations that agree, or by one beyond doubt.
 
-Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart.
+Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart. One is
+beyond doubt when many features hold it, or when the whole of both chunks speaks for it (docs/decisions/0134).
 
 Within one video neighbouring chunks share frames, and a false loop is caught by the chain. Nothing catches a false
 relation that alone ties one session to another: the whole session would land on top of the old world in a wrong place.
@@ -17,6 +18,7 @@ import numpy as np
 
 from list3r.association.graph.pose_graph import across, chain_poses
 from list3r.association.revisits.second_looks import FramesApart, are_two
+from list3r.association.revisits.whole_chunks.all_keyframes import WITNESSED
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -135,7 +137,7 @@ def _agree(e: Edge, f: Edge, blocks: _Blocks, unit: float, s: TieSettings) -> bo
 
 def _is_sure(e: Edge, s: TieSettings) -> bool:
     scores = e.scores
-    return (
+    return WITNESSED in scores or (
         scores.get("feature_inliers", 0.0) >= s.sure_features
         and scores.get("overlap", 0.0) >= s.sure_overlap
         and scores.get("agreement", 0.0) >= s.sure_agreement

@@ -110,7 +110,7 @@ def verify(
     if pose is None or pose.inliers < chosen.least_feature_share * pose.matches:
         agreeing = 0 if pose is None else pose.inliers
         return build.rejected(f"only {agreeing} of {len(matched)} matched features agree on a pose")
-    side_u, side_v = _side(keyframe_u, chosen.noise), _side(keyframe_v, chosen.noise)
+    side_u, side_v = _side(keyframe_u), _side(keyframe_v)
     found = _refine(side_u, side_v, pose, a, b, chosen)
     if found is None:
         return build.rejected("the depth images do not meet at the pose that the features give")
@@ -127,13 +127,17 @@ def rejected(keyframe_u: Keyframe, keyframe_v: Keyframe, u_id: int, v_id: int, r
     return _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id).rejected(reason)
 
 
-def _side(keyframe: Keyframe, noise: SensorNoise) -> _Side:
+def working_view(keyframe: Keyframe) -> WorkingFrame:
+    """Return the small depth image of a keyframe as a view: points and normals in camera coordinates."""
     height, width = keyframe.depth_small.shape
     camera = Camera(width, height, *keyframe.camera_small)
     depth = np.ascontiguousarray(keyframe.depth_small, np.float32)
-    points, normals, valid = surface(depth, camera)
-    view = WorkingFrame(camera, depth, points, normals, valid, np.zeros_like(depth))
-    return _Side(view, Samples(points[valid][::2], normals[valid][::2]))
+    return WorkingFrame(camera, depth, *surface(depth, camera), np.zeros_like(depth))
+
+
+def _side(keyframe: Keyframe) -> _Side:
+    view = working_view(keyframe)
+    return _Side(view, Samples(view.points[view.valid][::2], view.normals[view.valid][::2]))
 
 
 def _refine(

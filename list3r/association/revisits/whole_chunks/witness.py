@@ -1,0 +1,122 @@
+"""Ask the whole of two chunks whether a relation is true: all that their keyframes saw, of which two saw little.
+
+A relation of two keyframes can rest on a thing that was moved, or that looks like another. Then walls, floor and all
+that stayed lie elsewhere: what one chunk saw hangs in the free space of the other. What the two keyframes saw
+themselves is left out, so that the rest is a witness of its own (docs/decisions/0134).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from list3r.association.revisits.verification import working_view
+from list3r.memory.records import Keyframe
+from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.rgbd.view import WorkingFrame
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class WitnessSettings:
+    """When the whole of two chunks speaks for a relation."""
+
+    points: int = 400
+    """Most points of a keyframe that are looked for in the other chunk."""
+    met_m: float = 0.02
+    """A point lies on a surface within this and"""
+    met_sigmas: float = 2.0
+    """so many deviations of the sensor's noise, where both"""
+    least_cosine: float = 0.8
+    """have about one direction."""
+    through_m: float = 0.05
+    """A point is seen through where depth lies further behind it than this and"""
+    through_sigmas: float = 3.0
+    """so many deviations."""
+    near_m: float = 0.1
+    """Nearer points are not looked at."""
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What the whole of two chunks says of a relation."""
+
+    seen: float
+    """Share of a chunk's points that the other chunk saw, the smaller of the two, in [0, 1]."""
+    agreement: float
+    """Of those the share that lies on a surface, the smaller of the two, in [0, 1]."""
+
+
+class ChunkViews:
+    """The keyframes of a chunk with depth, as views and as points of the chunk."""
+
+    def __init__(self, keyframes: Sequence[Keyframe], settings: WitnessSettings) -> None:
+        self._settings = settings
+        self._views = {k.frame_index: (working_view(k), k.T_chunk_cam) for k in keyframes}
+        found = [_surface(view, T, settings.points) for view, T in self._views.values()]
+        self.points: Array = np.concatenate([p for p, _ in found]) if found else np.zeros((0, 3))
+        """Chunk coordinates, metres. Shape (N, 3)."""
+        self.normals: Array = np.concatenate([n for _, n in found]) if found else np.zeros((0, 3))
+        """Unit length. Shape (N, 3)."""
+
+    def seen_by(self, frame: int) -> Mask:
+        """Tell which points lie on a surface that one keyframe (Frame.index) saw. Shape (N,)."""
+        return self._fares(self.points, self.normals, *self._views[frame])[0]
+
+    def fare(self, points: Array, normals: Array) -> tuple[Mask, Mask]:
+        """Tell which points (N, 3) were seen here, and which of them lie on a surface, chunk coordinates.
+
+        A point counts by what most of the keyframes say that can tell. Shapes (N,).
+        """
+        met, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+        for view, T in self._views.values():
+            on, judged = self._fares(points, normals, view, T)
+            met, seen = met + on, seen + judged
+        return seen > 0, (met > 0) & (2 * met >= seen)
+
+    def _fares(self, points: Array, normals: Array, view: WorkingFrame, T_chunk_cam: Array) -> tuple[Mask, Mask]:
+        """Tell which points lie on what a view saw, and which lie there or before it. Shapes (N,)."""
+        s, camera = self._settings, view.camera
+        p = (points - T_chunk_cam[:3, 3]) @ T_chunk_cam[:3, :3]
+        z = np.maximum(p[:, 2], 1e-3)
+        column, row = np.rint(p[:, 0] / z * camera.fx + camera.cx), np.rint(p[:, 1] / z * camera.fy + camera.cy)
+        inside = (p[:, 2] > s.near_m) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        at = np.flatnonzero(inside)
+        pixel = (row[at] * camera.width + column[at]).astype(np.int64)
+        known = view.valid.ravel()[pixel]
+        at, pixel = at[known], pixel[known]
+        there, normal = view.points.reshape(-1, 3)[pixel], view.normals.reshape(-1, 3)[pixel]
+        sigma = s.noise.sigma(there[:, 2])
+        off = np.abs(np.einsum("ni,ni->n", p[at] - there, normal))
+        along = np.abs(np.einsum("ni,ni->n", normals[at] @ T_chunk_cam[:3, :3], normal))
+        limit = s.through_m + s.through_sigmas * sigma
+        on, judged = np.zeros(len(points), bool), np.zeros(len(points), bool)
+        on[at] = (off < s.met_m + s.met_sigmas * sigma) & (along > s.least_cosine)
+        judged[at] = on[at] | (off < limit) | (p[at, 2] < there[:, 2] - limit)
+        return on, judged
+
+
+def witness(T_v_u: Array, u: ChunkViews, v: ChunkViews, frames: tuple[int, int]) -> Witness:
+    """Return what two chunks say of a relation (4, 4) of two keyframes (Frame.index of u and of v), metres."""
+    T_u_v = np.linalg.inv(T_v_u)
+    shares = []
+    for source, target, T, frame in ((u, v, T_v_u, frames[0]), (v, u, T_u_v, frames[1])):
+        rest = ~source.seen_by(frame)
+        points, normals = source.points[rest], source.normals[rest]
+        seen, met = target.fare(points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T)
+        shares.append((float(seen.sum()) / max(len(source.points), 1), float(met.sum()) / max(int(seen.sum()), 1)))
+    return Witness(seen=min(s for s, _ in shares), agreement=min(a for _, a in shares))
+
+
+def _surface(view: WorkingFrame, T_chunk_cam: Array, most: int) -> tuple[Array, Array]:
+    """Return points of a view spread over its picture, and their normals, chunk coordinates. Shapes (N, 3)."""
+    rows = np.flatnonzero(view.valid)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+    R, t = T_chunk_cam[:3, :3], T_chunk_cam[:3, 3]
+    return view.points.reshape(-1, 3)[rows] @ R.T + t, view.normals.reshape(-1, 3)[rows] @ R.T
