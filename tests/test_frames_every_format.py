@@ -94,6 +94,8 @@ OPTIONS = {
     "images": SourceOptions(depth_scale=1000.0),
     "tum": SourceOptions(intrinsics=(70.0, 70.0, 39.5, 29.5)),
 }
+TELL_THEMSELVES = ("lerobot", "rosbag")
+"""Name features and topics that are not read, not files."""
 NUMBER = re.compile(rb"-?\d+\.\d+(e-?\d+)?")
 
 
@@ -131,6 +133,17 @@ def test_a_recording_of_nothing_but_noise_is_refused_and_leaves_nothing(
     before = sorted(tmp_path.rglob("*"))
     assert run(["build", str(place), "-m", str(tmp_path / "a.l3r"), "--workers", "0"]) == 2
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_what_lies_in_a_recording_and_is_not_read_is_named(recording: tuple[str, Path], tmp_path: Path) -> None:
+    name, path = recording
+    members = members_of(path)
+    if len(members) == 1 or name.split(" ")[0] in TELL_THEMSELVES:
+        pytest.skip("a file without members, or one whose reader tells it in its own words")
+    place = write_members(tmp_path / "more", path, {**members, "motion9.imu": b"x", "scan9/room.glb": b"x"})
+    notes = open_source(place, OPTIONS.get(name, SourceOptions())).info.notes
+    (said,) = [note for note in notes if note.startswith("not read: ")]
+    assert "motion9.imu" in said and "scan9" in said, said
 
 
 def look(path: Path, options: SourceOptions) -> str | None:

@@ -11,6 +11,7 @@ from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.memory.errors import List3rError, OptionError, SourceError
+from tests import recordings
 from tests.recordings import COUNT, off_plane, shots, write_bag
 from tests.test_frames_recordings import frames_of, world_points
 
@@ -79,6 +80,23 @@ def test_topics_are_chosen_by_name(tmp_path: Path) -> None:
         open_source(path, SourceOptions(topics=(("color", "/nothing"),)))
     with pytest.raises(OptionError, match="the roles are color, depth, pose"):
         SourceOptions(topics=(("smell", "/a"),))
+
+
+def test_topics_that_are_not_read_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_bag(tmp_path / "walk", "mcap")
+    assert not [note for note in open_source(path).info.notes if note.startswith("not read")]
+    messages = recordings._messages
+    with monkeypatch.context() as patch:
+        both = lambda put_, **how: [*messages(put_, **how), *messages(put_, registered=True, odometry=True)]  # noqa: E731
+        patch.setattr(recordings, "_messages", both)
+        (said,) = [n for n in open_source(write_bag(tmp_path / "both")).info.notes if n.startswith("not read")]
+        assert said == "not read: /odom (Odometry)"
+        (tmp_path / "both/plots").mkdir()
+        assert len(frames_of(tmp_path / "both")) > 0
+        blind = lambda put_, **how: [m for m in messages(put_, **how) if "Image" not in m[1]]  # noqa: E731
+        patch.setattr(recordings, "_messages", blind)
+        with pytest.raises(SourceError, match=r"no topic holds pictures .* it has .*/tf \(TFMessage\)"):
+            open_source(write_bag(tmp_path / "blind"))
 
 
 @pytest.mark.parametrize("kind", KINDS)

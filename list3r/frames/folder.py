@@ -27,9 +27,10 @@ from list3r.frames.decoding.decode import (
 )
 from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
+from list3r.frames.leftovers import not_read
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
-from list3r.frames.recordings.stored import stored_size
+from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
 from list3r.memory.errors import FrameError, SourceError
@@ -312,7 +313,7 @@ class FolderSource:
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
-            notes=(*layout.notes, *notes),
+            notes=(*layout.notes, *notes, *not_read(root, layout.kind, self._some_files())),
             missing=tuple(missing),
             image_size=rig.color_size,
             stored_size=rig.stored_size,
@@ -321,6 +322,12 @@ class FolderSource:
             z_up=layout.z_up and self._upright(),
             poses_drift=layout.poses_drift,
         )
+
+    def _some_files(self) -> list[Stored | CodedArray | None]:
+        """Return the files of the first frame, the last and one between."""
+        files = self._layout.files
+        some = [files[k] for k in sorted({0, len(files) // 2, len(files) - 1})]
+        return [p for f in some for p in (f.color, f.depth, f.pose, f.confidence, f.mask)]
 
     def _camera_guess(self) -> Camera | None:
         """Return what the first picture's EXIF says of a camera that is unknown."""

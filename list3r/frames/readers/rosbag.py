@@ -43,6 +43,8 @@ _TOLD_EVERY = 200
 """Messages after which whoever watches hears of the listing."""
 _PACKED = ".zstd"
 """Ends the names of files that `ros2 bag record --compression-mode file` packed, also in metadata, which stay so."""
+_NAMED = 8
+"""Topics that are named in a message."""
 _MOST_BYTES = 2**50
 """Of a recording: it is read message by message."""
 
@@ -102,6 +104,7 @@ class BagSource:
             depth = found.depth()
             tree = found.transforms(color.frame)
             optics, notes = found.optics(color, depth, tree)
+            unread = found.unread({color.topic} | ({depth.topic} if depth else set()))
         self._color, self._depth = color, depth
         pairs = np.stack([np.arange(len(color.times_s))] * 2, axis=1)
         if depth is not None:
@@ -118,7 +121,7 @@ class BagSource:
         stored = read_color(color.first).shape[:2]
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
         posed = sum(T is not None for T in self._poses)
-        notes = [*notes, *said, *_cut_off(path)]
+        notes = [*notes, *said, *_cut_off(path), *unread]
         if posed:
             notes.append(f"poses of {color.frame} in {world}")
         elif tree.moving:
@@ -151,10 +154,10 @@ class BagSource:
             last = max(max(stamps) for stamps in at.values())
             for connection, received, raw in reader.messages(connections, start=first, stop=last + 1):
                 role = topics[connection.topic]
-                number = at[role].get(received)
-                if number is None:
+                due_then = at[role].get(received)
+                if not due_then:
                     continue
-                waiting[number][role] = raw
+                waiting[due_then.pop(0)][role] = raw
                 kinds = {topics[c.topic]: c.msgtype for c in connections}
                 while due is not None and len(waiting[due]) == len(roles):
                     yield self._frame(reader, due, waiting.pop(due), kinds)
@@ -178,10 +181,13 @@ class BagSource:
         assert stream is not None
         return stream
 
-    def _wanted(self, role: str, numbers: list[int]) -> dict[int, int]:
-        """The frame number of each recorded time that is to be read."""
+    def _wanted(self, role: str, numbers: list[int]) -> dict[int, list[int]]:
+        """The frame numbers of each recorded time that is to be read; several messages may have come at one time."""
         column, stream = (0 if role == "color" else 1), self._stream(role)
-        return {int(stream.received_ns[self._pairs[n, column]]): n for n in numbers}
+        out: dict[int, list[int]] = {}
+        for n in numbers:
+            out.setdefault(int(stream.received_ns[self._pairs[n, column]]), []).append(n)
+        return out
 
     def _frame(
         self, reader: AnyReader, number: int, raw: Mapping[str, bytes], kinds: Mapping[str, str]
@@ -197,7 +203,7 @@ class BagSource:
 
     def _describe(self, notes: tuple[str, ...], has_poses: bool) -> SourceInfo:
         rig, separate = self._rig, self._rig.registration
-        files = [self._path] if self._path.is_file() else sorted(self._path.iterdir())
+        files = [self._path] if self._path.is_file() else sorted(p for p in self._path.iterdir() if p.is_file())
         listing = [(p.name, p.stat().st_size) for p in files]
         missing = missing_parts(depth=self._depth is not None, camera=rig.camera is not None)
         gaps = np.diff(self._times_s)
@@ -231,7 +237,8 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):
-            check_ordinary(part.stat(), part, _MOST_BYTES)
+            if part == path or not part.is_dir():
+                check_ordinary(part.stat(), part, _MOST_BYTES)
         with AnyReader(_parts(path), default_typestore=known) as reader:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
@@ -272,6 +279,7 @@ class _Topics:
         for role, topic in wanted.items():
             if topic not in self._of:
                 raise OptionError(f"--topics {role}={topic}: {path} has {', '.join(sorted(self._of)) or 'no topics'}")
+        self._pose_topic = wanted.get("pose") or self._only_pose_topic()
         self._streams, self._tree, self._infos, self._units = self._scan()
 
     def color(self) -> Stream:
@@ -327,8 +335,27 @@ class _Topics:
             if len(fitting) == 1 or (fitting and word):
                 return max(fitting, key=lambda s: (len(s.times_s), s.topic))
         names = ", ".join(s.topic for s in found)
-        said = f"several topics hold pictures ({names})" if found else "no topic holds pictures"
-        raise SourceError(f"{self._path}: {said}; choose by --topics {role}=/TOPIC")
+        if not found:
+            raise SourceError(f"{self._path}: no topic holds pictures (Image, CompressedImage); {self._all_topics()}")
+        raise SourceError(f"{self._path}: several topics hold pictures ({names}); choose by --topics {role}=/TOPIC")
+
+    def unread(self, pictures: set[str]) -> tuple[str, ...]:
+        """Return a note on the topics that nothing is taken from, where `pictures` are those of colour and depth."""
+        left = [t for t in self._of if t not in pictures and not self._told(t)]
+        return (f"not read: {self._named(left)}",) if left else ()
+
+    def _told(self, topic: str) -> bool:
+        """Whether what a topic says of cameras and poses was taken in."""
+        kind = self._of[topic].msgtype
+        return kind not in _IMAGES and self._tells(topic, kind, self._pose_topic)
+
+    def _all_topics(self) -> str:
+        return f"it has {self._named(list(self._of))}" if self._of else "it is empty"
+
+    def _named(self, topics: list[str]) -> str:
+        """Topics with the kinds of their messages, the first of them."""
+        some = [f"{t} ({self._of[t].msgtype.rsplit('/', 1)[-1]})" for t in sorted(topics)[:_NAMED]]
+        return ", ".join(some) + (f" and {len(topics) - _NAMED} more" if len(topics) > _NAMED else "")
 
     def _scan(self) -> tuple[dict[str, Stream], TransformTree, dict[str, Any], dict[str, float]]:
         """One pass: times of pictures, transforms, cameras; of pictures the headers alone are read."""
@@ -337,7 +364,7 @@ class _Topics:
         infos: dict[str, Any] = {}
         units: dict[str, float] = {}
         tree = TransformTree()
-        pose_topic = self._wanted.get("pose") or self._only_pose_topic()
+        pose_topic = self._pose_topic
         looked_at = [c for c in self._reader.connections if self._tells(c.topic, c.msgtype, pose_topic)]
         count = sum(c.msgcount for c in looked_at)
         for number, (connection, received, raw) in enumerate(self._reader.messages(looked_at), start=1):

@@ -14,6 +14,7 @@ from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOWHERE_SURE
 from list3r.frames.layout import Optics
+from list3r.frames.leftovers import not_read
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.stored import CodedArray, Stored
@@ -112,6 +113,11 @@ class VideoWithDepth:
             return () if not some or any(self._sure(k).any() for k in some) else (NOWHERE_SURE,)
         return ()
 
+    def _some_files(self) -> list[Stored | CodedArray | None]:
+        """Return the video, and depth and confidence of the first frame."""
+        parts, first = self._parts, min(self._parts.depth, default=0)
+        return [parts.video, parts.depth.get(first), parts.confidence(first) if parts.confidence else None]
+
     def _describe(self, root: Path) -> SourceInfo:
         info, parts, registration = self._video.info, self._parts, self._rig.registration
         return replace(
@@ -124,7 +130,7 @@ class VideoWithDepth:
             depth_camera=registration.depth_camera if registration else None,
             T_color_depth=registration.T_color_depth if registration else None,
             depth_scale=self._rig.depth_scale if parts.depth else None,
-            notes=(*info.notes, parts.note, *self._doubts()),
+            notes=(*info.notes, parts.note, *self._doubts(), *not_read(root, parts.kind, self._some_files())),
             missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=parts.z_up,
             poses_drift=parts.poses_drift,
