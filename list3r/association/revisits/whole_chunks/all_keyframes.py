@@ -39,9 +39,9 @@ class AllKeyframesSettings:
     """are turned by at most this."""
     least_seen: float = 0.08
     """Share of either chunk's points that neither keyframe saw and the other chunk did."""
-    least_agreement: float = 0.6
-    """Share of those that must lie on a surface of the other."""
-    contradicted: float = 0.3
+    least_agreement: float = 0.4
+    """Share of those that must lie on a surface of the other, whichever way they face (`Witness.agreement`)."""
+    contradicted: float = 0.15
     """With less of it a relation is contradicted, whatever else speaks for it."""
     margin: float = 0.15
     """By which another place must agree less."""
@@ -129,5 +129,5 @@ def _asked(edges: list[Edge], u: ChunkViews, v: ChunkViews) -> _Place:
 
 
 def _witnessed(edge: Edge, found: Witness) -> Edge:
-    said = f"{edge.reason}; of the rest of both chunks {found.agreement:.0%} agrees"
+    said = f"{edge.reason}; of what else both chunks saw {found.agreement:.0%} agrees"
     return replace(edge, scores=edge.scores | {WITNESSED: found.agreement}, reason=said)

@@ -2,7 +2,8 @@
 
 A relation of two keyframes can rest on a thing that was moved, or that looks like another. Then walls, floor and all
 that stayed lie elsewhere: what one chunk saw hangs in the free space of the other. What the two keyframes saw
-themselves is left out, so that the rest is a witness of its own (docs/decisions/0134).
+themselves is left out, so that the rest is a witness of its own. Along two walls and the floor a room can be shifted
+and they still agree, so it counts how much agrees of what faces the way that agrees least (docs/decisions/0134).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from list3r.association.revisits.verification import working_view
 from list3r.memory.records import Keyframe
@@ -40,6 +42,9 @@ class WitnessSettings:
     """so many deviations."""
     near_m: float = 0.1
     """Nearer points are not looked at."""
+    prior: float = 0.02
+    """Share of all that was seen that is taken to face every way besides, and to agree as all of it does on average:
+    a few points tell nothing."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
@@ -50,7 +55,8 @@ class Witness:
     seen: float
     """Share of a chunk's points that the other chunk saw, the smaller of the two, in [0, 1]."""
     agreement: float
-    """Of those the share that lies on a surface, the smaller of the two, in [0, 1]."""
+    """Of those the share that lies on a surface, of what faces the way in which the least does; the smaller of the two,
+    in [0, 1]."""
 
 
 class ChunkViews:
@@ -58,6 +64,7 @@ class ChunkViews:
 
     def __init__(self, keyframes: Sequence[Keyframe], settings: WitnessSettings) -> None:
         self._settings = settings
+        self.prior = settings.prior
         self._views = {k.frame_index: (working_view(k), k.T_chunk_cam) for k in keyframes}
         found = [_surface(view, T, settings.points) for view, T in self._views.values()]
         self.points: Array = np.concatenate([p for p, _ in found]) if found else np.zeros((0, 3))
@@ -110,8 +117,18 @@ def witness(T_v_u: Array, u: ChunkViews, v: ChunkViews, frames: tuple[int, int])
         rest = ~source.seen_by(frame)
         points, normals = source.points[rest], source.normals[rest]
         seen, met = target.fare(points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T)
-        shares.append((float(seen.sum()) / max(len(source.points), 1), float(met.sum()) / max(int(seen.sum()), 1)))
+        shares.append((float(seen.sum()) / max(len(source.points), 1), _least_share(normals, seen, met, u.prior)))
     return Witness(seen=min(s for s, _ in shares), agreement=min(a for _, a in shares))
+
+
+def _least_share(normals: Array, seen: Mask, met: Mask, prior: float) -> float:
+    """Return the least share that is met of what is seen, over all ways that a surface faces: of directions d the least
+    sum of (n d)^2 over normals n (N, 3) that are met by that over those that are seen."""
+    if not met.any():
+        return 0.0
+    all_seen, all_met = (normals[which].T @ normals[which] for which in (seen, met))
+    besides = prior * float(np.trace(all_seen)) * np.eye(3)
+    return float(eigh(all_met + float(met.sum()) / float(seen.sum()) * besides, all_seen + besides)[0][0])
 
 
 def _surface(view: WorkingFrame, T_chunk_cam: Array, most: int) -> tuple[Array, Array]:
