@@ -10,8 +10,10 @@ import os
 import pwd
 import shutil
 import signal
+import socket
 import subprocess
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -84,3 +86,46 @@ def running_postgres(options: str = "") -> Iterator[PostgresServer]:
         finally:
             with contextlib.suppress(subprocess.CalledProcessError):
                 server.stop()
+
+
+class Network:
+    """A way to a server over TCP that can be cut; `url` leads over it."""
+
+    def __init__(self, server: PostgresServer) -> None:
+        self._target = str(server.folder / ".s.PGSQL.5432")
+        self._pairs: list[socket.socket] = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._listener.getsockname()[1])
+        user = server.url.partition("@")[0]
+        self.url = f"{user}@127.0.0.1:{self.port}/postgres?sslmode=disable"
+        threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
+
+    def cut(self) -> None:
+        """Let go of all connections, and take no more."""
+        for end in (self._listener, *self._pairs):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+        self._pairs.clear()
+
+    def mend(self) -> None:
+        """Take connections again."""
+        self._listener = socket.create_server(("127.0.0.1", self.port))
+        threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
+
+    def _accept(self, listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = listener.accept()
+                server = socket.socket(socket.AF_UNIX)
+                server.connect(self._target)
+                self._pairs += [client, server]
+                for ends in ((client, server), (server, client)):
+                    threading.Thread(target=_passed_on, args=ends, daemon=True).start()
+
+
+def _passed_on(one: socket.socket, other: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while some := one.recv(65536):
+            other.sendall(some)
+        other.shutdown(socket.SHUT_WR)
