@@ -37,6 +37,7 @@ def main() -> None:
     words.add_argument("--frames", type=int, default=6)
     words.add_argument("--size", type=int, nargs=2, default=(160, 120))
     words.add_argument("--engines", nargs="+", default=["local"], choices=["local", "ray"])
+    words.add_argument("--runs", nargs="+", help="Only these, beside what --json holds already; one-process first.")
     words.add_argument("--worker-kills", type=int, default=20)
     words.add_argument("--driver-kills", type=int, default=2)
     words.add_argument("--seed", type=int, default=1)
@@ -50,21 +51,27 @@ def main() -> None:
         "frames": asked.frames,
     }
     result |= {"size": list(asked.size), "runs": runs}
+    told = asked.json or asked.folder / "batch.json"
+    if asked.runs and told.exists():
+        runs |= json.loads(told.read_text())["runs"]
     print(f"{asked.videos} videos of {asked.frames} frames and one file that is no video")
     reference: dict[str, str] | None = None
     for name, engine, jobs in _runs(asked.engines):
         out = asked.folder / f"out-{name}"
+        if asked.runs and name not in asked.runs:
+            reference = reference or _hashes(out)
+            continue
         kills = (asked.worker_kills, asked.driver_kills) if name.endswith("killed") else (0, 0)
         with _cluster() if engine == "ray" else contextlib.nullcontext("") as address:
             command = [sys.executable, "-m", "list3r", "batch", str(videos), "--out", str(out), "--retries", "100"]
             command += ["--engine", engine, *(["--address", address] if address else []), *jobs]
             found = _run(command, out, kills, random.Random(asked.seed))
-        hashes = {p.name: file_hash(p) for p in sorted(out.glob("*.l3r"))}
+        hashes = _hashes(out)
         reference = reference or hashes
         found |= {"files": len(hashes), "equal": hashes == reference, **_told(out)}
         runs[name] = found
         print(name, json.dumps(found), flush=True)
-        write_json(asked.json or asked.folder / "batch.json", result)
+        write_json(told, result)
 
 
 def _runs(engines: list[str]) -> Iterator[tuple[str, str, list[str]]]:
@@ -159,6 +166,10 @@ def _workers(driver: int, command: list[str]) -> list[int]:
             everyone = psutil.Process().children(recursive=True)
             found = [p.pid for p in everyone if "ray::run_task" in " ".join(p.cmdline())]
     return found
+
+
+def _hashes(out: Path) -> dict[str, str]:
+    return {p.name: file_hash(p) for p in sorted(out.glob("*.l3r"))}
 
 
 def _told(out: Path) -> dict[str, object]:
