@@ -1,6 +1,9 @@
 """Many short videos: local processes and Ray make the same files; nothing is lost or built twice while processes die.
 
-python benchmarks/batch.py --videos 200 --engines local ray --worker-kills 20 --driver-kills 2
+python benchmarks/batch.py --engines local ray --json benchmarks/results/batch.json
+
+Processor seconds are those of the command and all that it starts, looked at twice a second: what a process spent after it
+was last seen is not in them.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
+from machine import descendants, write_json
 
 from list3r.batch.sealing import file_hash
 from list3r.simulation.dataset import WalkSettings, write_walk
@@ -28,15 +32,17 @@ def main() -> None:
     words = argparse.ArgumentParser(description=__doc__)
     words.add_argument("--folder", type=Path, default=Path("batch-benchmark"), help="Videos, memories, result.")
     words.add_argument("--videos", type=int, default=200)
-    words.add_argument("--frames", type=int, default=8)
+    words.add_argument("--frames", type=int, default=6)
     words.add_argument("--size", type=int, nargs=2, default=(160, 120))
     words.add_argument("--engines", nargs="+", default=["local"], choices=["local", "ray"])
     words.add_argument("--worker-kills", type=int, default=20)
     words.add_argument("--driver-kills", type=int, default=2)
     words.add_argument("--seed", type=int, default=1)
+    words.add_argument("--json", type=Path, help="Where the result is written; default: in the folder.")
     asked = words.parse_args()
     videos = _videos(asked.folder / "videos", asked.videos, asked.frames, tuple(asked.size))
-    result: dict[str, object] = {"videos": asked.videos, "frames": asked.frames, "size": list(asked.size)}
+    runs: dict[str, object] = {}
+    result = {"videos": asked.videos, "frames": asked.frames, "size": list(asked.size), "runs": runs}
     print(f"{asked.videos} videos of {asked.frames} frames and one file that is no video")
     reference: dict[str, str] | None = None
     for name, engine, jobs in _runs(asked.engines):
@@ -49,9 +55,9 @@ def main() -> None:
         hashes = {p.name: file_hash(p) for p in sorted(out.glob("*.l3r"))}
         reference = reference or hashes
         found |= {"files": len(hashes), "equal": hashes == reference, **_told(out)}
-        result[name] = found
+        runs[name] = found
         print(name, json.dumps(found), flush=True)
-    (asked.folder / "batch.json").write_text(json.dumps(result, indent=2))
+        write_json(asked.json or asked.folder / "batch.json", result)
 
 
 def _runs(engines: list[str]) -> Iterator[tuple[str, str, list[str]]]:
@@ -87,12 +93,17 @@ def _run(command: list[str], out: Path, kills: tuple[int, int], chance: random.R
     """Run the command until it ends by itself, ending its workers and itself at random meanwhile."""
     workers_left, drivers_left = kills
     began, runs, first_seen, rewritten = time.monotonic(), 0, dict[str, int](), set[str]()
+    before, spent = _spent(), dict[int, float]()
     while True:
         driver = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         runs += 1
         started, due = time.monotonic(), time.monotonic() + chance.uniform(1, 6)
+        looked = 0.0
         while driver.poll() is None:
             time.sleep(0.05)
+            if time.monotonic() > looked + 0.5:
+                looked = time.monotonic()
+                spent |= _spent()
             for path in out.glob("*.l3r"):
                 with contextlib.suppress(FileNotFoundError):
                     if first_seen.setdefault(path.name, path.stat().st_ino) != path.stat().st_ino:
@@ -108,11 +119,22 @@ def _run(command: list[str], out: Path, kills: tuple[int, int], chance: random.R
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(chance.choice(busy), signal.SIGKILL)
         if driver.wait() >= 0:
-            seconds = time.monotonic() - began
+            seconds, cpu = time.monotonic() - began, sum(spent.values()) - sum(before.values())
             killed = {"worker_kills": kills[0] - workers_left, "driver_kills": kills[1] - drivers_left}
-            return {"status": driver.returncode, "seconds": round(seconds, 1), "runs": runs, **killed} | {
-                "rewritten": sorted(rewritten)
+            return {"status": driver.returncode, "seconds": round(seconds, 1), "cpu_s": round(cpu, 1), "runs": runs} | {
+                **killed,
+                "rewritten": sorted(rewritten),
             }
+
+
+def _spent() -> dict[int, float]:
+    """Processor seconds of each process that this one has started, and of theirs."""
+    found = {}
+    for pid in descendants(os.getpid()):
+        with contextlib.suppress(psutil.Error):
+            times = psutil.Process(pid).cpu_times()
+            found[pid] = times.user + times.system
+    return found
 
 
 def _workers(driver: int, command: list[str]) -> list[int]:
@@ -133,7 +155,10 @@ def _told(out: Path) -> dict[str, object]:
         states = dict(database.execute("SELECT state, count(*) FROM tasks GROUP BY state").fetchall())
         attempts = dict(database.execute("SELECT outcome, count(*) FROM attempts GROUP BY outcome").fetchall())
         twice = database.execute("SELECT memory FROM attempts WHERE built GROUP BY memory HAVING count(*) > 1")
-        return {"states": states, "attempts": attempts, "built_twice": [name for (name,) in twice]}
+        failed = dict(database.execute("SELECT memory, reason FROM tasks WHERE state = 'failed'").fetchall())
+        return {"states": states, "attempts": attempts, "built_twice": [n for (n,) in twice]} | {
+            "failed": {name: reason.replace(f"{out.parent.resolve()}/", "") for name, reason in failed.items()}
+        }
 
 
 if __name__ == "__main__":
