@@ -16,7 +16,7 @@ import pytest
 
 from list3r.catalog import Catalog
 from list3r.catalog.base import open_backend
-from list3r.catalog.catalog import aabb_distance, box_distance
+from list3r.catalog.catalog import aabb_distance, box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.cli.app import run as list3r
@@ -71,6 +71,10 @@ def content(name: str, count: int = 120, seed: int = 1) -> MemoryContent:
     vectors = chance.normal(size=(count, 16)).astype(np.float32)
     entry = MemoryEntry(name, f"/none/{name}.l3r", 0, f"{name}{seed}", 9, 0, "relative", "known", count, 1)
     return MemoryContent(entry, things, relations, [SpaceVectors(SPACE, np.arange(count), vectors)])
+
+
+def box_distance(thing: CatalogThing, point: np.ndarray[Any, Any]) -> float:
+    return float(box_distances([thing], point)[0])
 
 
 def passing(filters: CatalogFilters) -> list[CatalogThing]:
