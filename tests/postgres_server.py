@@ -33,8 +33,8 @@ def postgres_programs() -> Path:
 class PostgresServer:
     """A server that is running; `url` names its database of the catalogue."""
 
-    def __init__(self, programs: Path, folder: Path, user: str | None) -> None:
-        self._programs, self.folder, self._user = programs, folder, user
+    def __init__(self, programs: Path, folder: Path, user: str | None, options: str = "") -> None:
+        self._programs, self.folder, self._user, self._options = programs, folder, user, options
         name = user or pwd.getpwuid(os.getuid()).pw_name
         self.url = f"postgresql://{name}@/postgres?host={folder}"
         self._run("initdb", "-D", str(folder / "data"), "-A", "trust", "-E", "UTF8", "--no-sync", "--no-instructions")
@@ -43,6 +43,7 @@ class PostgresServer:
     def start(self) -> None:
         """Start it, and wait until it answers."""
         options = f"-c listen_addresses= -c unix_socket_directories={self.folder} -c shared_buffers=256MB"
+        options = f"{options} {self._options}"
         log = str(self.folder / "log")
         self._run("pg_ctl", "-D", str(self.folder / "data"), "-l", log, "-w", "-o", options, "start")
 
@@ -66,15 +67,18 @@ class PostgresServer:
 
 
 @contextlib.contextmanager
-def running_postgres() -> Iterator[PostgresServer]:
-    """A fresh server, gone at the end with all that it held. As root it runs under the user of the package."""
+def running_postgres(options: str = "") -> Iterator[PostgresServer]:
+    """A fresh server, gone at the end with all that it held. As root it runs under the user of the package.
+
+    `options` are settings of the server, such as "-c port=5433", which go before those of a test.
+    """
     programs = postgres_programs()
     user = "postgres" if os.getuid() == 0 else None
     with tempfile.TemporaryDirectory(prefix="list3r-pg-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         if user is not None:
             os.chown(folder, pwd.getpwnam(user).pw_uid, -1)
-        server = PostgresServer(programs, folder, user)
+        server = PostgresServer(programs, folder, user, options)
         try:
             yield server
         finally:

@@ -37,6 +37,7 @@ _BUILD_MEMORY = "2GB"
 """What the server may take while it makes an index anew; one of vectors that does not fit is made far more slowly."""
 _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
+_WRITTEN = "written"
 _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""
 
@@ -56,7 +57,7 @@ class PostgresBackend:
 
     def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name, in one transaction."""
-        with self._connected("written; nothing was changed") as connection, connection.transaction():
+        with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
             names, marks = ", ".join(f.name for f in fields(MemoryEntry)), ", ".join("%s" for _ in fields(MemoryEntry))
             statement = (
@@ -105,7 +106,7 @@ class PostgresBackend:
 
     def drop(self, name: str) -> bool:
         """Forget a memory; whether there was one."""
-        with self._connected("written; nothing was changed") as connection, connection.transaction():
+        with self._connected(_WRITTEN) as connection, connection.transaction():
             known = _first(connection.execute("DELETE FROM memory WHERE name = %s RETURNING memory_id", (name,)))
             if known:
                 self._forget(connection, int(known[0]))
@@ -124,11 +125,11 @@ class PostgresBackend:
         Meanwhile `similar` over all compares all vectors. An index that is missing, since a load was ended, is made.
         """
         if many:
-            with self._connected("written") as connection:
+            with self._connected(_WRITTEN) as connection:
                 for (n,) in connection.execute("SELECT space_id FROM space").fetchall():
                     connection.execute(f"DROP INDEX IF EXISTS vector_{int(n)}_alike")
         yield
-        with self._connected("written") as connection, connection.transaction():
+        with self._connected(_WRITTEN) as connection, connection.transaction():
             connection.execute("SET LOCAL statement_timeout = 0")
             connection.execute(f"SET LOCAL maintenance_work_mem = '{_BUILD_MEMORY}'")
             for (n,) in connection.execute("SELECT space_id FROM space ORDER BY space_id").fetchall():
@@ -291,7 +292,7 @@ class PostgresBackend:
             with self._connections.one() as connection:
                 return _asked(connection, query, values)
         except psycopg.OperationalError as error:
-            if error.sqlstate is not None and not error.sqlstate.startswith(("57P", "08")):
+            if not _lost(error):
                 raise self._failed("asked", error) from error
         except psycopg.Error as error:
             raise self._failed("asked", error) from error
@@ -306,8 +307,15 @@ class PostgresBackend:
         except psycopg.Error as error:
             raise self._failed(what, error) from error
 
-    def _failed(self, what: str, error: Exception) -> CatalogError:
+    def _failed(self, what: str, error: psycopg.Error) -> CatalogError:
+        if what == _WRITTEN:
+            what += "; the same again is safe" if _lost(error) else "; nothing was changed"
         return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_said(error)}")
+
+
+def _lost(error: psycopg.Error) -> bool:
+    """Whether the connection was lost, so that nobody knows whether a transaction that was ending has ended."""
+    return isinstance(error, psycopg.OperationalError) and (error.sqlstate or "08").startswith(("57P", "08"))
 
 
 def _asked(connection: psycopg.Connection[Any], query: str, values: Sequence[Any]) -> list[Any]:
