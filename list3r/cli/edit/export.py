@@ -6,7 +6,7 @@ import contextlib
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,7 +102,7 @@ def export(
 
 
 @contextlib.contextmanager
-def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Callable[[int, int], None]]]:
+def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Any]]:
     """The option that shows how far a long export is, of formats that tell."""
     if quiet or not sys.stderr.isatty() or "progress" not in find_format(to).options:
         yield {}
