@@ -348,6 +348,42 @@ def receivers() -> str:
     return _table(["memory", *heads], rows)
 
 
+def catalogue() -> str:
+    """Return what questions to a catalogue in PostgreSQL cost as it grows."""
+    stages = _read("catalog")["stages"]
+    rows = [
+        ["a memory of 1,000 goes in", "put of 1000"],
+        *([n, n] for n in stages[0] if "," in n and "recall" not in n),
+    ]
+    lines = []
+    for told, name in rows:
+        cells = [s[name] for s in stages]
+        cost = [f"{c['client_cpu_ms'] + c['server_cpu_ms']:.3g}" for c in cells]
+        lines.append(
+            [told, *(f"{cpu} ({c['p10_ms']:.3g}, {c['p50_ms']:.3g})" for cpu, c in zip(cost, cells, strict=True))]
+        )
+    lines.append(["recall@10 of similar, all", *(f"{s['recall@10, similar, all']:.3f}" for s in stages)])
+    lines.append(["GB on disk", *(f"{s['bytes']['all'] / 1e9:.2f}" for s in stages)])
+    load = [s["loaded"] for s in stages]
+    spent = [1e3 * (x["client_cpu_s"] + x["server_cpu_s"]) / x["memories"] for x in load]
+    lines.append(["a memory in a load of many, ms", *(f"{x:.0f}" for x in spent)])
+    heads = [f"{s['memories']} memories, {s['instances']:,} instances" for s in stages]
+    return _table(["ms of processor time, client and server (wall p10, p50)", *heads], lines)
+
+
+def batches() -> str:
+    """Return the runs of the benchmark of batches."""
+    rows = []
+    for name, r in _read("batch")["runs"].items():
+        equal = "the others are compared with these" if name == "one-process" else "equal" if r["equal"] else "differ"
+        ended, lost = f"{r['worker_kills']}, {r['driver_kills']}", r["attempts"].get("lost", 0)
+        twice = f"{len(r['built_twice'])}, {len(r['rewritten'])}"
+        done = f"{r['attempts']['done']}, {lost}, {r['attempts'].get('failed', 0)}"
+        rows.append([name, str(r["files"]), equal, ended, done, twice, f"{r['cpu_s']:.0f}", f"{r['seconds']:.0f}"])
+    heads = ["files", "bytes", "ended workers, drivers", "attempts done, lost, failed", "built twice, written twice"]
+    return _table(["run", *heads, "processor s", "wall s"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "summary": summary,
     "kitchen": kitchen,
@@ -363,8 +399,13 @@ TABLES: dict[str, Callable[[], str]] = {
     "pack": pack,
     "exports": exports,
     "receivers": receivers,
+    "catalogue": catalogue,
+    "batches": batches,
 }
-PAGES = ("README.md", "docs/measured.md", "docs/prompt.md", "docs/commands.md", "docs/usd.md")
+PAGES = (
+    *("README.md", "docs/measured.md", "docs/prompt.md", "docs/commands.md", "docs/usd.md"),
+    *("docs/batch.md", "docs/catalog.md"),
+)
 """The pages with tables."""
 
 

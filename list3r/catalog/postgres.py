@@ -31,7 +31,7 @@ _ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
 _THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _THING_OF_ONE = _THING.replace("m.name", "?::text")
 """Of the instances of one memory, whose name is given as a value."""
-_PROBED = 200
+_PROBED = 400
 """Candidates that a search for vectors keeps at each step; more finds more and takes longer."""
 _BUILD_MEMORY = "2GB"
 """What the server may take while it makes an index anew; one of vectors that does not fit is made far more slowly."""

@@ -18,6 +18,9 @@ _STATEMENT_MS = 60_000
 """How long one statement may take."""
 _SILENT_S = 20
 """A server that does not acknowledge anything for so long is lost: the network is gone."""
+_PLANS = "-c jit=off -c enable_partitionwise_join=on -c max_parallel_workers_per_gather=0"
+"""How questions are planned: relations are joined within each partition, where the rows of a memory lie, in place of
+reading them all; many small questions share the processors better than one that takes several."""
 
 
 class Connections:
@@ -54,7 +57,7 @@ class Connections:
                     held.close()
 
     def _connect(self) -> psycopg.Connection[Any]:
-        options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} -c jit=off"
+        options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} {_PLANS}"
         lost = {"keepalives_idle": 5, "keepalives_interval": 5, "keepalives_count": (_SILENT_S - 5) // 5}
         return psycopg.connect(
             self._url,
