@@ -284,6 +284,8 @@ def test_the_commands_keep_and_ask_a_catalogue(
         assert found["schema"] == "list3r/answer/1"
         return found
 
+    for words in (("catalog", "list"), ("query", "find", "@all", "mug", "--catalog", url), ("catalog", "rebuild")):
+        assert "does not exist" in answer(*words, status=2)["error"]["message"]
     assert [e["name"] for e in answer("catalog", "add", str(tmp_path))["matches"]] == ["room"]
     ask = ("--catalog", url)
     assert [m["id"] for m in answer("query", "find", "@all", "mug on table", *ask)["matches"]] == [3, 4]

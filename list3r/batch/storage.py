@@ -55,7 +55,10 @@ def read_text(where: str) -> str:
         fs, path = _filesystem(where)
         return bytes(fs.cat_file(path)).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise OptionError(f"{where} cannot be read as a manifest: {error}; give one video a line") from error
+        said = getattr(error, "strerror", None) or error
+        raise OptionError(
+            f"{where} cannot be read as a manifest: {said}; name a folder, or a file with one video a line"
+        ) from error
 
 
 def fetched(source: str, folder: Path) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -86,13 +87,19 @@ class Backend(Protocol):
         ...
 
 
-def open_backend(url: str, connections: int = 1) -> Backend:
-    """Return the database of a URL: postgresql://host/name, or a path or sqlite:///path for the embedded one."""
+def open_backend(url: str, connections: int = 1, *, make: bool = True) -> Backend:
+    """Return the database of a URL: postgresql://host/name, or a path or sqlite:///path for the embedded one.
+
+    Without `make` a file that is not there is refused. Raises `CatalogError`.
+    """
     kind, told, rest = url.partition("://")
     if not told or kind == "sqlite":
         from list3r.catalog.sqlite import SqliteBackend
 
-        return SqliteBackend(rest.removeprefix("/") if told else url)
+        path = rest.removeprefix("/") if told else url
+        if not make and not Path(path).exists():
+            raise CatalogError(f"{path} does not exist; `list3r catalog add FILE... --catalog {path}` makes it")
+        return SqliteBackend(path)
     if kind in ("postgresql", "postgres"):
         from list3r.catalog.postgres import PostgresBackend
 

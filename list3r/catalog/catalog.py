@@ -50,12 +50,13 @@ class Catalog:
 
     @staticmethod
     @naming_extras()
-    def open(url: str, connections: int = 1) -> Catalog:
-        """Open postgresql://host/name, or a file of the embedded catalogue, which is made where there is none.
+    def open(url: str, connections: int = 1, *, make: bool = True) -> Catalog:
+        """Open postgresql://host/name, or a file of the embedded catalogue, which is made where there is none unless
+        `make` is False.
 
         Raises `CatalogError`.
         """
-        return Catalog(open_backend(url, connections))
+        return Catalog(open_backend(url, connections, make=make))
 
     def __enter__(self) -> Self:
         return self

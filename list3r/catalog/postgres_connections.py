@@ -58,13 +58,13 @@ class Connections:
 
     def _connect(self) -> psycopg.Connection[Any]:
         options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} {_PLANS}"
-        lost = {"keepalives_idle": 5, "keepalives_interval": 5, "keepalives_count": (_SILENT_S - 5) // 5}
+        lost: dict[str, Any] = {"keepalives_idle": 5, "keepalives_interval": 5, "tcp_user_timeout": 1000 * _SILENT_S}
         return psycopg.connect(
             self._url,
             options=options,
             connect_timeout=_WAIT_S,
             application_name="list3r",
             autocommit=True,
-            tcp_user_timeout=1000 * _SILENT_S,
+            keepalives_count=(_SILENT_S - 5) // 5,
             **lost,
         )

@@ -38,7 +38,7 @@ def serve(
 
     Raises `OptionError` where the port is taken, `CatalogError` where the catalogue cannot be opened.
     """
-    Catalog.open(catalog).close()  # what is wrong with it is said here, and once
+    Catalog.open(catalog, make=False).close()  # what is wrong with it is said here, and once
     os.environ |= {CATALOG_VARIABLE: catalog, SECRET_VARIABLE: secret, TIMEOUT_VARIABLE: str(limits.request_s)}
     listener = _listen(address.host, address.port)
     config = uvicorn.Config(

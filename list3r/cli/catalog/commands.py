@@ -58,7 +58,7 @@ def add(
     found = list(_memories(files))
     if name is not None and len(found) != 1:
         raise OptionError(f"--name {name} is of one memory; {len(found)} are given")
-    with _opened(catalog) as opened:
+    with _opened(catalog, make=True) as opened:
         with opened.loading(len(found)):
             entries = [asdict(opened.add(path, name, store)) for path in found]
     if json:
@@ -127,7 +127,7 @@ def rebuild(
 
     Example: list3r catalog rebuild memories/
     """
-    with _opened(catalog) as opened:
+    with _opened(catalog, make=files is not None) as opened:
         known = opened.memories()
         found = {e.path: e.name for e in known} if files is None else dict.fromkeys(_memories(files))
         with opened.loading(len(found) + 1):
@@ -144,10 +144,10 @@ def rebuild(
 _HEADER = ("memory", "revision", "things", "file")
 
 
-def _opened(url: str) -> Catalog:
+def _opened(url: str, *, make: bool = False) -> Catalog:
     from list3r.catalog import Catalog
 
-    return Catalog.open(url)
+    return Catalog.open(url, make=make)
 
 
 def _memories(files: Sequence[str]) -> Iterator[str]:

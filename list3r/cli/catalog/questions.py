@@ -87,7 +87,7 @@ def _ask(url: str, name: str, memory: str | None, words: Words, json: bool) -> N
     filters = CatalogFilters(
         bool(words.get("structure")), float(words.get("min_confidence") or 0.0), words.get("state")
     )
-    with Catalog.open(url) as catalog:
+    with Catalog.open(url, make=False) as catalog:
         if name == "relations":
             found = catalog.relations(memory, **{w: words[w] for w in _TOLD[name][:3]}, k=_MOST_RELATIONS)
             rows = [r for r in found if r.confidence >= filters.min_confidence]

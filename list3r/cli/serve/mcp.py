@@ -68,7 +68,7 @@ def _opened(memory: Path | None, catalog: str | None, *, write: bool) -> SceneMe
     if memory is not None:
         return open_scene(memory, writable=write)
     assert catalog is not None
-    return Catalog.open(catalog, _CONNECTIONS)
+    return Catalog.open(catalog, _CONNECTIONS, make=False)
 
 
 def _say(address: str, token: str) -> None:
