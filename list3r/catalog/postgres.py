@@ -234,10 +234,11 @@ class PostgresBackend:
     ) -> list[tuple[CatalogThing, float]]:
         """Return the k most alike: in one memory exactly, over all through the index of vectors."""
         table, asked, count = f"vector_{self._space(space)}", _halfvec(vector), k
-        only, given = ("", ()) if memory is None else (" WHERE memory_id = ?", (self._number(memory),))
-        query = _marked(
-            f"SELECT memory_id, id, 1 - (v <=> ?::halfvec) FROM {table}{only} ORDER BY v <=> ?::halfvec LIMIT ?"
-        )
+        only, apart = "", "v <=> ?::halfvec"
+        given: tuple[int, ...] = ()
+        if memory is not None:  # an order by the sum is one that the index of vectors does not know
+            only, given, apart = " WHERE memory_id = ?", (self._number(memory),), f"({apart}) + 0"
+        query = _marked(f"SELECT memory_id, id, 1 - (v <=> ?::halfvec) FROM {table}{only} ORDER BY {apart} LIMIT ?")
         while True:
             with self._connected("asked") as connection, connection.transaction():
                 connection.execute(f"SET LOCAL hnsw.ef_search = {max(_PROBED, min(2 * count, 1000))}")
