@@ -1,113 +1,309 @@
-"""A catalogue of many memories: what adding a memory and asking costs, and how good the nearest vectors are.
+"""A catalogue of many memories as it grows: what loading, adding a memory and asking costs, how many of the nearest
+vectors are found, many at once, a server that is killed, and the catalogue written anew from files.
 
-python benchmarks/catalog.py --memories 1000 --instances 2000 --postgres      # needs a server that may be started
-python benchmarks/catalog.py --memories 100 --instances 2000 --url catalog.sqlite
+python benchmarks/catalog.py --postgres --busy-s 300 --json benchmarks/results/catalog.json
+python benchmarks/catalog.py --stages 5,50 --json catalog-sqlite.json        # the embedded catalogue
+
+The server is the benchmark's own, from the distribution's package with pgvector. Memories are made up and handed to the
+catalogue as the reader of files does; `--files` of them are real files. Wall times hold for a machine of its own alone:
+beside them stands processor time, of this process and of the server's that answers it.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import statistics
-import sys
+import contextlib
+import os
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import scale
+from machine import write_json
 from numpy.typing import NDArray
 
-from list3r.catalog.base import Backend, open_backend
+from list3r.catalog.base import open_backend
 from list3r.catalog.catalog import Catalog
-from list3r.catalog.records import CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
+from list3r.catalog.records import (
+    CatalogError,
+    CatalogFilters,
+    CatalogThing,
+    MemoryContent,
+    MemoryEntry,
+    SpaceVectors,
+)
 from list3r.memory.geometry import OrientedBox
+from list3r.memory.store.store import Store
+from tests.postgres_server import PostgresServer, running_postgres
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 SPACE = "benchmark@1/{}"
 COLORS = ("red", "blue", "green", "white", "black", "grey", "brown", "yellow")
 KINDS = tuple(f"kind{n}" for n in range(400))
+SERVER = "-c shared_buffers=2GB -c max_wal_size=4GB -c max_parallel_maintenance_workers=0"
+"""Settings of the server: the second keeps checkpoints rare while it is loaded, the third all work in one process."""
+Vectors = NDArray[np.float32]
 
 
 def main() -> None:
-    words = argparse.ArgumentParser(description=__doc__)
-    words.add_argument("--url", default="catalog-benchmark.sqlite", help="A catalogue without memories.")
-    words.add_argument("--postgres", action="store_true", help="Start a server for the benchmark instead.")
-    words.add_argument("--memories", type=int, default=100)
+    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words.add_argument("--postgres", action="store_true", help="A server of its own; else a file of SQLite.")
+    words.add_argument("--stages", default="5,50,250,1000", help="Memories at which is measured.")
     words.add_argument("--instances", type=int, default=2000)
-    words.add_argument("--dimension", type=int, default=128)
+    words.add_argument("--dimension", type=int, default=64)
     words.add_argument("--questions", type=int, default=200)
+    words.add_argument("--files", type=int, default=5, help="Real files that are taken in, and anew.")
     words.add_argument("--busy-s", type=float, default=0.0, help="So long 16 ask while 4 write.")
-    words.add_argument("--out", type=Path, default=Path("catalog-benchmark.json"))
+    words.add_argument("--json", type=Path)
     asked = words.parse_args()
-    with _server(asked.postgres) as url:
-        result = _measure(url or asked.url, asked)
-    asked.out.write_text(json.dumps(result, indent=2))
-    print(json.dumps(result, indent=2))
+    with _started(asked.postgres) as (url, server):
+        Growth(url, server, asked).run()
 
 
-@contextmanager
-def _server(wanted: bool) -> Iterator[str]:
-    if not wanted:
-        yield ""
-        return
-    from tests.postgres_server import running_postgres
-
-    with running_postgres() as server:
-        yield server.url
-
-
-def _measure(url: str, asked: argparse.Namespace) -> dict[str, object]:
-    chance = np.random.default_rng(1)
-    looks = chance.normal(size=(3000, asked.dimension)).astype(np.float32)
-    backend = open_backend(url)
-    catalog, rows, growth = Catalog(backend), asked.memories * asked.instances, []
-    vectors, places = [], []
-    began = time.perf_counter()
-    for n in range(asked.memories):
-        content = make_content(f"m{n:05d}", asked.instances, looks, chance)
-        vectors.append(content.spaces[0].vectors)
-        places += [(content.entry.name, t.id) for t in content.things]
-        started = time.perf_counter()
-        backend.put(content)
-        growth.append(time.perf_counter() - started)
-        if n + 1 in (10, 30, 100, 300, 1000):
-            print(f"{n + 1} memories, {time.perf_counter() - began:.0f} s", flush=True)
-    small = make_content("small", 1000, looks, chance)
-    result: dict[str, object] = {"url": url.partition(":")[0], "memories": asked.memories, "instances": rows}
-    result |= {"dimension": asked.dimension, "build_s": round(sum(growth), 1)}
-    result["put_s_first_last_tenth"] = [round(statistics.median(g), 3) for g in (growth[:10], growth[-10:])]
-    server = _server_process(backend)
-    result["put of 1000"] = _timed(lambda n: backend.put(small), 1, server)
-    backend.drop("small")
-    questions: dict[str, Callable[[int], object]] = {
-        "nearest, one memory": lambda n: catalog.nearest(_name(n, asked), point=chance.uniform(0, 10, 3), k=10),
-        "nearest, rows alone": lambda n: backend.near(
-            _name(n, asked), chance.uniform(0, 10, 3).tolist(), 10, CatalogFilters()
-        ),
-        "within, one memory": lambda n: catalog.within(_name(n, asked), center=chance.uniform(0, 10, 3), radius=0.5),
-        "find, one word, all": lambda n: catalog.find(KINDS[n % 400], k=10),
-        "find, frequent word, all": lambda n: catalog.find(COLORS[n % 8], k=10),
-        "find, two words, all": lambda n: catalog.find(f"{COLORS[n % 8]} {KINDS[n % 400]}", k=10),
-        "find, relation, all": lambda n: catalog.find(f"{KINDS[n % 400]} on {KINDS[(n + 1) % 400]}", k=10),
-        "find, one memory": lambda n: catalog.find(COLORS[n % 8], _name(n, asked), k=10),
-        "similar, one memory": lambda n: catalog.similar(_name(n, asked), instance_id=n % 100, anywhere=False, k=10),
-        "similar, all": lambda n: catalog.similar(vector=_near(looks, n), space=SPACE.format(asked.dimension), k=10),
-        "relations, one memory": lambda n: catalog.relations(_name(n, asked), subject=KINDS[n % 400], k=10),
-    }
-    for name, ask in questions.items():
-        count = asked.questions if url.startswith("postgres") or name != "similar, all" else 10
-        result[name] = _timed(ask, count, server)
-        print(name, result[name], flush=True)
-    result["recall@10, similar, all"] = _recall(catalog, looks, np.concatenate(vectors), places, asked.dimension)
-    if asked.busy_s:
-        result["busy"] = _busy(url, asked, looks)
-    catalog.close()
-    return result
+@contextlib.contextmanager
+def _started(postgres: bool) -> Iterator[tuple[str, PostgresServer | None]]:
+    if postgres:
+        with running_postgres(SERVER) as server:
+            yield server.url, server
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            yield f"{folder}/catalog.sqlite", None
 
 
-def make_content(name: str, count: int, looks: NDArray[np.float32], chance: np.random.Generator) -> MemoryContent:
+class Growth:
+    """A catalogue that grows from stage to stage, and what was measured."""
+
+    def __init__(self, url: str, server: PostgresServer | None, asked: argparse.Namespace) -> None:
+        self._url, self._server, self._asked = url, server, asked
+        self._chance = np.random.default_rng(1)
+        self._looks = self._chance.normal(size=(3000, asked.dimension)).astype(np.float32)
+        self._vectors: list[Vectors] = []
+        self._backend = open_backend(url)
+        self._catalog = Catalog(self._backend)
+        told = ("instances", "dimension", "questions")
+        self._result: dict[str, Any] = {"database": "PostgreSQL" if server else "SQLite", "stages": []}
+        self._result |= {"a_memory": {name: getattr(asked, name) for name in told}}
+
+    def run(self) -> None:
+        for count in map(int, self._asked.stages.split(",")):
+            self._result["stages"].append(self._stage(count))
+            self._told()
+        if self._asked.files:
+            self._result["from_files"] = self._from_files()
+            self._told()
+        if self._asked.busy_s:
+            self._result["busy"] = self._busy()
+            self._told()
+        if self._server is not None:
+            self._result["killed"] = self._killed(self._server)
+            self._told()
+        self._catalog.close()
+
+    def _told(self) -> None:
+        print(list(self._result.items())[-1], "load", round(os.getloadavg()[0], 1), flush=True)
+        write_json(self._asked.json, self._result)
+
+    def _stage(self, count: int) -> dict[str, Any]:
+        row: dict[str, Any] = {"memories": count, "instances": count * self._asked.instances}
+        server, missing = self._process(), count - len(self._vectors)
+        made = 0.0
+        with _spent(server) as spent, self._catalog.loading(missing):
+            for n in range(len(self._vectors), count):
+                began = time.process_time()
+                content = make_content(f"m{n:05d}", self._asked.instances, self._looks, self._chance)
+                made += time.process_time() - began
+                self._vectors.append(content.spaces[0].vectors.astype(np.float16))
+                self._backend.put(content)
+        spent["client_cpu_s"] = round(spent["client_cpu_s"] - made, 1)
+        row |= {"loaded": {"memories": missing, **spent}, "bytes": self._bytes(), "put of 1000": self._put(server)}
+        for name, ask in self._questions().items():
+            many = self._server is not None or name != "similar, all"
+            row[name] = _timed(ask, self._asked.questions if many else 5, server)
+            print(count, name, row[name], flush=True)
+        row["recall@10, similar, all"] = self._recall()
+        row["load_average"] = round(os.getloadavg()[0], 1)
+        return row
+
+    def _put(self, server: int) -> dict[str, float]:
+        """Add a memory of 1,000 three times, each of other things."""
+        contents = [make_content(f"small{n}", 1000, self._looks, self._chance) for n in range(3)]
+        found = _timed(lambda n: self._backend.put(contents[n]), 3, server, warm=0)
+        for content in contents:
+            self._backend.drop(content.entry.name)
+        return found
+
+    def _questions(self) -> dict[str, Callable[[int], object]]:
+        catalog, chance, space = self._catalog, np.random.default_rng(2), SPACE.format(self._asked.dimension)
+
+        def point() -> NDArray[np.float64]:
+            return chance.uniform(0, 10, 3)
+
+        return {
+            "nearest, one memory": lambda n: catalog.nearest(self._name(n), point=point(), k=10),
+            "nearest, rows alone": lambda n: self._backend.near(self._name(n), point().tolist(), 10, CatalogFilters()),
+            "within, one memory": lambda n: catalog.within(self._name(n), center=point(), radius=0.5),
+            "find, one word, all": lambda n: catalog.find(KINDS[n % 400], k=10),
+            "find, frequent word, all": lambda n: catalog.find(COLORS[n % 8], k=10),
+            "find, two words, all": lambda n: catalog.find(f"{COLORS[n % 8]} {KINDS[n % 400]}", k=10),
+            "find, relation, all": lambda n: catalog.find(f"{KINDS[n % 400]} on {KINDS[(n + 1) % 400]}", k=10),
+            "find, one memory": lambda n: catalog.find(COLORS[n % 8], self._name(n), k=10),
+            "similar, one memory": lambda n: catalog.similar(
+                self._name(n), instance_id=n % 100, space=space, anywhere=False, k=10
+            ),
+            "similar, all": lambda n: catalog.similar(vector=_near(self._looks, n), space=space, k=10),
+            "relations, one memory": lambda n: catalog.relations(self._name(n), subject=KINDS[n % 400], k=10),
+        }
+
+    def _recall(self) -> float:
+        """Share of the true ten that are found, over 50 questions."""
+        hits, size, space = 0, self._asked.instances, SPACE.format(self._asked.dimension)
+        for n in range(50):
+            query = _near(self._looks, n)
+            cosine = np.concatenate([v.astype(np.float32) @ query for v in self._vectors])
+            truth = {(f"m{k // size:05d}", k % size) for k in np.argpartition(-cosine, 10)[:10].tolist()}
+            hits += len(truth & {(m.memory, m.id) for m in self._catalog.similar(vector=query, space=space, k=10)})
+        return hits / 500
+
+    def _from_files(self) -> dict[str, Any]:
+        """Real files are taken in, asked, written anew and asked again."""
+        size, names = self._asked.instances, [f"file{n}" for n in range(self._asked.files)]
+        with tempfile.TemporaryDirectory() as folder:
+            paths = [Path(folder) / f"{name}.l3r" for name in names]
+            for n, path in enumerate(paths):
+                scale.write_memory(path, size, n)
+            with _spent(self._process()) as first:
+                for path in paths:
+                    self._catalog.add(path)
+            before, entries = self._answers(names), self._catalog.memories()
+            with _spent(self._process()) as again, self._catalog.loading(len(paths)):
+                for path in paths:
+                    self._catalog.again(str(path))
+            equal = self._answers(names) == before and self._catalog.memories() == entries
+        for name in names:
+            self._catalog.remove(name)
+        return {"files": len(names), "instances": len(names) * size, "added": first, "written_anew": again} | {
+            "answers": sum(map(len, before)),
+            "equal": equal,
+        }
+
+    def _answers(self, names: list[str]) -> list[list[Any]]:
+        catalog, point = self._catalog, (3.0, 3.0, 1.0)
+        asked = [list(catalog.find(text, n, k=100)) for text in ("red table", "noun7", "box near table") for n in names]
+        asked += [list(catalog.nearest(n, point=point, k=50)) for n in names]
+        asked += [list(catalog.within(n, center=point, radius=3.0)) for n in names]
+        asked += [list(catalog.relations(n, subject="table")) for n in names]
+        for n in names:
+            with Store.open(self._catalog.memory(n).path) as store:
+                vectors = store.embeddings.of(scale.SPACE, [1, 2, 3])[1]
+            asked += [
+                list(catalog.similar(n, vector=v, space=scale.SPACE, anywhere=where, k=20))
+                for v in vectors
+                for where in (False, True)
+            ]
+        return asked
+
+    def _busy(self) -> dict[str, object]:
+        """16 threads ask and 4 write, each with a connection of its own."""
+        seconds = self._asked.busy_s
+        end, done, errors, waited = time.monotonic() + seconds, {"asked": 0, "written": 0}, list[str](), list[float]()
+
+        def work(number: int, writes: bool) -> None:
+            chance, backend = np.random.default_rng(number), open_backend(self._url)
+            while time.monotonic() < end:
+                began = time.perf_counter()
+                try:
+                    if writes:
+                        backend.put(make_content(f"busy{number}", 200, self._looks, chance))
+                    else:
+                        self._one(Catalog(backend), chance)
+                except Exception as error:
+                    errors.append(f"{type(error).__name__}: {error}")
+                done["written" if writes else "asked"] += 1
+                if not writes:
+                    waited.append(1e3 * (time.perf_counter() - began))
+            backend.close()
+
+        threads = [threading.Thread(target=work, args=(n, n < 4)) for n in range(20)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        p50, p95 = (round(float(v), 1) for v in np.percentile(waited, (50, 95)))
+        return {"seconds": seconds, **done, "three_questions_p50_ms": p50, "three_questions_p95_ms": p95} | {
+            "errors": errors[:5],
+            "error_count": len(errors),
+        }
+
+    def _one(self, catalog: Catalog, chance: np.random.Generator) -> None:
+        n = int(chance.integers(1_000_000))
+        near = catalog.nearest(self._name(n), point=chance.uniform(0, 10, 3), k=10)
+        named = catalog.find(KINDS[n % 400], k=10)
+        alike = catalog.similar(vector=_near(self._looks, n), space=SPACE.format(self._asked.dimension), k=10)
+        if len(near) != 10 or not named or len(alike) != 10:
+            raise CatalogError(f"answers are missing: {len(near)}, {len(named)}, {len(alike)}")
+
+    def _killed(self, server: PostgresServer) -> dict[str, object]:
+        """The server ends as in a crash while a memory goes in; it is started again."""
+        names = [self._name(n) for n in range(5)]
+
+        def answers() -> list[object]:
+            near = [list(self._catalog.nearest(n, point=(5, 5, 5), k=20)) for n in names]
+            space = SPACE.format(self._asked.dimension)
+            alike = [list(self._catalog.similar(vector=_near(self._looks, n), space=space)) for n in range(5)]
+            return [*near, *alike, self._catalog.memories()]
+
+        before, said = answers(), list[str]()
+        content = make_content("cut off", 4000, self._looks, self._chance)
+
+        def write() -> None:
+            backend = open_backend(self._url)
+            try:
+                backend.put(content)
+            except CatalogError as error:
+                said.append(str(error))
+            backend.close()
+
+        thread = threading.Thread(target=write)
+        thread.start()
+        time.sleep(0.5)
+        server.kill()
+        thread.join()
+        try:
+            self._catalog.find(KINDS[0])
+        except CatalogError as error:
+            said.append(str(error))
+        began = time.perf_counter()
+        server.start()
+        back = time.perf_counter() - began
+        said = [text.replace(str(server.folder), "...") for text in said]
+        return {"said": said, "back_s": round(back, 1), "equal": answers() == before}
+
+    def _process(self) -> int:
+        """The process of PostgreSQL that answers a backend with one connection; 0 of another database."""
+        rows = getattr(self._backend, "_rows", None)
+        return int(rows("SELECT pg_backend_pid()", ())[0][0]) if self._server and rows else 0
+
+    def _bytes(self) -> dict[str, int]:
+        """Bytes of the catalogue, and of its largest parts where the database tells them."""
+        if self._server is None:
+            return {"all": Path(self._url).stat().st_size}
+        query = (
+            "SELECT coalesce(substring(relname FROM '^(instance|relation|vector)'), 'other') || CASE relkind WHEN 'i' "
+            "THEN ', ' || am.amname ELSE '' END AS part, sum(pg_relation_size(c.oid))::bigint FROM pg_class c "
+            "LEFT JOIN pg_am am ON am.oid = c.relam WHERE relkind IN ('r', 'i') "
+            "AND relnamespace = 'list3r'::regnamespace GROUP BY 1 ORDER BY 2 DESC"
+        )
+        parts = {str(name): int(size) for name, size in self._backend._rows(query, ())}  # type: ignore[attr-defined]
+        return {"all": sum(parts.values()), **parts}
+
+    def _name(self, n: int) -> str:
+        return f"m{n * 7919 % len(self._vectors):05d}"
+
+
+def make_content(name: str, count: int, looks: Vectors, chance: np.random.Generator) -> MemoryContent:
     """A memory of things of random places, names, looks and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
@@ -130,81 +326,40 @@ def make_content(name: str, count: int, looks: NDArray[np.float32], chance: np.r
     return MemoryContent(entry, things, relations, [space])
 
 
-def _near(looks: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+def _near(looks: Vectors, n: int) -> Vectors:
     """A look with noise of its own, the same for the same number."""
-    return looks[n % len(looks)] + 0.5 * np.random.default_rng(n).normal(size=looks.shape[1])
+    noise = np.random.default_rng(n).normal(size=looks.shape[1])
+    return np.asarray(looks[n % len(looks)] + 0.5 * noise, np.float32)
 
 
-def _recall(
-    catalog: Catalog, looks: NDArray[np.float32], vectors: NDArray[np.float32], places: list[tuple[str, int]], size: int
-) -> float:
-    hits = 0
-    for n in range(50):
-        query = _near(looks, n)
-        best = np.argsort(-(vectors @ query))[:10]
-        found = {(m.memory, m.id) for m in catalog.similar(vector=query, space=SPACE.format(size), k=10)}
-        hits += len(found & {places[k] for k in best})
-    return hits / 500
+@contextlib.contextmanager
+def _spent(server: int) -> Iterator[dict[str, float]]:
+    """Seconds by the clock, and of a processor of this process and of the server's."""
+    found: dict[str, float] = {}
+    began, client, other = time.perf_counter(), time.process_time(), _server_ms(server)
+    yield found
+    found["wall_s"] = round(time.perf_counter() - began, 1)
+    found["client_cpu_s"] = round(time.process_time() - client, 1)
+    found["server_cpu_s"] = round((_server_ms(server) - other) / 1e3, 1)
 
 
-def _timed(ask: Callable[[int], object], count: int, server: int = 0) -> dict[str, float]:
-    """Median and 95th percentile of the wall time, mean processor time of this process and of a server's; ms."""
-    times, before = [], _cpu_ms(server)
+def _timed(ask: Callable[[int], object], count: int, server: int, warm: int = 10) -> dict[str, float]:
+    """Percentiles of the wall time, mean processor time of this process and the server's; ms."""
+    for n in range(min(warm, count)):
+        ask(n)
+    times, client, other = [], time.process_time(), _server_ms(server)
     for n in range(count):
         started = time.perf_counter()
         ask(n)
         times.append(1e3 * (time.perf_counter() - started))
-    cpu = (_cpu_ms(server) - before) / count
-    found = (*np.percentile(times, (50, 95)).tolist(), cpu)
-    return {name: round(v, 3) for name, v in zip(("p50_ms", "p95_ms", "cpu_ms"), found, strict=True)}
+    cpu = 1e3 * (time.process_time() - client) / count, (_server_ms(server) - other) / count
+    names = ("p10_ms", "p50_ms", "p95_ms", "client_cpu_ms", "server_cpu_ms")
+    found = (*np.percentile(times, (10, 50, 95)).tolist(), *cpu)
+    return {name: round(v, 3) for name, v in zip(names, found, strict=True)}
 
 
-def _cpu_ms(process: int) -> float:
-    """Milliseconds on a processor of this process and of another."""
-    other = int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) / 1e6 if process else 0.0
-    return 1e3 * time.process_time() + other
-
-
-def _server_process(backend: Backend) -> int:
-    """The process of PostgreSQL that answers a backend with one connection; 0 of another database."""
-    rows = getattr(backend, "_rows", None)
-    return int(rows("SELECT pg_backend_pid()", ())[0][0]) if type(backend).__name__ == "PostgresBackend" else 0
-
-
-def _busy(url: str, asked: argparse.Namespace, looks: NDArray[np.float32]) -> dict[str, object]:
-    """16 threads ask and 4 write, each with a connection of its own."""
-    end, done, errors = time.monotonic() + asked.busy_s, {"asked": 0, "written": 0}, list[str]()
-
-    def work(number: int, writes: bool) -> None:
-        chance, backend = np.random.default_rng(number), open_backend(url)
-        while time.monotonic() < end:
-            try:
-                if writes:
-                    backend.put(make_content(f"busy{number}", 200, looks, chance))
-                    done["written"] += 1
-                else:
-                    _one(backend, asked, chance)
-                    done["asked"] += 1
-            except Exception as error:
-                errors.append(f"{type(error).__name__}: {error}")
-        backend.close()
-
-    threads = [threading.Thread(target=work, args=(n, n < 4)) for n in range(20)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return {"seconds": asked.busy_s, **done, "errors": errors[:5], "error_count": len(errors)}
-
-
-def _one(backend: Backend, asked: argparse.Namespace, chance: np.random.Generator) -> None:
-    catalog, n = Catalog(backend), int(chance.integers(1_000_000))
-    catalog.nearest(_name(n, asked), point=chance.uniform(0, 10, 3), k=10)
-    catalog.find(KINDS[n % 400], k=10)
-
-
-def _name(n: int, asked: argparse.Namespace) -> str:
-    return f"m{n * 7919 % asked.memories:05d}"
+def _server_ms(process: int) -> float:
+    return int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) / 1e6 if process else 0.0
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import sqlite3
+import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +18,7 @@ import pytest
 
 from list3r.catalog import Catalog
 from list3r.catalog.base import open_backend
-from list3r.catalog.catalog import aabb_distance, box_distance
+from list3r.catalog.catalog import aabb_distance, box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.cli.app import run as list3r
@@ -24,7 +26,7 @@ from list3r.memory.errors import List3rError, OptionError, UnknownIdError
 from list3r.memory.geometry import OrientedBox, rotation_exp
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
-from tests.postgres_server import PostgresServer, running_postgres
+from tests.postgres_server import Network, PostgresServer, running_postgres
 
 SPACE = "test@1/16"
 STRANGE = ("x'; DROP TABLE memory; --", '"%s ? $1 {}', "\\", "a\x00b", "mug' OR 1=1")
@@ -71,6 +73,10 @@ def content(name: str, count: int = 120, seed: int = 1) -> MemoryContent:
     vectors = chance.normal(size=(count, 16)).astype(np.float32)
     entry = MemoryEntry(name, f"/none/{name}.l3r", 0, f"{name}{seed}", 9, 0, "relative", "known", count, 1)
     return MemoryContent(entry, things, relations, [SpaceVectors(SPACE, np.arange(count), vectors)])
+
+
+def box_distance(thing: CatalogThing, point: np.ndarray[Any, Any]) -> float:
+    return float(box_distances([thing], point)[0])
 
 
 def passing(filters: CatalogFilters) -> list[CatalogThing]:
@@ -334,6 +340,65 @@ def test_a_server_that_dies_is_told_and_asked_again_when_it_is_back(server: Post
         assert not catalog.alive()
         server.start()
         assert catalog.find("mug", "kept", k=50) == before
+
+
+def test_a_lost_network_is_told_and_nothing_is_half_written(server: PostgresServer) -> None:
+    network = Network(server)
+    with Catalog.open(network.url) as catalog:
+        backend = open_backend(network.url)
+        backend.put(content("far"))
+        before = catalog.find("mug", "far", k=50), catalog.memories()
+        held = content("half")
+
+        def things() -> Iterator[CatalogThing]:
+            yield from held.things[:60]
+            network.cut()
+            yield from held.things[60:]
+
+        with pytest.raises(CatalogError, match="cannot be written; the same again is safe") as told:
+            backend.put(replace(held, things=things()))  # type: ignore[arg-type]
+        assert "\n" not in str(told.value)
+        with pytest.raises(CatalogError, match="cannot be asked") as told:
+            catalog.find("mug", "far")
+        assert "\n" not in str(told.value)
+        network.mend()
+        assert (catalog.find("mug", "far", k=50), catalog.memories()) == before
+        assert backend.put(held).revision == 1
+        backend.close()
+    network.cut()
+
+
+def test_a_full_disk_of_the_server_is_told_and_changes_nothing() -> None:
+    psycopg = pytest.importorskip("psycopg")
+    with running_postgres() as own, small_disk(own.folder / "small") as disk:
+        with psycopg.connect(own.url, autocommit=True) as owner:
+            owner.execute(f"CREATE TABLESPACE small LOCATION '{disk}'")
+            owner.execute("ALTER DATABASE postgres SET default_tablespace = small")
+        with Catalog.open(own.url) as catalog:
+            backend = open_backend(own.url)
+            backend.put(content("kept"))
+            before = catalog.find("mug", "kept", k=50), catalog.memories()
+            with pytest.raises(CatalogError, match="No space left on device") as told:
+                backend.put(content("more", count=15_000))
+            assert "nothing was changed" in str(told.value) and "\n" not in str(told.value)
+            assert (catalog.find("mug", "kept", k=50), catalog.memories()) == before
+            subprocess.run(["mount", "-o", "remount,size=96m", str(disk)], check=True)
+            assert backend.put(content("little")).revision == 1
+            backend.close()
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path) -> Iterator[Path]:
+    """A disk of 12 MB for the server; the test is skipped where none may be made."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)]
+    if os.getuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("a small disk can be made by root alone, outside a container")
+    try:
+        shutil.chown(folder, "postgres")
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path) -> None:

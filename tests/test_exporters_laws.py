@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
@@ -116,45 +120,88 @@ def test_a_place_that_cannot_be_written_is_one_line(name: str, single: SceneMemo
     assert held(out) == {"file": b"mine"}
 
 
-class Interruption:
-    """Ctrl-C in the call of so many functions of the package; with -1 none, calls are counted."""
+MOMENTS = (0.2, 0.6, 0.97)
+"""At which an export is interrupted: shares of the calls that it makes."""
 
-    def __init__(self, at: int) -> None:
-        self.at, self.calls = at, 0
+
+class Interruption:
+    """A real signal to this process at a call of the exporters, or within one; with no signal calls are counted."""
+
+    def __init__(self, at: int, number: int) -> None:
+        self.at, self.number, self.calls = at, number, 0
 
     def __call__(self, frame: FrameType, event: str, _: object) -> None:
-        if event == "call" and "list3r/exporters" in frame.f_code.co_filename.replace("\\", "/"):
+        if event in ("call", "c_call") and "list3r/exporters" in frame.f_code.co_filename:
             self.calls += 1
             if self.calls == self.at:
-                raise KeyboardInterrupt
+                os.kill(os.getpid(), self.number)
 
-    def runs(self, work: Callable[[], object]) -> bool:
-        """Tell whether the work ended by itself."""
-        sys.setprofile(self)
+
+def export_in_a_process(memory: Path, name: str, place: Path, interruption: Interruption) -> tuple[int, int]:
+    """Export in a process of its own. Returns the signal that ended it (SIGINT: was obeyed), and its calls."""
+    told, tells = os.pipe()
+    child = os.fork()
+    if child == 0:  # what is raised here must not come back to pytest
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        ended = 0
         try:
-            work()
+            with list3r.open(memory) as scene:
+                sys.setprofile(interruption)
+                scene.export(name, place)
         except KeyboardInterrupt:
-            return False
-        finally:
-            sys.setprofile(None)
-        return True
+            ended = signal.SIGINT
+        except BaseException:
+            traceback.print_exc()
+            ended = 99
+        sys.setprofile(None)
+        os.write(tells, str(interruption.calls).encode())
+        os._exit(ended)
+    os.close(tells)
+    with os.fdopen(told) as pipe:
+        calls = pipe.read()
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    return abs(status), int(calls or 0)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_an_interruption_leaves_whole_files(name: str, single: SceneMemory, out: Path, tmp_path: Path) -> None:
-    count = Interruption(-1)
-    assert count.runs(lambda: single.export(name, place_of(name, out)))
+PLACES = [
+    pytest.param(name, suffix, marks=pytest.mark.skipif(not installed(form.package), reason=f"no {form.package}"))
+    for name, form in FORMATS.items()
+    for suffix in form.suffixes or ("",)
+]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are copied")
+@pytest.mark.parametrize(("name", "suffix"), PLACES)
+def test_an_export_that_is_interrupted_or_killed_leaves_whole_files(
+    name: str, suffix: str, single: SceneMemory, out: Path, tmp_path: Path
+) -> None:
+    for module in (f"list3r.exporters.{FORMATS[name].module}", *filter(None, [FORMATS[name].package])):
+        importlib.import_module(module)  # once, not in every process
+
+    def export(folder: Path, at: int = -1, number: int = 0) -> tuple[int, int]:
+        return export_in_a_process(single.path, name, folder / f"out{suffix}", Interruption(at, number))
+
+    ended, calls = export(out)
     whole = held(out)
+    assert ended == 0 and whole
     (tmp_path / "new").mkdir()
-    for at in (1, count.calls // 2, count.calls):
+    for number in (signal.SIGINT, signal.SIGKILL):
         for folder in (tmp_path / "new", out):  # where nothing stands, and where the whole stands
-            Interruption(at).runs(lambda to=folder: single.export(name, place_of(name, to)))
-            found = held(folder)
-            if name != "rerun":  # which numbers its parts at random
-                assert all(whole[file] == content for file, content in found.items())
-            if FORMATS[name].folder:
-                assert not found or set(found) == set(whole)
-        assert set(held(out)) == set(whole)
+            for moment in MOMENTS:
+                ended, _ = export(folder, 1 + int(moment * calls), number)
+                assert ended in (number, 0)
+                found = {file: content for file, content in held(folder).items() if not file.startswith(".")}
+                if name != "rerun":  # which numbers its parts at random
+                    assert all(whole[file] == content for file, content in found.items())
+                if FORMATS[name].folder:
+                    assert not found or set(found) == set(whole)
+                if number == signal.SIGINT:
+                    assert len(found) == len(held(folder)), "and nothing beside it"
+                if folder == out:
+                    assert FORMATS[name].folder or set(found) == set(whole)
+    for folder in (tmp_path / "new", out):  # what a killed export has left, the next one takes away
+        assert export(folder)[0] == 0
+        assert set(held(folder)) == set(whole)
 
 
 LIMITED = """

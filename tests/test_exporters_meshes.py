@@ -168,8 +168,26 @@ def test_only_the_things_that_are_asked_for(room: Path, tmp_path: Path, capsys: 
         capsys.readouterr()
         assert run([*words[:-1], str(tmp_path / "none"), "--ids", ids]) == 2
         assert told in capsys.readouterr().err and not (tmp_path / "none").exists()
-    with list3r.open(room) as memory, pytest.raises(OptionError, match=r"has 4 things; 2 props at most .* --ids"):
-        write_simready(memory.store, tmp_path / "none", SimreadySettings(most=2))
+
+
+def test_many_props_are_told_and_share_folders_and_processes_change_nothing(room: Path, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    with list3r.open(room) as memory:
+        write_simready(memory.store, tmp_path / "few", SimreadySettings(density=300.0))
+        for workers in (0, 2):
+            settings = SimreadySettings(300.0, workers=workers, progress=lambda *n: told.append(n), one_folder=2)
+            write_simready(memory.store, tmp_path / str(workers), settings)
+    assert told == [(4, 4), (4, 4)]
+    few, alone, both = (tmp_path / name for name in ("few", "0", "2"))
+    assert {p.name for p in alone.iterdir() if p.is_dir()} == {"from_0"}
+    for file in (few / "mug_3").rglob("*.*"):
+        if file.is_file():
+            beside = "from_0" / file.relative_to(few)
+            assert file.read_bytes() == (alone / beside).read_bytes() == (both / beside).read_bytes()
+    placed = [Usd.Stage.Open(str(folder / "scene.usdc")).ExportToString() for folder in (few, alone, both)]
+    assert placed[0].count("faceVertexIndices") == 6
+    assert len({text.replace(str(f), "") for text, f in zip(placed[1:], (alone, both), strict=True)}) == 1
+    assert run(["export", str(room), "--to", "simready", "--out", str(tmp_path / "d"), "--workers", "-1"]) == 2
 
 
 def test_names_of_props_are_plain(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store.read_checks import unbelieved
 from list3r.memory.store.store import Store
+from list3r.memory.store.tables import words as word_table
 from list3r.queries.find import find
 from list3r.queries.match import Match
 from list3r.queries.nearest import nearest
@@ -68,6 +69,7 @@ def plain(matches: list[Match]) -> list[tuple[object, ...]]:
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(gather, "EVERYTHING", COUNT)
+    monkeypatch.setattr(word_table, "_FEW", COUNT // 5)
     return monkeypatch
 
 

@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 
 import list3r
+from list3r.catalog import Catalog
 from list3r.cli.app import run
 from list3r.memory.store.store import Store
 from tests.conftest import small_picture, write_small_room
@@ -320,3 +321,42 @@ def test_the_entry_of_codex_is_toml(room: Path, capsys: pytest.CaptureFixture[st
     assert entry["args"][-1] == "--write"
     assert run(["ask-config", str(room), "--client", "emacs"]) == 2
     assert run(["ask-config", str(room.with_name("absent.l3r"))]) == 2
+
+
+def test_a_catalogue_answers_with_the_names_of_its_memories(room: Path, tmp_path: Path) -> None:
+    with Catalog.open(str(tmp_path / "catalog.sqlite")) as catalog:
+        catalog.add(room, "kitchen")
+        catalog.add(room, "hall")
+
+        async def asked() -> dict[str, Any]:
+            async with Client(make_server(catalog)) as client:
+                told = {t.name for t in (await client.list_tools()).tools}
+                assert told == {"memories", "find", "nearest", "within", "similar", "relations"}
+                found = {}
+                for tool, words in (
+                    ("memories", {}),
+                    ("find", {"text": "mug on table"}),
+                    ("nearest", {"memory": "hall", "id": MUG, "limit": 2}),
+                    ("within", {"memory": "hall", "center": [2.0, 1.0, 0.4], "radius": 0.3}),
+                    ("similar", {"memory": "hall", "id": MUG}),
+                    ("relations", {"subject": "mug", "predicate": "on", "object": "table"}),
+                ):
+                    found[tool] = (await client.call_tool(tool, words)).structured_content
+                refused = await client.call_tool("find", {"text": "mug", "memory": "cellar"})
+                assert refused.is_error and "no memory 'cellar'" in str(refused.content)
+                return found
+
+        found = asyncio.run(asked())
+    assert [m["name"] for m in found["memories"]["matches"]] == ["hall", "kitchen"]
+    assert {m["memory"] for m in found["find"]["matches"]} == {"hall", "kitchen"}
+    assert {m["id"] for m in found["find"]["matches"]} == {MUG, TWIN}
+    assert [m["memory"] for m in found["nearest"]["matches"]] == ["hall"] * 2
+    assert [m["id"] for m in found["within"]["matches"]] == [CHAIR]
+    assert {m["memory"] for m in found["similar"]["matches"]} == {"hall", "kitchen"}
+    assert {(r["subject"], r["object"]) for r in found["relations"]["matches"]} == {(MUG, TABLE), (TWIN, TABLE)}
+
+
+def test_mcp_serves_one_memory_or_one_catalogue(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ((), (str(room), "--catalog", "c.sqlite"), ("--catalog", "c.sqlite", "--write")):
+        assert run(["mcp", *words]) == 2
+        assert "catalog" in capsys.readouterr().err

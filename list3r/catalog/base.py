@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,6 +23,10 @@ class Backend(Protocol):
 
         Return its entry, whose revision is the next one where the file is another.
         """
+        ...
+
+    def loading(self, *, many: bool) -> AbstractContextManager[None]:
+        """Write memories meanwhile; where they are `many`, indices that cost more kept up are made anew at the end."""
         ...
 
     def drop(self, name: str) -> bool:

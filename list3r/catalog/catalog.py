@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -96,6 +97,10 @@ class Catalog:
         """Write a memory anew from its file; its revision stays where the file is the same."""
         return self._backend.put(read_content(path, name), anew=True)
 
+    def loading(self, count: int) -> AbstractContextManager[None]:
+        """Take in so many memories meanwhile: where the catalogue knows fewer, its indices are made anew at the end."""
+        return self._backend.loading(many=count > len(self._backend.memories()))
+
     def remove(self, name: str) -> None:
         """Forget a memory; its file stays. Raises `CatalogError` where there is none of that name."""
         if not self._backend.drop(printable(name)):
@@ -131,7 +136,7 @@ class Catalog:
         count, own = k + 8, instance_id
         while True:
             near = self._backend.near(memory, at.tolist(), count, filters)
-            found = sorted(((box_distance(t, at), t.id, t) for t in near if t.id != own), key=lambda f: f[:2])[:k]
+            found = [f for f in _by_distance(near, at) if f[1] != own][:k]
             # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
             if len(near) < count or (len(found) == k and found[-1][0] <= aabb_distance(near[-1], at)):
                 break
@@ -165,7 +170,7 @@ class Catalog:
             middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
             low, high = middle - reach, middle + reach
         met = self._backend.inside(memory, low.tolist(), high.tolist(), filters, MOST_ANSWERS + 1)
-        found = sorted(((box_distance(t, middle), t.id, t) for t in met), key=lambda f: f[:2])
+        found = _by_distance(met, middle)
         notes = [f"more than {MOST_ANSWERS} things are there; so many are told"] if len(met) > MOST_ANSWERS else []
         rows = (
             (t, 1.0 / (1.0 + d), d, f"box {d:.2f} from the middle") for d, _, t in found[:MOST_ANSWERS] if d <= reach
@@ -244,7 +249,9 @@ class Catalog:
         rows = self._backend.related(memory, ends[0], predicate, ends[1], k)
         by_name = self._by_name(entries, [r[0] for r in rows])
         return CatalogAnswers(
-            CatalogRelation(r[0], by_name[r[0]][0].revision, by_name[r[0]][0].path, by_name[r[0]][1], *r[1:])
+            CatalogRelation(
+                r[0], by_name[r[0]][0].revision, by_name[r[0]][0].path, by_name[r[0]][1], *r[1:6], *_rounded(r[6:])
+            )
             for r in rows
             if r[0] in by_name
         )
@@ -316,10 +323,18 @@ def is_stale(entry: MemoryEntry) -> bool | None:
     return (now.st_size, now.st_mtime_ns) != (entry.bytes, entry.mtime_ns)
 
 
-def box_distance(thing: CatalogThing, point: NDArray[np.float64]) -> float:
-    """Return the distance of a point from an oriented box, 0 inside, world units."""
-    local = (point - thing.box.center) @ thing.box.rotation
-    return float(np.linalg.norm(np.maximum(np.abs(local) - thing.box.size / 2.0, 0.0)))
+def box_distances(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distances of a point from oriented boxes, 0 inside, world units. Shape (N,)."""
+    apart = point - np.array([t.box.center for t in things]).reshape(-1, 3)
+    axes, size = (np.array([getattr(t.box, name) for t in things]) for name in ("rotation", "size"))
+    local = np.einsum("ni,nij->nj", apart, axes.reshape(-1, 3, 3))
+    return np.asarray(np.linalg.norm(np.maximum(np.abs(local) - size.reshape(-1, 3) / 2.0, 0.0), axis=1))
+
+
+def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> list[tuple[float, int, CatalogThing]]:
+    """Return things with the distance of a point from their boxes and their number, the nearest first."""
+    held = zip(box_distances(things, point).tolist(), things, strict=True)
+    return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
 
 
 def aabb_distance(thing: CatalogThing, point: NDArray[np.float64]) -> float:
@@ -340,13 +355,17 @@ def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, told: Sequen
         t.description,
         t.state,
         round(t.confidence, 4),
-        tuple(round(x, 4) for x in t.box.center.tolist()),
-        tuple(round(x, 4) for x in t.box.size.tolist()),
+        tuple(_rounded(t.box.center.tolist())),
+        tuple(_rounded(t.box.size.tolist())),
         entry.units,
         round(score, 4),
         None if distance is None else round(distance, 4),
         reason,
     )
+
+
+def _rounded(numbers: Iterable[float]) -> list[float]:
+    return [round(x, 4) for x in numbers]
 
 
 def _wanted(phrase: Phrase) -> Wanted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, fields, replace
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
 from list3r.catalog.postgres_connections import Connections
-from list3r.catalog.postgres_schema import MIGRATIONS, vector_table
+from list3r.catalog.postgres_schema import MIGRATIONS, vector_index, vector_table
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
@@ -24,16 +25,19 @@ from list3r.catalog.records import (
     SpaceVectors,
     Wanted,
 )
-from list3r.catalog.sqlite import thing_of
+from list3r.catalog.sqlite import thing_of, unit_vectors
 
 _ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
 _THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _THING_OF_ONE = _THING.replace("m.name", "?::text")
 """Of the instances of one memory, whose name is given as a value."""
-_PROBED = 100
+_PROBED = 200
 """Candidates that a search for vectors keeps at each step; more finds more and takes longer."""
+_BUILD_MEMORY = "2GB"
+"""What the server may take while it makes an index anew; one of vectors that does not fit is made far more slowly."""
 _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
+_WRITTEN = "written"
 _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""
 
@@ -45,6 +49,7 @@ class PostgresBackend:
         """Connect, and bring the schema up to date where this user may. Raises `CatalogError`."""
         self._where = _checked(url)
         self._connections = Connections(url, connections)
+        self._numbers: dict[str, int] = {}
         with self._connected("opened") as connection, connection.transaction():
             self.has_vectors = _migrated(connection)
 
@@ -52,7 +57,7 @@ class PostgresBackend:
 
     def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name, in one transaction."""
-        with self._connected("written; nothing was changed") as connection, connection.transaction():
+        with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
             names, marks = ", ".join(f.name for f in fields(MemoryEntry)), ", ".join("%s" for _ in fields(MemoryEntry))
             statement = (
@@ -93,6 +98,7 @@ class PostgresBackend:
                 statement = "INSERT INTO space (name, dimension) VALUES (%s, %s) RETURNING space_id, dimension"
                 known = _first(connection.execute(statement, (held.space, dimension)))
                 connection.execute(vector_table(known[0], dimension).encode())
+                connection.execute(vector_index(known[0]).encode())
             if known[1] != dimension:
                 raise CatalogError(f"vectors of {dimension} numbers are none of {held.space}, which has {known[1]}")
             out.append((int(known[0]), held))
@@ -100,7 +106,7 @@ class PostgresBackend:
 
     def drop(self, name: str) -> bool:
         """Forget a memory; whether there was one."""
-        with self._connected("written; nothing was changed") as connection, connection.transaction():
+        with self._connected(_WRITTEN) as connection, connection.transaction():
             known = _first(connection.execute("DELETE FROM memory WHERE name = %s RETURNING memory_id", (name,)))
             if known:
                 self._forget(connection, int(known[0]))
@@ -112,13 +118,33 @@ class PostgresBackend:
         for table in tables:
             connection.execute(f"DELETE FROM {table} WHERE memory_id = %s", (memory,))
 
+    @contextlib.contextmanager
+    def loading(self, *, many: bool) -> Iterator[None]:
+        """Write memories; where they are many, the indices of vectors are made anew at the end, not kept up meanwhile.
+
+        Meanwhile `similar` over all compares all vectors. An index that is missing, since a load was ended, is made.
+        """
+        if many:
+            with self._connected(_WRITTEN) as connection:
+                for (n,) in connection.execute("SELECT space_id FROM space").fetchall():
+                    connection.execute(f"DROP INDEX IF EXISTS vector_{int(n)}_alike")
+        yield
+        with self._connected(_WRITTEN) as connection, connection.transaction():
+            connection.execute("SET LOCAL statement_timeout = 0")
+            connection.execute(f"SET LOCAL maintenance_work_mem = '{_BUILD_MEMORY}'")
+            for (n,) in connection.execute("SELECT space_id FROM space ORDER BY space_id").fetchall():
+                connection.execute(vector_index(n).encode())
+            if many:
+                connection.execute("ANALYZE")
+
     # ------------------------------------------------------------------ asking
 
     def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
         """Return entries by name."""
         where, values = ("", ()) if names is None else (" WHERE m.name = ANY(?)", (list(names),))
-        rows = self._rows(f"SELECT {_ENTRY} FROM memory m{where} ORDER BY m.name", values)
-        return [MemoryEntry(*row) for row in rows]
+        rows = self._rows(f"SELECT m.memory_id, {_ENTRY} FROM memory m{where} ORDER BY m.name", values)
+        self._numbers |= {str(name): int(number) for number, name, *_ in rows}
+        return [MemoryEntry(*row[1:]) for row in rows]
 
     def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
         """Return one instance."""
@@ -131,9 +157,9 @@ class PostgresBackend:
         passing, values = filters_sql(filters, "i")
         query = (
             f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? AND {passing} "
-            "ORDER BY i.bounds <-> cube(?::float8[]) LIMIT ?"
+            "ORDER BY i.bounds <-> ?::cube LIMIT ?"
         )
-        asked = (memory, self._number(memory), *values, list(point), k)
+        asked = (memory, self._number(memory), *values, _corner(point), k)
         return [_thing(row) for row in self._rows(query, asked)]
 
     def inside(
@@ -143,9 +169,10 @@ class PostgresBackend:
         passing, values = filters_sql(filters, "i")
         query = (
             f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? "
-            f"AND i.bounds && cube(?::float8[], ?::float8[]) AND {passing} ORDER BY i.id LIMIT ?"
+            f"AND i.bounds && ?::cube AND {passing} ORDER BY i.id LIMIT ?"
         )
-        asked = (memory, self._number(memory), list(lower), list(upper), *values, None if limit < 0 else limit)
+        region = f"{_corner(lower)},{_corner(upper)}"
+        asked = (memory, self._number(memory), region, *values, None if limit < 0 else limit)
         return [_thing(row) for row in self._rows(query, asked)]
 
     def named(
@@ -233,9 +260,13 @@ class PostgresBackend:
         return {(int(row[-1]), int(row[1])): _thing(row[:-1]) for row in rows}
 
     def _number(self, memory: str) -> int:
-        """Return the number of a memory, 0 where there is none of that name."""
-        rows = self._rows("SELECT memory_id FROM memory WHERE name = ?", (memory,))
-        return int(rows[0][0]) if rows else 0
+        """Return the number that a memory had when it was last asked for, 0 where there is none of that name.
+
+        A number is never given twice: that of a memory which is gone leads to nothing.
+        """
+        if memory not in self._numbers:
+            self.memories([memory])
+        return self._numbers.get(memory, 0)
 
     def _space(self, space: str) -> int:
         rows = self._rows("SELECT space_id FROM space WHERE name = ?", (space,))
@@ -261,7 +292,7 @@ class PostgresBackend:
             with self._connections.one() as connection:
                 return _asked(connection, query, values)
         except psycopg.OperationalError as error:
-            if error.sqlstate is not None and not error.sqlstate.startswith(("57P", "08")):
+            if not _lost(error):
                 raise self._failed("asked", error) from error
         except psycopg.Error as error:
             raise self._failed("asked", error) from error
@@ -276,12 +307,19 @@ class PostgresBackend:
         except psycopg.Error as error:
             raise self._failed(what, error) from error
 
-    def _failed(self, what: str, error: Exception) -> CatalogError:
+    def _failed(self, what: str, error: psycopg.Error) -> CatalogError:
+        if what == _WRITTEN:
+            what += "; the same again is safe" if _lost(error) else "; nothing was changed"
         return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_said(error)}")
 
 
+def _lost(error: psycopg.Error) -> bool:
+    """Whether the connection was lost, so that nobody knows whether a transaction that was ending has ended."""
+    return isinstance(error, psycopg.OperationalError) and (error.sqlstate or "08").startswith(("57P", "08"))
+
+
 def _asked(connection: psycopg.Connection[Any], query: str, values: Sequence[Any]) -> list[Any]:
-    found: list[Any] = connection.execute(_marked(query), values).fetchall()
+    found: list[Any] = connection.execute(_marked(query), values, binary=True).fetchall()
     return found
 
 
@@ -327,8 +365,7 @@ def _copy_things(connection: psycopg.Connection[Any], memory: int, content: Memo
     with connection.cursor() as cursor:
         with cursor.copy("COPY instance FROM STDIN") as copy:
             for t in content.things:
-                low, high = t.bounds()
-                bounds = f"({','.join(map(repr, low))}),({','.join(map(repr, high))})"
+                bounds = ",".join(map(_corner, t.bounds()))
                 told = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
                 words = list(t.words), list(t.words.values())
                 copy.write_row((memory, t.id, *told, t.box_numbers(), bounds, *words))
@@ -338,15 +375,24 @@ def _copy_things(connection: psycopg.Connection[Any], memory: int, content: Memo
 
 
 def _copy_vectors(connection: psycopg.Connection[Any], memory: int, space: int, held: SpaceVectors) -> None:
-    with connection.cursor() as cursor, cursor.copy(f"COPY vector_{space} FROM STDIN") as copy:
-        for n, vector in zip(held.ids.tolist(), held.vectors, strict=True):
-            copy.write_row((memory, n, _halfvec(vector)))
+    """Write vectors as PostgreSQL reads them fastest: rows of three fields, each after its length, big-endian."""
+    count, dimension = held.vectors.shape
+    lengths = [("fields", ">i2"), ("l0", ">i4"), ("memory", ">i4"), ("l1", ">i4"), ("id", ">i8"), ("l2", ">i4")]
+    rows = np.zeros(count, np.dtype([*lengths, ("dim", ">i2"), ("unused", ">i2"), ("v", ">f2", (dimension,))]))
+    rows["fields"], rows["l0"], rows["l1"], rows["l2"] = 3, 4, 8, 4 + 2 * dimension
+    rows["memory"], rows["id"], rows["dim"], rows["v"] = memory, held.ids, dimension, unit_vectors(held.vectors)
+    with connection.cursor() as cursor, cursor.copy(f"COPY vector_{space} FROM STDIN (FORMAT binary)") as copy:
+        copy.write(b"PGCOPY\n\xff\r\n\0" + struct.pack(">ii", 0, 0) + rows.tobytes() + struct.pack(">h", -1))
+
+
+def _corner(point: Sequence[float]) -> str:
+    """Return a point as `cube` reads it."""
+    return f"({','.join(map(repr, point))})"
 
 
 def _halfvec(vector: NDArray[np.float32]) -> str:
-    """Return a vector of unit length as pgvector writes it."""
-    unit = vector / max(float(np.linalg.norm(vector)), 1e-12)
-    return "[" + ",".join(f"{x:.5g}" for x in unit.tolist()) + "]"
+    """Return a vector of unit length as pgvector reads it."""
+    return "[" + ",".join(f"{x:.5g}" for x in unit_vectors(vector[None])[0].tolist()) + "]"
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:

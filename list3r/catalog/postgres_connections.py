@@ -16,6 +16,8 @@ _WAIT_S = 5
 """How long a server is waited for, and a connection where all are in use."""
 _STATEMENT_MS = 60_000
 """How long one statement may take."""
+_SILENT_S = 20
+"""A server that does not acknowledge anything for so long is lost: the network is gone."""
 
 
 class Connections:
@@ -53,6 +55,13 @@ class Connections:
 
     def _connect(self) -> psycopg.Connection[Any]:
         options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} -c jit=off"
+        lost = {"keepalives_idle": 5, "keepalives_interval": 5, "keepalives_count": (_SILENT_S - 5) // 5}
         return psycopg.connect(
-            self._url, options=options, connect_timeout=_WAIT_S, application_name="list3r", autocommit=True
+            self._url,
+            options=options,
+            connect_timeout=_WAIT_S,
+            application_name="list3r",
+            autocommit=True,
+            tcp_user_timeout=1000 * _SILENT_S,
+            **lost,
         )

@@ -108,10 +108,15 @@ class SqliteBackend:
             "INSERT INTO relation VALUES (?, ?, ?, ?, ?, ?)", ((memory, *r) for r in content.relations)
         )
         for space in content.spaces:
-            held = zip(space.ids.tolist(), _unit(space.vectors).astype("<f2"), strict=True)
+            held = zip(space.ids.tolist(), unit_vectors(space.vectors).astype("<f2"), strict=True)
             database.executemany(
                 "INSERT INTO vector VALUES (?, ?, ?, ?)", ((space.space, memory, n, v.tobytes()) for n, v in held)
             )
+
+    @contextlib.contextmanager
+    def loading(self, *, many: bool) -> Iterator[None]:
+        """Write memories: nothing is to be made anew here."""
+        yield
 
     def drop(self, name: str) -> bool:
         """Forget a memory; whether there was one."""
@@ -248,7 +253,7 @@ class SqliteBackend:
             f"WHERE v.space = ? AND {passing}{only}"
         )
         best = np.zeros((0, 2))
-        unit = _unit(vector[None])[0]
+        unit = unit_vectors(vector[None])[0]
         with self._reading():
             rows = self._database.execute(query, (space, *values, *given))
             while some := rows.fetchmany(_BATCH):
@@ -342,7 +347,8 @@ def box_of(numbers: NDArray[np.float64]) -> OrientedBox:
     return OrientedBox(numbers[:3], numbers[3:6], numbers[6:].reshape(3, 3))
 
 
-def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+def unit_vectors(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return vectors of length one. Shape (N, D)."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float32)
 

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     check_target(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
+        for left in _left_behind(path, f".{path.stem}.*.tmp{path.suffix}"):
+            left.unlink(missing_ok=True)
         temporary.unlink(missing_ok=True)
         temporary.touch(exist_ok=False)
         yield temporary
@@ -54,7 +57,12 @@ def replacing_folder(folder: str | Path, kind: str) -> Iterator[Path]:
     try:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / ours).is_file():
             raise ExportError(f"{folder} holds other files; name a new folder for the export")
-        shutil.rmtree(temporary, ignore_errors=True)
+        for left in _left_behind(folder, f".{folder.name}.*.old"):
+            if not folder.exists():  # what stood here before, where the change of the two was cut short
+                left.replace(folder)
+            shutil.rmtree(left, ignore_errors=True)
+        for left in [*_left_behind(folder, f".{folder.name}.*.tmp"), temporary]:
+            shutil.rmtree(left, ignore_errors=True)
         temporary.mkdir()
         yield temporary
         if not (temporary / ours).exists():
@@ -71,6 +79,26 @@ def replacing_folder(folder: str | Path, kind: str) -> Iterator[Path]:
             old.replace(folder)
         for rest in (temporary, old):
             shutil.rmtree(rest, ignore_errors=True)
+
+
+def _left_behind(path: Path, pattern: str) -> list[Path]:
+    """Return what exports to `path` have left there whose process was killed; its number is the `*`."""
+    if sys.platform == "win32":  # where asking for a process would end it
+        return []
+    before, after = pattern.split("*")
+    found = [p for p in path.parent.iterdir() if p.name.startswith(before) and p.name.endswith(after)]
+    numbers = {p: p.name[len(before) : -len(after)] for p in found}
+    return [p for p, number in numbers.items() if number.isdecimal() and not _runs(int(number))]
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def check_target(path: Path) -> None:

@@ -29,6 +29,8 @@ class ExportOptions(TypedDict, total=False):
     colliders: bool | None
     density: float | None
     ids: tuple[int, ...] | None
+    workers: int | None
+    progress: Callable[[int, int], None] | None
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ FORMATS: dict[str, Format] = {
         (),
         "a prop for each instance and a scene of them, for simulators",
         settings="SimreadySettings",
-        options=("density", "ids"),
+        options=("density", "ids", "workers", "progress"),
         address_space_mb=USD_MB,
     ),
     "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),

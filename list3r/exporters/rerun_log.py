@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,20 +10,25 @@ import numpy as np
 
 from list3r.exporters.components import Component, has_box, read_components, thinned_support
 from list3r.exporters.output import replacing, units
-from list3r.exporters.palette import instance_color, structure_color
+from list3r.exporters.palette import instance_color
 from list3r.memory.geometry import quat_wxyz_from_rotation
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 
 _POINTS = 5000
 """Of one instance, at most."""
+_ALONE = 1000
+"""Instances that have an entity each, at most: the viewer's tree and the file take no more of them."""
+_TOGETHER = 1000
+"""Instances of one entity where there are more."""
 
 
 def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
     """Write `world/instances/12` (points and a named box), `world/relations` and `world/camera` as an .rrd file.
 
-    The camera and its pictures lie on the time line `time_s` of their session. A component that was not placed against
-    the main one is `component_7` beside `world`. Returns the file written.
+    Of more than 1,000 instances a thousand share an entity, `world/instances/1_to_1000`; the box or the point that is
+    clicked says its id. The camera and its pictures lie on the time line `time_s` of their session. A component that
+    was not placed against the main one is `component_7` beside `world`. Returns the file written.
     """
     import rerun as rr
 
@@ -35,8 +41,10 @@ def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
             root = component.name or "world"
             if store.facts.gravity != "unknown":
                 log.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-            for instance in component.instances:
-                _log_instance(rr, log, root, instance, store)
+            for structure in (False, True):
+                members = [i for i in component.instances if bool(i.structure) == structure]
+                for name, group in _groups(members).items():
+                    _log_group(rr, log, f"{root}/{'structure' if structure else 'instances'}/{name}", group, store)
             _log_relations(rr, log, root, component, store)
             _log_camera(rr, log, root, component, store)
         log.flush()
@@ -48,23 +56,32 @@ def _recording_id(store: Store) -> str:
     return f"{store.path.stem}-{store.ids.largest()}"
 
 
-def _log_instance(rr: Any, log: Any, root: str, instance: Instance, store: Store) -> None:
-    kind = "structure" if instance.structure else "instances"
-    where = f"{root}/{kind}/{instance.id}"
-    support = thinned_support(store, instance, _POINTS)
-    if len(support.points):
-        log.log(f"{where}/points", rr.Points3D(support.points, colors=support.rgb), static=True)
-    if has_box(instance) and not instance.structure:
-        box, name = instance.box, instance.label or instance.description.split(",")[0]
+def _groups(instances: Sequence[Instance]) -> dict[str, Sequence[Instance]]:
+    """Return instances by the name of their entity: alone, or where they are many those that follow each other."""
+    if len(instances) <= _ALONE:
+        return {str(i.id): [i] for i in instances}
+    blocks = [instances[n : n + _TOGETHER] for n in range(0, len(instances), _TOGETHER)]
+    return {f"{block[0].id}_to_{block[-1].id}": block for block in blocks}
+
+
+def _log_group(rr: Any, log: Any, where: str, group: Sequence[Instance], store: Store) -> None:
+    """Log the points and the boxes of instances, with the id of each as `instance`."""
+    supports = [thinned_support(store, i, _POINTS) for i in group]
+    ids = np.repeat([i.id for i in group], [len(s.points) for s in supports])
+    if len(ids):
+        points, rgb = (np.concatenate([getattr(s, part) for s in supports]) for part in ("points", "rgb"))
+        log.log(f"{where}/points", rr.Points3D(points, colors=rgb), rr.AnyValues(instance=ids), static=True)
+    boxed = [i for i in group if has_box(i) and not i.structure]
+    if boxed:
         shape = rr.Boxes3D(
-            centers=[box.center],
-            half_sizes=[box.size / 2],
-            quaternions=[np.roll(quat_wxyz_from_rotation(box.rotation), -1)],
-            colors=[(structure_color if instance.structure else instance_color)(instance.id)],
-            labels=[f"{instance.id} {name}"],
+            centers=[i.box.center for i in boxed],
+            half_sizes=[i.box.size / 2 for i in boxed],
+            quaternions=[np.roll(quat_wxyz_from_rotation(i.box.rotation), -1) for i in boxed],
+            colors=[instance_color(i.id) for i in boxed],
+            labels=[f"{i.id} {i.label or i.description.split(',')[0]}" for i in boxed],
             show_labels=False,
         )
-        log.log(f"{where}/box", shape, static=True)
+        log.log(f"{where}/box", shape, rr.AnyValues(instance=[i.id for i in boxed]), static=True)
 
 
 def _log_relations(rr: Any, log: Any, root: str, component: Component, store: Store) -> None:

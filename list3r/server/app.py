@@ -1,4 +1,4 @@
-"""A memory as an MCP server: tools that compute, the scene and map as resources, prompts; over stdio or HTTP."""
+"""A memory, or a catalogue of many, as an MCP server: tools, resources and prompts, over stdio or HTTP."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from pydantic import AnyHttpUrl
 
 from list3r import __version__
 from list3r.api import SceneMemory
+from list3r.catalog import Catalog
 from list3r.memory.errors import List3rError, OptionError
+from list3r.server.catalog import CatalogTools
 from list3r.server.reading import ReadingTools
 from list3r.server.writing import WritingTools
 
@@ -31,6 +33,11 @@ _INSTRUCTIONS = (
     "A memory of the things in a place, made from video: where they are, how large, how they relate, what changed. "
     "Call overview first. Ids are stable; lengths are in `units`. An empty answer means nothing fits; "
     "`state: unknown` means the memory cannot tell."
+)
+_OF_MANY = (
+    "A catalogue of memories of places, made from video: what things there are, where, and how they relate. Call "
+    "memories first. An answer names its memory and file; ids, places and units are those of that memory alone; "
+    "`stale` means that the file has changed since. An empty answer means nothing fits."
 )
 
 
@@ -64,8 +71,8 @@ class _OneToken:
         return AccessToken(token=token, client_id="list3r", scopes=[], resource=self._resource)
 
 
-def make_server(memory: SceneMemory, *, http: HttpSettings | None = None) -> MCPServer[Any]:
-    """Return the server of a memory; with tools that edit where the memory is open for writing.
+def make_server(served: SceneMemory | Catalog, *, http: HttpSettings | None = None) -> MCPServer[Any]:
+    """Return the server of a catalogue or of a memory, with tools that edit where the memory is open for writing.
 
     With `http` (port and token given) clients must bear the token.
     """
@@ -75,28 +82,30 @@ def make_server(memory: SceneMemory, *, http: HttpSettings | None = None) -> MCP
         auth = AuthSettings(issuer_url=address, resource_server_url=address, validate_token_resource=True)
         guard = {"auth": auth, "token_verifier": _OneToken(http.token, str(auth.resource_server_url))}
     server: MCPServer[Any] = MCPServer(
-        f"list3r {memory.path.stem}",
-        instructions=_INSTRUCTIONS,
+        "list3r catalogue" if isinstance(served, Catalog) else f"list3r {served.path.stem}",
+        instructions=_OF_MANY if isinstance(served, Catalog) else _INSTRUCTIONS,
         version=__version__,
         log_level="WARNING",
         **guard,
     )
-    for tool in _public_methods(ReadingTools(memory)):
+    for tool in _public_methods(CatalogTools(served) if isinstance(served, Catalog) else ReadingTools(served)):
         server.tool(annotations=ToolAnnotations(read_only_hint=True, open_world_hint=False))(_told(tool))
-    if memory.writable:
-        for tool in _public_methods(WritingTools(memory)):
+    if isinstance(served, Catalog):
+        return server
+    if served.writable:
+        for tool in _public_methods(WritingTools(served)):
             server.tool(annotations=ToolAnnotations(read_only_hint=False, open_world_hint=False))(_told(tool))
-    _add_resources(server, memory)
+    _add_resources(server, served)
     _add_prompts(server)
     return server
 
 
-def serve_stdio(memory: SceneMemory) -> None:
+def serve_stdio(served: SceneMemory | Catalog) -> None:
     """Serve one client over standard input and output until it closes them."""
-    make_server(memory).run("stdio")
+    make_server(served).run("stdio")
 
 
-def serve_http(memory: SceneMemory, settings: HttpSettings, started: Callable[[str, str], None]) -> None:
+def serve_http(served: SceneMemory | Catalog, settings: HttpSettings, started: Callable[[str, str], None]) -> None:
     """Serve clients of this machine over streamable HTTP until interrupted.
 
     `started` is told the address and the token once the server listens. A request must bear the token, name this host
@@ -108,7 +117,7 @@ def serve_http(memory: SceneMemory, settings: HttpSettings, started: Callable[[s
     port = int(listener.getsockname()[1])
     settings = HttpSettings(port, settings.token or secrets.token_urlsafe(24), settings.max_request_bytes)
     hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
-    application = make_server(memory, http=settings).streamable_http_app(
+    application = make_server(served, http=settings).streamable_http_app(
         json_response=True,
         stateless_http=True,
         max_request_body_size=settings.max_request_bytes,

@@ -59,7 +59,8 @@ def add(
     if name is not None and len(found) != 1:
         raise OptionError(f"--name {name} is of one memory; {len(found)} are given")
     with _opened(catalog) as opened:
-        entries = [asdict(opened.add(path, name, store)) for path in found]
+        with opened.loading(len(found)):
+            entries = [asdict(opened.add(path, name, store)) for path in found]
     if json:
         print_answer(entries)
         return
@@ -129,7 +130,8 @@ def rebuild(
     with _opened(catalog) as opened:
         known = opened.memories()
         found = {e.path: e.name for e in known} if files is None else dict.fromkeys(_memories(files))
-        entries = [opened.again(path, name) for path, name in found.items()]
+        with opened.loading(len(found) + 1):
+            entries = [opened.again(path, name) for path, name in found.items()]
         gone = sorted({e.name for e in known} - {e.name for e in entries})
         for name in gone:
             opened.remove(name)

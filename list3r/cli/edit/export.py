@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -44,6 +46,8 @@ class ExportWords:
         default=None, metadata=option("simready: kg per cubic metre of the hull, for an estimated mass.", "KG/M3")
     )
     ids: str | None = field(default=None, metadata=option("simready: only these things, such as 3,7,12.", "ID,..."))
+
+    workers: int | None = field(default=None, metadata=option("simready: processes; 0: none beside this one.", "N"))
 
     def given(self) -> dict[str, Any]:
         """Return the options that are not left out. Raises `OptionError`."""
@@ -86,8 +90,8 @@ def export(
         with open_memory(memory, min_confidence) as scene:
             _pipe(scene, to, options)
         return
-    with open_memory(memory, min_confidence) as scene:
-        written = scene.export(to, out, **options)
+    with open_memory(memory, min_confidence) as scene, _watched(to, quiet=json) as watch:
+        written = scene.export(to, out, **options, **watch)
     sizes = {str(path): path.stat().st_size for path in written}
     if json:
         print_answer({"format": to, "path": path, "bytes": size} for path, size in sizes.items())
@@ -95,6 +99,21 @@ def export(
         say(f"{out}  {len(sizes)} file{'s' * (len(sizes) != 1)}, {_told(sum(sizes.values()))}")
     else:
         say(*(f"{path}  {_told(size)}" for path, size in sizes.items()))
+
+
+@contextlib.contextmanager
+def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Any]]:
+    """The option that shows how far a long export is, of formats that tell."""
+    if quiet or not sys.stderr.isatty() or "progress" not in find_format(to).options:
+        yield {}
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn(to), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(to, total=None)
+        yield {"progress": lambda done, total: bar.update(task, completed=done, total=total)}
 
 
 def _told(size: int) -> str:

@@ -1,10 +1,10 @@
-"""mcp, ask-config: a memory for agents."""
+"""mcp, ask-config: a memory, or a catalogue of many, for agents."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,7 +12,13 @@ from list3r.cli import terminal
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, MemoryArgument, note
 
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+    from list3r.catalog import Catalog
+
 TOKEN_VARIABLE = "LIST3R_MCP_TOKEN"
+_CONNECTIONS = 4
+"""To the database of a catalogue, at most."""
 
 
 def register(app: typer.Typer) -> None:
@@ -22,28 +28,47 @@ def register(app: typer.Typer) -> None:
 
 
 def mcp(
-    memory: MemoryArgument,
+    memory: Annotated[Path | None, typer.Argument(metavar="[MEMORY]", help="The memory file.")] = None,
+    catalog: Annotated[
+        str | None,
+        typer.Option("--catalog", metavar="URL", help="A catalogue instead: postgresql://host/name, or a file."),
+    ] = None,
     http: Annotated[bool, typer.Option("--http", help="Streamable HTTP on this machine instead of stdio.")] = False,
     port: Annotated[int, typer.Option("--port", help="Port of --http; 0: any free one.")] = 8740,
     write: Annotated[bool, typer.Option("--write", help="Also tools that edit; keeps other writers out.")] = False,
 ) -> None:
-    """Serve a memory to agents by the Model Context Protocol. With --http clients must send a token: that of the
-    environment variable LIST3R_MCP_TOKEN, else a new one, which is printed.
+    """Serve a memory, or with --catalog many, to agents by the Model Context Protocol. With --http clients must send a
+    token: that of the environment variable LIST3R_MCP_TOKEN, else a new one, which is printed.
 
     Example: list3r mcp house.l3r --http
     """
-    from list3r.api import open as open_scene
+    from list3r.memory.errors import OptionError
+
+    if (memory is None) == (catalog is None):
+        raise OptionError("mcp serves one of two: a memory, or --catalog URL; list3r mcp house.l3r")
+    if catalog is not None and write:
+        raise OptionError("--write edits one memory; a catalogue is only asked")
     from list3r.server.app import HttpSettings, serve_http, serve_stdio
 
-    with open_scene(memory, writable=write) as scene:
+    with _opened(memory, catalog, write=write) as served:
         if not http:
-            serve_stdio(scene)
+            serve_stdio(served)
             return
         settings = HttpSettings(port, os.environ.get(TOKEN_VARIABLE, ""))
         try:
-            serve_http(scene, settings, _say)
+            serve_http(served, settings, _say)
         except KeyboardInterrupt:
             note("stopped")
+
+
+def _opened(memory: Path | None, catalog: str | None, *, write: bool) -> SceneMemory | Catalog:
+    from list3r.api import open as open_scene
+    from list3r.catalog import Catalog
+
+    if memory is not None:
+        return open_scene(memory, writable=write)
+    assert catalog is not None
+    return Catalog.open(catalog, _CONNECTIONS)
 
 
 def _say(address: str, token: str) -> None:

@@ -73,7 +73,7 @@ def zero_level(field: Array) -> ClosedSurface:
     triangles = [_of_tetrahedra(corners[:, list(t)], above) for t in _TETRAHEDRA]
     triangles = [f if n in _RIGHT_HANDED else f[:, ::-1] for n, f in enumerate(triangles)]
     ends = np.concatenate([*triangles, np.zeros((0, 3, 2), np.int64)])  # each corner of a face lies on an edge
-    edges, faces = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    edges, faces = _distinct(ends.reshape(-1, 2), field.size)
     places = [np.stack(np.unravel_index(edges[:, k], field.shape), axis=1).astype(np.float64) for k in (0, 1)]
     share = np.clip(flat[edges[:, 0]] / (flat[edges[:, 0]] - flat[edges[:, 1]]), 0.05, 0.95)[:, None]
     return ClosedSurface(places[0] + share * (places[1] - places[0]), faces.reshape(-1, 3).astype(np.int64))
@@ -108,6 +108,12 @@ def _odd(order: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(swaps % 2 == 1)
 
 
+def _distinct(pairs: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the distinct pairs of numbers below `count`, in order, and which of them each is. Shape (N, 2)."""
+    keys, which = np.unique(pairs @ [count, 1], return_inverse=True)
+    return np.stack(np.divmod(keys, count), axis=1), which
+
+
 def outward(surface: ClosedSurface) -> ClosedSurface:
     """Return the surface with faces that look outward as a whole."""
     return surface if surface.volume() >= 0 else ClosedSurface(surface.vertices, surface.faces[:, ::-1])
@@ -133,7 +139,7 @@ def divided(surface: ClosedSurface, longest: float, most_faces: int = 6000) -> C
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
         if np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).max() <= longest:
             break
-        unique, which = np.unique(edges, axis=0, return_inverse=True)
+        unique, which = _distinct(edges, len(vertices))
         m = which.reshape(3, -1).T + len(vertices)
         vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
         corner = [np.stack([faces[:, k], m[:, k], m[:, (k + 2) % 3]], axis=1) for k in range(3)]

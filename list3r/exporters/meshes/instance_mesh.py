@@ -11,7 +11,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from list3r.exporters.components import has_box, point_spacing, thinned_support
 from list3r.exporters.meshes.closed import ClosedSurface, divided, filled, hull, outward, slab, zero_level
-from list3r.memory.records import Instance
+from list3r.memory.records import Instance, Support
 from list3r.memory.store.store import Store
 
 Array = NDArray[np.float64]
@@ -37,6 +37,8 @@ class MeshSettings:
     """And where so much of its area bears points, of two opposite sides the better: under a table nothing does."""
     hull_faces: int = 10_000
     """Of a hull, at most; more of them show colours finer."""
+    faces_a_point: int = 8
+    """Of a hull, at most: between few points there is no more to show."""
     least_part: float = 0.1
     """Parts of less than this share of the volume are left out."""
     slab_cells: int = 128
@@ -58,7 +60,12 @@ class InstanceMesh:
 def instance_mesh(store: Store, instance: Instance, settings: MeshSettings | None = None) -> InstanceMesh | None:
     """Return the mesh of an instance, None where its support allows none."""
     s = settings or MeshSettings()
-    support = thinned_support(store, instance, s.points)
+    return mesh_of(instance, thinned_support(store, instance, s.points), s)
+
+
+def mesh_of(instance: Instance, support: Support, settings: MeshSettings | None = None) -> InstanceMesh | None:
+    """Return the mesh of surface points that were read, None where they allow none."""
+    s = settings or MeshSettings()
     points = support.points.astype(np.float64)
     points = points[_dense(points)]
     if len(points) < s.least_points or not np.ptp(points, axis=0).max() > 0:
@@ -101,8 +108,10 @@ def _hull(points: Array, axes_world: Array, s: MeshSettings) -> ClosedSurface | 
     depth = -(some @ normal.T - np.einsum("ij,ij->i", normal, a)).max(axis=1)
     if float((depth < s.convex_depth * size).mean()) < s.convex_share:
         return None
-    found = divided(found, size / 16, s.hull_faces)
-    return found if _borne_sides(found, points, axes_world, s.convex_depth * size) >= s.convex_sides else None
+    spacing = point_spacing(points.astype(np.float32))
+    found = divided(found, size / 16, min(s.hull_faces, s.faces_a_point * len(points)))
+    reach = max(s.convex_depth * size, spacing)
+    return found if _borne_sides(found, points, axes_world, reach) >= s.convex_sides else None
 
 
 def _borne_sides(surface: ClosedSurface, points: Array, axes_world: Array, reach: float) -> float:

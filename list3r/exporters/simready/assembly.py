@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from list3r.exporters.components import has_box, read_components
 from list3r.exporters.meshes.instance_mesh import InstanceMesh, instance_mesh
 from list3r.exporters.output import replacing_folder, units
-from list3r.exporters.simready.prop import Prop, PropFacts, write_prop
+from list3r.exporters.simready.making import Making, write_props
+from list3r.exporters.simready.prop import Prop, PropFacts
 from list3r.exporters.usd.labels import set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind
 from list3r.exporters.usd.stage import errors_of_disk
@@ -25,18 +26,24 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class SimreadySettings:
-    """What props are told to be."""
+    """What props are told to be, and how they are made."""
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for no mass and no rigid body."""
     ids: tuple[int, ...] | None = None
     """Of the things that become props; None for all."""
-    most: int = 10_000
-    """Props of one export: minutes of work and 0.7 GB."""
+    workers: int | None = None
+    """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
+    progress: Callable[[int, int], None] | None = None
+    """Is told how many of the things are done, and how many there are."""
+    one_folder: int = 1000
+    """Of more props than this a thousand ids share a folder, `from_12000`."""
 
     def __post_init__(self) -> None:
         if self.density is not None and not 0 < self.density < 1e6:
             raise OptionError(f"density {self.density:g}: kilograms per cubic metre above 0 are needed, such as 300")
+        if self.workers is not None and self.workers < 0:
+            raise OptionError(f"workers {self.workers}: a number of processes is needed, 0 for none beside this one")
 
 
 def write_simready(store: Store, folder: str | Path, settings: SimreadySettings | None = None) -> tuple[Path, ...]:
@@ -44,26 +51,31 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
 
     Props have a closed mesh, a material, labels, a collider, a thumbnail and metadata; with a density a rigid body
     whose mass is an estimate, marked so. Structure is fixed and lies in the scene. What was seen to move, is gone, or
-    has too few points for a mesh has no prop. Raises `OptionError` for a memory without scale, for more props than
-    `most`, and for ids that allow none.
+    has too few points for a mesh has no prop. Raises `OptionError` for a memory without scale and for ids that allow
+    none.
     """
     folder, settings = Path(folder), settings or SimreadySettings()
     if units(store) != "m":
         raise OptionError(
             f"{store.path.name} has no metric scale, which a simulator needs: `list3r scale --anchor` gives it one"
         )
-    facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density)
     things, structure = _chosen(store, settings)
+    parts = len(things) > settings.one_folder
+    facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density, parts)
     with replacing_folder(folder, "simready") as temporary, errors_of_disk(folder):
-        meshes = ((i, instance_mesh(store, i)) for i in things)
-        props = [write_prop(temporary, i, mesh, facts) for i, mesh in meshes if mesh is not None]
+        making = Making(settings.workers, settings.progress)
+        props = write_props(store, things, temporary, facts, making)
         if settings.ids is not None and len(props) < len(things):
             bare = sorted({i.id for i in things} - {p.instance_id for p in props})
             raise OptionError(f"{_told(bare)}: too few surface points for a mesh; leave it out of the ids")
         fixed = [(i, mesh) for i in structure if (mesh := instance_mesh(store, i)) is not None]
-        stage = Usd.Stage.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
-        _fill_scene(stage, props, fixed)
-        stage.GetRootLayer().Save()
+        scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
+        _fill_scene(Usd.Stage.Open(scene), props, fixed)
+        with Sdf.ChangeBlock():  # without a stage, which would open the file of every prop
+            for prop in props:
+                _refer(scene, prop)
+        if not scene.Save():
+            raise OSError("the scene of the props")
     return tuple(sorted(p for p in folder.rglob("*") if p.is_file()))
 
 
@@ -76,11 +88,6 @@ def _chosen(store: Store, settings: SimreadySettings) -> tuple[list[Instance], l
         if bare := sorted(wanted - {i.id for i in things}):
             raise OptionError(f"{_told(bare)}: structure, gone, moving or placed apart; leave it out of the ids")
         things = [i for i in things if i.id in wanted]
-    if len(things) > settings.most:
-        raise OptionError(
-            f"{store.path.name} has {len(things):,} things; {settings.most:,} props at most are written at once: "
-            "choose by --ids, such as those of `list3r query within --json`"
-        )
     return things, [i for i in there if i.structure is not None]
 
 
@@ -89,6 +96,7 @@ def _told(ids: Sequence[int]) -> str:
 
 
 def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[Instance, InstanceMesh]]) -> None:
+    """Write all of a scene but its props."""
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
@@ -101,10 +109,6 @@ def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[I
     for group, members in (("Props", props), ("Structure", fixed)):
         if members:
             Usd.ModelAPI(UsdGeom.Xform.Define(stage, f"/World/{group}").GetPrim()).SetKind("group")
-    for prop in props:
-        xform = UsdGeom.Xform.Define(stage, f"/World/Props/{prop.name}")
-        xform.GetPrim().GetReferences().AddReference(f"./{prop.file}")
-        _place(xform, prop.T_world_prop)
     for i, mesh in fixed:
         xform = UsdGeom.Xform.Define(stage, f"/World/Structure/instance_{i.id}")
         set_labels(xform.GetPrim(), i)
@@ -113,6 +117,22 @@ def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[I
         body = add_mesh(stage, xform.GetPath().AppendChild("mesh"), mesh, T_world_prim)
         bind(body.GetPrim(), material)
         add_collider(body, fixed=True)
+
+
+def _refer(layer: Sdf.Layer, prop: Prop) -> None:
+    """Add a prim that is the prop of a file, where the thing stands."""
+    spec = Sdf.CreatePrimInLayer(layer, f"/World/Props/{prop.name}")
+    spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
+    spec.referenceList.prependedItems = [Sdf.Reference(f"./{prop.file}")]
+    w, x, y, z = quat_wxyz_from_rotation(prop.T_world_prop.rotation).tolist()
+    ops = {
+        "xformOp:translate": (Sdf.ValueTypeNames.Double3, Gf.Vec3d(*prop.T_world_prop.translation.tolist())),
+        "xformOp:orient": (Sdf.ValueTypeNames.Quatd, Gf.Quatd(w, x, y, z)),
+    }
+    for name, (kind, value) in ops.items():
+        Sdf.AttributeSpec(spec, name, kind).default = value
+    order = Sdf.AttributeSpec(spec, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
+    order.default = Vt.TokenArray(list(ops))
 
 
 def _place(xform: UsdGeom.Xform, T_world_prim: Sim3) -> None:

@@ -32,7 +32,8 @@ def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: InstanceMesh, T_world_prim:
 
 def set_vertex_colors(prim: UsdGeom.Gprim, rgb: NDArray[np.uint8]) -> None:
     """Set the colour of each point or vertex; each colour once with indices, where that is less. Shape (N, 3)."""
-    distinct, index = np.unique(rgb, axis=0, return_inverse=True)
+    _, first, index = np.unique(rgb @ np.array([1 << 16, 1 << 8, 1]), return_index=True, return_inverse=True)
+    distinct = rgb[first]
     primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
     indexed = len(distinct) < len(rgb)
     colors = np.ascontiguousarray(linear_from_srgb(distinct if indexed else rgb), dtype=np.float32)

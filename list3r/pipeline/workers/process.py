@@ -70,12 +70,15 @@ def _prepare(script: str) -> None:
 
 
 def one_thread() -> None:
-    """Let OpenCV and BLAS use one thread in this process from now on."""
-    import cv2
-    from threadpoolctl import threadpool_limits
+    """Let OpenCV and BLAS use one thread in this process from now on, those of them that are installed."""
+    with contextlib.suppress(ImportError):
+        import cv2
 
-    cv2.setNumThreads(1)
-    threadpool_limits(1)
+        cv2.setNumThreads(1)
+    with contextlib.suppress(ImportError):
+        from threadpoolctl import threadpool_limits
+
+        threadpool_limits(1)
 
 
 class _Script(types.ModuleType):

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from list3r.memory.records import Instance
 from list3r.memory.store.connection import Connection
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.word_index import ASK_STAMP, STAMP, expected_words, hundredths
+
+_FEW = 2_000
+"""A word that so few bear leads to the others; bearers of more frequent ones are read whole and kept."""
+_KEPT_BYTES = 64_000_000
+"""Of the bearers of frequent words that were asked for last."""
+_Bearers = tuple[NDArray[np.int64], NDArray[np.int16]]
+"""Ids, ascending, and hundredths."""
 
 
 class Words:
@@ -14,6 +25,9 @@ class Words:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self._kept = _kept()
+        self._kept_of: object = None
+        """State of the file in which they were read."""
 
     def known(self, words: Iterable[str]) -> set[str]:
         """Those of some words that any instance bears."""
@@ -31,7 +45,9 @@ class Words:
             return []
         if not self._is_current():
             return self._bearing_without_index(wanted)[:limit]
-        first, *others = sorted(wanted, key=lambda word: (self._count(word), word))
+        first, *others = sorted(wanted, key=lambda word: (self._count(word, _FEW + 1), word))
+        if self._count(first, _FEW + 1) > _FEW:
+            return self._bearing_frequent(wanted, limit)
         joins = "".join(
             f" CROSS JOIN words w{n} ON w{n}.word = ? AND w{n}.instance = w.instance" for n in range(len(others))
         )
@@ -41,6 +57,27 @@ class Words:
             " ORDER BY total DESC, w.instance LIMIT ?"
         )
         return [(n, total) for n, total in self._connection.rows(query, (*others, first, limit))]
+
+    def _bearing_frequent(self, words: Sequence[str], limit: int) -> list[tuple[int, int]]:
+        (ids, total), *others = sorted((self._bearers(word) for word in words), key=lambda b: len(b[0]))
+        for other, weights in others:
+            at = np.minimum(np.searchsorted(other, ids), len(other) - 1)
+            both = other[at] == ids
+            ids, total = ids[both], total[both] + weights[at[both]]
+        order = np.argsort(-total, kind="stable")[:limit]
+        return list(zip(ids[order].tolist(), total[order].tolist(), strict=True))
+
+    def _bearers(self, word: str) -> _Bearers:
+        """Return all that bear a word, from what is kept while the file stays as it is."""
+        state = self._connection.stamp()
+        if state != self._kept_of:
+            self._kept, self._kept_of = _kept(), state
+        kept = self._kept.get(word)
+        if kept is None:
+            rows = self._connection.rows("SELECT instance, weight FROM words WHERE word = ? ORDER BY instance", (word,))
+            held = np.array(rows, np.int64).reshape(-1, 2)
+            kept = self._kept.put(word, (held[:, 0].copy(), held[:, 1].astype(np.int16)))
+        return kept
 
     def bearing_most(self, words: Sequence[str], limit: int) -> list[list[int]]:
         """Ids of the instances that bear some words or, of three letters on, words that begin so: those that bear the
@@ -70,7 +107,7 @@ class Words:
         with self._connection.unchecked() as database:
             return list(expected_words(database))
 
-    def _count(self, word: str, most: int = 100_000) -> int:
+    def _count(self, word: str, most: int) -> int:
         query = "SELECT count(*) FROM (SELECT 1 FROM words WHERE word = ? LIMIT ?)"
         return int(self._connection.rows(query, (word, most))[0][0])
 
@@ -81,3 +118,7 @@ class Words:
                 held.setdefault(instance, {})[word] = weight
         found = [(-sum(weights.values()), n) for n, weights in held.items() if len(weights) == len(words)]
         return [(n, -total) for total, n in sorted(found)]
+
+
+def _kept() -> LruCache[str, _Bearers]:
+    return LruCache(_KEPT_BYTES, lambda bearers: bearers[0].nbytes + bearers[1].nbytes)

@@ -1,0 +1,57 @@
+"""Make many props: in this process, or in several, which are handed surface points and write the files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from list3r.exporters.components import thinned_support
+from list3r.exporters.meshes.instance_mesh import MeshSettings, mesh_of
+from list3r.exporters.simready.prop import Prop, PropFacts, write_prop
+from list3r.memory.records import Instance, Support
+from list3r.memory.store.store import Store
+from list3r.pipeline.workers import OrderedPool, default_workers
+
+Some = Sequence[tuple[Instance, Support]]
+_AT_ONCE = 50
+"""Things that a process makes at a time; of fewer than four times as many no process is started unasked."""
+
+
+@dataclass(frozen=True)
+class Making:
+    """How props are made."""
+
+    workers: int | None
+    """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
+    progress: Callable[[int, int], None] | None
+    """Is told how many of the things are done, and how many there are."""
+
+
+def write_props(store: Store, things: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:
+    """Write a prop below `folder` for each thing whose surface points allow a mesh; in the order of the things."""
+    blocks = [things[n : n + _AT_ONCE] for n in range(0, len(things), _AT_ONCE)]
+    some = ([(i, thinned_support(store, i, MeshSettings().points)) for i in block] for block in blocks)
+    workers = making.workers if making.workers is not None else default_workers() if len(blocks) >= 4 else 0
+    props, done = [], 0
+    for block, made in zip(blocks, _made(some, partial(_write_some, folder, facts), workers), strict=True):
+        props += made
+        done += len(block)
+        if making.progress is not None:
+            making.progress(done, len(things))
+    return props
+
+
+def _made(some: Iterator[Some], work: Callable[[Some], list[Prop]], workers: int) -> Iterator[list[Prop]]:
+    if workers == 0:
+        yield from map(work, some)
+        return
+    with OrderedPool(work, workers) as pool:
+        yield from pool.map(some)
+
+
+def _write_some(folder: Path, facts: PropFacts, some: Some) -> list[Prop]:
+    """Write the props of some things, in the process that makes them."""
+    meshes = ((i, mesh_of(i, support)) for i, support in some)
+    return [write_prop(folder, i, mesh, facts) for i, mesh in meshes if mesh is not None]
