@@ -118,7 +118,7 @@ def measured(folder: Path, seed: int, workers: int, discovery: str = "", frames:
     walk = folder / "walk"
     if not (walk / "truth.json").exists():
         write_walk(walk, settings, workers)
-    colour = _colour_only(folder / "colour", walk)
+    colour = colour_only(folder / "colour", walk)
     camera = settings.camera()
     intrinsics = ",".join(f"{v:g}" for v in (camera.fx, camera.fy, camera.cx, camera.cy))
     memory, depths = folder / f"memory{discovery}.l3r", folder / "reconstructions"
@@ -133,7 +133,7 @@ def measured(folder: Path, seed: int, workers: int, discovery: str = "", frames:
     return row | depth_errors(depths, walk) | scene_errors(memory, walk)
 
 
-def _colour_only(folder: Path, walk: Path) -> Path:
+def colour_only(folder: Path, walk: Path) -> Path:
     """A folder of links to the colour pictures, in order."""
     folder.mkdir(exist_ok=True)
     for path in sorted((walk / "rgb").iterdir()):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
+from list3r.memory.library.uncertainty import ConfidenceWeights, signs_of
 from list3r.memory.overlap.missed import LookSettings, bears_out, frames_beside, misses
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
 from list3r.memory.overlap.voxels import ChunkShapes, Ints
@@ -27,6 +28,10 @@ class EvidenceSettings:
     """Share of its surface that another chunk gives to one other instance, to speak against it."""
     min_agreement: float = 0.4
     """Share of the chunks that saw its place and found it too."""
+    least_confidence: float = 0.2
+    """What is less probably one thing and all of it is not shown; chosen on walks that the weights were not fitted to,
+    where hardly any right one lies below it."""
+    weights: ConfidenceWeights = field(default_factory=ConfidenceWeights)
     claim_m: float = 0.1
     """Edge of the cells in which the claims of instances to a place are counted."""
     claims: int = 4
@@ -49,6 +54,8 @@ class Evidence:
     """Those other instances (numbers of groups), the one named most first."""
     missed: int = 0
     """Chunks of computed depth that looked at it in frames they share with one that found it, and found nothing."""
+    confidence: float = 1.0
+    """How probably it is one thing and all of it."""
 
     @property
     def agreement(self) -> float:
@@ -56,10 +63,12 @@ class Evidence:
         return self.found / max(self.found + self.swallowed + self.missed, 1)
 
     def shown(self, s: EvidenceSettings, all_frames: int) -> bool:
-        """Seen in enough of all posed frames, and more chunks for it than against (or nearly, if several found it)."""
+        """Seen in enough of all posed frames, surely enough one thing, and more chunks for it than against (or nearly,
+        if several found it).
+        """
         agreed = self.found > self.swallowed + self.missed or (self.found >= 3 and self.agreement >= s.min_agreement)
         enough = min(s.min_frames, max(3, math.ceil(s.min_share * all_frames)))
-        return self.frames >= enough and agreed
+        return self.frames >= enough and agreed and self.confidence >= s.least_confidence
 
 
 def weigh(
@@ -107,7 +116,11 @@ def weigh(
         asked = weighed[n] and not all(_bounds(chunks, key) for key in group)
         silent = {v for u in own for v in beside.get(u, {})} - own - against[n].keys() if asked else set()
         missed = sum(misses(v, group, chunks, beside, settings.looks) for v in silent)
-        out.append(Evidence(len(frames[n]), len(own), sum(votes.values()), ranked, missed))
+        found = Evidence(len(frames[n]), len(own), sum(votes.values()), ranked, missed)
+        if weighed[n]:
+            sure = settings.weights.probability(signs_of(group, chunks, found.frames))
+            found = replace(found, confidence=sure * found.agreement)
+        out.append(found)
     return out
 
 

@@ -28,10 +28,8 @@ grow with chunks."""
 
 @dataclass(frozen=True)
 class DeriveSettings:
-    """How much evidence makes an instance certain, and how its extent is measured."""
+    """How the extent of an instance is measured, and which is its best view."""
 
-    half_frames: float = 12.0
-    """Frames after which half of the doubt is gone."""
     max_points: int = 1000
     """Surface points kept for boxes and relations."""
     trim: float = 0.01
@@ -50,8 +48,6 @@ class DeriveSettings:
     """where this share of the members are whole views;"""
     least_kept: float = 0.3
     """nothing is dropped where less than this share of the points would be kept."""
-    seen_share: float = 0.6
-    """Weight of the frames in the certainty; the rest is that of the chunks that found it on their own."""
     cut: float = 0.25
     """Weight of a view that the image's border cuts, as the best one is chosen."""
     hidden: float = 0.2
@@ -93,8 +89,6 @@ class DerivedInstance:
     frames: NDArray[np.int64]
     """Session id and Frame.index of every frame in which it is seen, in order. Shape (F, 2)."""
     best_view: BestView | None
-    certainty: float
-    """How sure it is that it exists as one instance, before it is asked who else should have seen it."""
     anchor: int
     """Id of the chunk that saw it longest."""
     shape: str
@@ -200,7 +194,6 @@ def derive_instance(
     points, rgb = points[keep], rgb[keep]
     frames = _frames(members)
     counts = np.array([len(m.shapes.frames[m.at]) for m in members], dtype=np.float64)
-    stability = float(np.average([m.shapes.stability[m.at] for m in members], weights=np.maximum(counts, 1)))
     feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
     box = fit_box(points, upright=upright, trim=s.trim)
     geometry = InstanceGeometry(
@@ -213,13 +206,12 @@ def derive_instance(
         flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
         component=component,
     )
-    certainty = _certainty(len(frames), stability, members, s)
     anchor = members[int(np.argmax(counts))].shapes.chunk_id
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(geometry, unit_feature, frames, view, certainty, anchor, shape, colors)
+    return DerivedInstance(geometry, unit_feature, frames, view, anchor, shape, colors)
 
 
 def _frames(members: Sequence[Member]) -> NDArray[np.int64]:
@@ -281,21 +273,6 @@ def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Arra
         return None
     toward = np.sum([m.S_world_chunk.rotation @ m.shapes.plane[m.at, :3] for m in flat], axis=0)
     return np.asarray(axes[2] if axes[2] @ toward >= 0 else -axes[2])
-
-
-def with_agreement(found: DerivedInstance, agreement: float) -> DerivedInstance:
-    """Return the instance with its confidence; `agreement` is the share of the chunks that saw its place and found
-    it.
-    """
-    return replace(found, geometry=replace(found.geometry, confidence=round(found.certainty * agreement, 4)))
-
-
-def _certainty(frames: int, stability: float, members: Sequence[Member], s: DeriveSettings) -> float:
-    """Grows with frames and with chunks that found the instance on their own; stability caps it."""
-    chunks = len({m.shapes.chunk_id for m in members})
-    seen = frames / (frames + s.half_frames)
-    agreed = 1.0 - 0.5**chunks
-    return float(np.clip(stability, 0.0, 1.0)) * (s.seen_share * seen + (1.0 - s.seen_share) * agreed)
 
 
 def _best_view(members: Sequence[Member], s: DeriveSettings) -> BestView | None:

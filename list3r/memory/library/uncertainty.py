@@ -1,13 +1,80 @@
-"""How well the position of an instance is known, from how well the chunks that saw it are placed."""
+"""How sure it is that an instance is one thing and all of it, and how well its position is known."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from list3r.memory.geometry import Array, skew
+from list3r.memory.overlap.pair_scores import Key
+from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChunkRow
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What tells whether a group of local instances is one thing and all of it."""
+
+    stability: float
+    """How probably its members are one thing each, times how well their masks fit; mean weighted by their frames."""
+    frames: int
+    """Different frames in which it is seen, at least 1."""
+    area: float
+    """Share of what is seen in a frame that its mask covers, in the middle of its frames."""
+    size_m: float
+    """Diagonal of what one chunk saw of it."""
+    structure: float
+    """Share of it that its chunks took for structure."""
+
+
+def signs_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes], frames: int) -> Signs:
+    """Return the signs of a group that is seen in so many different frames."""
+    own = [(chunks[k], int(np.searchsorted(chunks[k].local_id, n))) for k, n in group]
+    weight = [max(1, len(c.frames[at])) for c, at in own]
+    rows = [(c.stability[at], _area(c, at), c.size[at] / c.unit, c.structure[at]) for c, at in own]
+    stability, area, size, structure = np.average(np.array(rows, np.float64), axis=0, weights=weight).tolist()
+    return Signs(stability, max(frames, 1), area, size, structure)
+
+
+def _area(chunk: ChunkShapes, at: int) -> float:
+    """Return the share of what is seen in a frame that the mask of an instance covers, in the middle of its frames."""
+    seen = float(np.prod(chunk.seen[2:] - chunk.seen[:2]))
+    return float(np.median(chunk.areas_px[at])) / max(seen, 1.0) if len(chunk.areas_px[at]) else 0.0
+
+
+@dataclass(frozen=True)
+class ConfidenceWeights:
+    """Log odds that a person would call an instance one thing and all of it: logistic regression on whole memories of
+    simulated walks (docs/decisions/0137-confidence-of-instances.md).
+    """
+
+    stability: float = 11.2
+    frames: float = 1.46
+    """Of the logarithm of the frames, up to `most_frames`."""
+    most_frames: int = 100
+    area: float = 0.606
+    """Of the logarithm of the share of the picture, from `least_area` on."""
+    least_area: float = 1e-4
+    size: float = -0.798
+    """Of the logarithm of the diagonal in metres, from `least_size_m` on."""
+    least_size_m: float = 0.01
+    constant: float = -11.3
+
+    def probability(self, signs: Signs) -> float:
+        """Return the probability; of structure, which is never seen whole, how sure its chunks are."""
+        if signs.structure > 0.5:
+            return signs.stability
+        weights = self.stability, self.frames, self.area, self.size
+        odds = self.constant + sum(w * x for w, x in zip(weights, self.inputs(signs), strict=True))
+        return 1.0 / (1.0 + math.exp(-odds))
+
+    def inputs(self, signs: Signs) -> tuple[float, float, float, float]:
+        """Return what stability, frames, area and size are the weights of."""
+        frames, area = min(signs.frames, self.most_frames), max(signs.area, self.least_area)
+        return signs.stability, math.log(frames), math.log(area), math.log(max(signs.size_m, self.least_size_m))
 
 
 def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:

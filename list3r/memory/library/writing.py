@@ -10,7 +10,7 @@ import numpy as np
 from list3r.memory.change.ledger import Group
 from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping
-from list3r.memory.library.instances import DerivedInstance, Members, derived_instance, with_agreement
+from list3r.memory.library.instances import DerivedInstance, Members, derived_instance
 from list3r.memory.library.redundancy import sightings
 from list3r.memory.library.rows import looks_of, moved, record_of
 from list3r.memory.library.session_changes import SessionChanges
@@ -74,10 +74,9 @@ class Writer:
         for n in order:
             found = self._derive(n, fresh[n], was[n].structure if n in was else None)
             seen = weighed.evidence.get(fresh[n])
-            geometry = replace(found.geometry, confidence=was[n].confidence if n in was else 1.0)
-            self._derived[n] = (
-                replace(found, geometry=geometry) if seen is None else with_agreement(found, seen.agreement)
-            )
+            kept = was[n].confidence if n in was else 1.0
+            sure = kept if seen is None else round(seen.confidence, 4)
+            self._derived[n] = replace(found, geometry=replace(found.geometry, confidence=sure))
         self._put(order, fresh, labels)
         again = sorted(self._classify(order, boxes))
         if again:
@@ -92,7 +91,7 @@ class Writer:
         self._states |= {n: s for n, s in states.items() if n in self._states}
 
     def _derive(self, instance_id: int, group: Group, structure: str | None = None) -> DerivedInstance:
-        """Return an instance, with its agreement still to be said."""
+        """Return an instance, with its confidence still to be said."""
         region = self._region
         chunks = {k: (region.shapes(k), region.pose(k), self._weighing.dropped_of(k)) for k in {k for k, _ in group}}
         mover = self._g.mover(group)
@@ -187,10 +186,9 @@ class Writer:
         return changed
 
     def _kind(self, geometry: InstanceGeometry, reach: Array) -> str | None:
-        if not (self._world.upright and geometry.component == self._world.first):
+        upright = self._world.upright and geometry.component == self._world.first
+        if not upright or geometry.normal is None:
             return flagged_only([geometry])[0]
-        if geometry.normal is None:
-            return None
         near = [b for b in self._stored(self._near(geometry.aabb, reach)) if b.component == geometry.component]
         still = [b for b in near if not self._derived[b.id].dynamic]
         world = self._world

@@ -68,10 +68,10 @@ def classify_structure(
     `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
     saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level, lies at the
     floor, and is no rug, which chunks told from a floor that is seen beside it; a ceiling is level, above the cameras,
-    and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. A smaller surface that the
-    chunks flagged and that has nothing behind it is `plane`. A table top or a cabinet front stands in the room and is
-    none of these. What lies near an instance decides, so `around` may be all instances (the default: those given) or
-    those within `near_m`.
+    and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. What the chunks flagged in
+    the main and is none of these is `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet front stands
+    in the room and is no structure. What lies near an instance decides, so `around` may be all instances (the default:
+    those given) or those within `near_m`.
     """
     s = settings or StructureSettings()
     known = instances if around is None else around
@@ -80,7 +80,7 @@ def classify_structure(
     out: list[str | None] = []
     for b in instances:
         if b.normal is None:
-            out.append(None)
+            out += flagged_only([b])
             continue
         gap = np.maximum(box[:, 0] - b.aabb[1], b.aabb[0] - box[:, 1]).max(axis=1)
         rows = np.flatnonzero(gap <= s.near_m * unit).tolist()
@@ -89,7 +89,7 @@ def classify_structure(
             told = [known[n] for n in rows if known[n].flagged >= s.least_flagged]
             floors = [n.points for n in told if _low(n, floor_height, unit, s)]
             kind = None if floors and _bordered(b.points, np.concatenate(floors), unit, s) else kind
-        out.append(kind)
+        out.append(kind or flagged_only([b])[0])
     return out
 
 
@@ -107,7 +107,7 @@ def _bordered(sheet: Array, floor: Array, unit: float, s: StructureSettings) -> 
 
 
 def flagged_only(instances: Sequence[InstanceGeometry]) -> list[str | None]:
-    """Without gravity: `plane` for what the chunks took for structure in the main, else None."""
+    """`plane` for what the chunks took for structure in the main, else None: all that can be told without gravity."""
     return ["plane" if b.flagged > 0.5 else None for b in instances]
 
 
@@ -144,7 +144,7 @@ def _classify(
         tall = float(instance.box.size[2])
         if tall >= s.wall_height_m * unit and wide >= s.wall_width_m * unit:
             return "wall"
-    return "plane" if instance.flagged > 0.5 else None
+    return None
 
 
 def _level(instance: InstanceGeometry, s: StructureSettings) -> bool:
