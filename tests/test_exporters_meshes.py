@@ -194,5 +194,5 @@ def test_names_of_props_are_plain(tmp_path: Path) -> None:
     cloud = box_points((0, 0, 0), (1, 1, 1), 300, 5)
     with list3r.open(memory_of(tmp_path / "m.l3r", cloud, label="Écran plat <3")) as memory:
         memory.export("simready", tmp_path / "sim", density=1.0)
-    assert (tmp_path / "sim/cran_plat_3_1/simready_usd/cran_plat_3_1.usd").is_file()
+    assert (tmp_path / "sim/ecran_plat_3_1/simready_usd/ecran_plat_3_1.usd").is_file()
     assert json.loads((tmp_path / "sim/list3r-simready.json").read_text())["format"] == "list3r-simready"

@@ -91,7 +91,7 @@ def test_a_tag_on_a_large_thing_is_on_it() -> None:
     assert place == (500.0, 500.0)
 
 
-def testround_lengths() -> None:
+def test_round_lengths() -> None:
     assert [round_length(v) for v in (0.9, 1.0, 4.9, 7.0, 23.0)] == pytest.approx([0.5, 1.0, 2.0, 5.0, 20.0])
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from list3r.memory.geometry import rotation_exp
 from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box
 from list3r.memory.relations.predicates import INVERSE, relations
+from list3r.memory.relations.scene import certainty
 from list3r.memory.relations.symmetry import round_axis
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, WALL, Piece, surface
 
@@ -408,3 +409,7 @@ def test_what_shares_no_height_is_near_and_not_next_to() -> None:
     beside = {p for s, p, o in facts([body(1, low, view=None), body(2, level, view=None)]) if (s, o) == (1, 2)}
     assert "near" in apart and "next_to" not in apart
     assert {"near", "next_to"} <= beside
+
+
+def test_what_lies_metres_beyond_a_boundary_is_sure_not_to_hold() -> None:
+    assert certainty(-6.5, 0.015) < 1e-300 < certainty(0.0, 0.015) == 0.5 < certainty(6.5, 0.015) == 1.0

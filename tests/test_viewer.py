@@ -33,6 +33,7 @@ from list3r.viewer.beside import SideBySide
 from list3r.viewer.box_lines import thin_lines
 from list3r.viewer.clouds import FINE, CloudSettings
 from list3r.viewer.link import ViewState
+from list3r.viewer.names import on_page, with_room
 from list3r.viewer.told import described
 from list3r.viewer.world import (
     COLOR_MODES,
@@ -151,6 +152,25 @@ def test_the_path_is_that_of_the_camera(room: Path) -> None:
     with list3r.open(room) as memory:
         path = read_path(memory)
     assert len(path.frame) == 20 and np.allclose(np.diff(path.position[:, 1]), 0.01)
+
+
+@given(st.lists(st.tuples(*[st.integers(-400, 400)] * 2, *[st.integers(10, 90)] * 2), min_size=1, max_size=30))
+def test_names_that_are_shown_do_not_cover_each_other_and_hide_for_no_other_reason(rows: list[tuple[int, ...]]) -> None:
+    told = np.array(rows, float)
+    kept = with_room(told[:, :2], told[:, 2:])
+    low, high = told[:, :2] - told[:, 2:] * [0.5, 1.0], told[:, :2] + told[:, 2:] * [0.5, 0.0]
+    cover = ((low[:, None] < high[None]) & (low[None] < high[:, None])).all(axis=2)
+    assert kept[0]
+    for k in range(1, len(rows)):
+        assert kept[k] != (cover[k, :k] & kept[:k]).any()
+
+
+def test_a_name_stands_where_the_page_draws_the_thing() -> None:
+    T_world_cam = np.eye(4)
+    T_world_cam[:3, 3] = (1.0, 0.0, -2.0)
+    at = on_page(np.array([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 0.0, -3.0]]), T_world_cam, np.pi / 2, 800.0)
+    assert at[:2] == pytest.approx(np.array([[0.0, 0.0], [0.0, 400.0]])) and np.isnan(at[2]).all()
+    assert not with_room(at, np.full((3, 2), 10.0))[2]
 
 
 # ---------------------------------------------------------------------------------------------- links

@@ -18,6 +18,7 @@ from list3r.memory.errors import List3rError
 from list3r.viewer.clouds import CloudSettings, PageClouds, Shown
 from list3r.viewer.layers import Layers, LayerSettings
 from list3r.viewer.link import ViewState
+from list3r.viewer.names import NameSettings, PageNames
 from list3r.viewer.panel import Panel
 from list3r.viewer.serving import HOST, quiet, start_server
 from list3r.viewer.told import described
@@ -37,6 +38,7 @@ class ViewerSettings:
     """The next free one where it is taken."""
     layers: LayerSettings = field(default_factory=LayerSettings)
     clouds: CloudSettings = field(default_factory=CloudSettings)
+    names: NameSettings = field(default_factory=NameSettings)
 
 
 class Viewer:
@@ -110,7 +112,6 @@ class Viewer:
             s, world, unit = self.state, self.world, self.world.unit
             self._layers.highlight(world, s.colors, s.selected, visible=s.points)
             self._layers.boxes(world, s.colors, s.selected, structure=s.structure, visible=s.boxes)
-            self._layers.labels(world, s.selected, visible=s.labels)
             self._layers.path(self.path, s.session, visible=s.path, unit=unit)
             self._layers.changes(world, visible=s.colors == "changes")
             self._layers.clear("relations")
@@ -119,6 +120,8 @@ class Viewer:
             else:
                 self.panel.tell("Click a thing, or search for one.", None)
         self._draw_points()
+        for page in self._open_pages():
+            page.names.draw(self.world, self.state.selected, visible=self.state.labels)
         self.server.gui.configure_theme(dark_mode=self.state.dark, show_share_button=False, show_logo=False)
 
     def _draw_points(self) -> None:
@@ -128,10 +131,13 @@ class Viewer:
             self._drawn = shown
             counts = shown.allowed()
             self.picked = self.world.cloud.part(np.zeros_like(counts), overview(counts, _PICKED_POINTS))
-            open_pages = self.server.get_clients()
-            self._pages = {n: page for n, page in self._pages.items() if n in open_pages}
-            for page in list(self._pages.values()):
+            for page in self._open_pages():
                 page.draw(shown)
+
+    def _open_pages(self) -> list[PageClouds]:
+        there = self.server.get_clients()
+        self._pages = {n: page for n, page in self._pages.items() if n in there}
+        return list(self._pages.values())
 
     def _tell(self, instance_id: int) -> None:
         relations = list(self.memory.relations(subject=instance_id))
@@ -210,10 +216,12 @@ class Viewer:
     def _connected(self, client: viser.ClientHandle) -> None:
         if self._asked:
             self.show(**vars(self._asked.pop()))
-        page = self._pages[client.client_id] = PageClouds(client, self.settings.clouds)
+        names = PageNames(client, self.settings.names)
+        page = self._pages[client.client_id] = PageClouds(client, self.settings.clouds, names)
         client.camera.on_update(page.moved)
         if self._drawn is not None:
             page.draw(self._drawn)
+        names.draw(self.world, self.state.selected, visible=self.state.labels)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64)

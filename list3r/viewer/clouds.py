@@ -12,6 +12,7 @@ import viser
 from numpy.typing import NDArray
 
 from list3r.viewer.box_lines import box_lines
+from list3r.viewer.names import PageNames
 from list3r.viewer.world import ShownCloud, ShownWorld, close_by, color_of, colors, overview
 
 FINE = "/fine"
@@ -69,8 +70,8 @@ class Shown:
 class PageClouds:
     """The points of one page, drawn in its own part of the scene, so that each page gets what it can draw."""
 
-    def __init__(self, client: viser.ClientHandle, settings: CloudSettings) -> None:
-        self._client, self._settings = client, settings
+    def __init__(self, client: viser.ClientHandle, settings: CloudSettings, names: PageNames) -> None:
+        self._client, self._settings, self.names = client, settings, names
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
         self._shown: Shown | None = None
@@ -181,6 +182,7 @@ class PageClouds:
             self._moving = False
             self._draw_detail()
             self._switch(fine=True)
+        self.names.arrange()
 
     def _switch(self, *, fine: bool) -> None:
         """Show one of the two levels; a page that is not slow has the fine one only."""

@@ -1,4 +1,4 @@
-"""What stands in the 3D scene of all pages: boxes, labels, path, and lines of the selected instance."""
+"""What stands in the 3D scene of all pages: boxes, path, and lines of the selected instance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import quat_wxyz_from_rotation
-from list3r.memory.records import Instance, Relation
+from list3r.memory.records import Relation
 from list3r.viewer.box_lines import box_lines
 from list3r.viewer.clouds import FINE
 from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, color_of, colors
@@ -26,8 +26,6 @@ class LayerSettings:
 
     selected_points: int = 100_000
     """Points of the selected thing that are tinted, at most."""
-    most_labels: int = 60
-    """The things seen most have labels."""
     frustums: int = 40
 
 
@@ -71,21 +69,6 @@ class Layers:
             ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in things]
             node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in things], ink)
             self._nodes["boxes"] = [node]
-
-    def labels(self, world: ShownWorld, selected: int | None, *, visible: bool) -> None:
-        """Draw the names of the things seen most, and of the selected one."""
-        self.clear("labels")
-        things = sorted((i for i in world.instances.values() if i.structure is None), key=lambda i: -i.observations)
-        chosen = things[: self._settings.most_labels] if visible else []
-        if selected in world.instances and all(i.id != selected for i in chosen):
-            chosen = [*chosen, world.instances[selected]] if selected is not None else chosen
-        self._nodes["labels"] = [
-            self._scene.add_label(
-                f"{FINE}/labels/{i.id}", f"{i.id} {world.name(i.id)}", position=_top(i), anchor="bottom-center",
-                font_screen_scale=1.2 if i.id == selected else 0.6,
-            )
-            for i in chosen
-        ]  # fmt: skip
 
     def path(self, path: CameraPath, session: int | None, *, visible: bool, unit: float) -> None:
         """Draw the camera's path, through gaps broken, with frustums."""
@@ -176,7 +159,3 @@ class Layers:
             ]
         elif ends:
             self._nodes["measured"] = [self._scene.add_label("/measured/text", text, position=ends[0])]
-
-
-def _top(instance: Instance) -> NDArray[np.float64]:
-    return np.array([*instance.center[:2], instance.aabb[1, 2]])

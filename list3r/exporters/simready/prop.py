@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,8 +69,9 @@ def write_prop(folder: Path, instance: Instance, mesh: InstanceMesh, facts: Prop
 
 
 def prop_name(instance: Instance) -> str:
-    """Return the name of a prop, lower-case letters, digits and underscores, its id at the end."""
-    words = re.sub(r"[^a-z0-9]+", "_", class_token(instance)).strip("_")[:40].strip("_")
+    """Return the name of a prop, lower-case letters without accents, digits and underscores, its id at the end."""
+    plain = unicodedata.normalize("NFKD", class_token(instance)).encode("ascii", "ignore").decode()
+    words = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")[:40].strip("_")
     return f"{words if words[:1].isalpha() else 'instance'}_{instance.id}"
 
 

@@ -197,7 +197,7 @@ class Footprint:
 
 def certainty(margin: float, noise: float) -> float:
     """Return how likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
-    return 1.0 / (1.0 + math.exp(-min(1.7 * margin / max(noise, 1e-12), 700.0)))
+    return 1.0 / (1.0 + math.exp(-max(-700.0, min(1.7 * margin / max(noise, 1e-12), 700.0))))
 
 
 def wall_touched(scene: RelationScene, a: int) -> tuple[float, int] | None:
