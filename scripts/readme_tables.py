@@ -246,6 +246,26 @@ def registration() -> str:
     return _table(["by things alone, homes that nothing was tuned on", *heads, "within 0.1 m and 3 degrees"], rows)
 
 
+def changed() -> str:
+    """Return the table of second sessions after heavy change."""
+    whole, alone = _read("changed-homes")["total"], _read("changed-keyframes")["total"]
+    rows = []
+    for name, t, placed, wrong, others in (
+        ("build and update", whole, whole["placed"], whole["wrong"], "not measured"),
+        (
+            "keyframes alone, at true poses",
+            alone,
+            alone["placed_right"],
+            alone["placed_wrong"],
+            f"{alone['strangers_placed']} of {alone['strangers']}",
+        ),
+    ):
+        off = f"{1000 * t['median_off_m']:.1f} and {1000 * t['worst_off_m']:.1f} mm"
+        rows.append([name, f"{placed} of {t['homes']}", str(wrong), str(t["homes"] - placed - wrong), off, others])
+    heads = ["placed within 0.1 m and 3 degrees", "in a wrong place", "left apart", "off, median and worst"]
+    return _table(["homes that nothing was chosen on", *heads, "placed in another home"], rows)
+
+
 def alignment() -> str:
     """Return the table of the alignment of whole point maps."""
     single, double = _read("alignment"), _read("alignment-double")
@@ -393,6 +413,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "fair": fair,
     "returns": returns,
     "registration": registration,
+    "changed": changed,
     "alignment": alignment,
     "changes": changes,
     "relations": relations,
