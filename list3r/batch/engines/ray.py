@@ -46,7 +46,8 @@ class RayEngine:
         self.window = jobs if jobs is not None else _AHEAD * max(1, fits)
         memory = None if resources.memory_gb is None else math.ceil(resources.memory_gb * _GIB)
         asked = {"num_cpus": resources.cpus, "num_gpus": resources.gpus, "memory": memory, "max_retries": 0}
-        self._work = ray.remote(**{k: v for k, v in asked.items() if v is not None})(run_task)
+        remote: Any = ray.remote
+        self._work = remote(**{k: v for k, v in asked.items() if v is not None})(run_task)
         self._open: dict[Any, BatchJob] = {}
 
     def submit(self, job: BatchJob) -> None:
