@@ -28,7 +28,7 @@ class EvidenceSettings:
     """Share of its surface that another chunk gives to one other instance, to speak against it."""
     min_agreement: float = 0.4
     """Share of the chunks that saw its place and found it too."""
-    least_confidence: float = 0.2
+    least_confidence: float = 0.3
     """What is less probably one thing and all of it is not shown; chosen on walks that the weights were not fitted to,
     where hardly any right one lies below it."""
     weights: ConfidenceWeights = field(default_factory=ConfidenceWeights)
