@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ class RayEngine:
         Raises `OptionError` where it cannot be reached, `MissingPackageError` without Ray.
         """
         try:
-            import ray
+            ray: Any = importlib.import_module("ray")
         except ModuleNotFoundError:
             raise MissingPackageError(
                 "--engine ray takes ray, which is not installed: pip install 'list3r[ray]'"
@@ -46,8 +47,7 @@ class RayEngine:
         self.window = jobs if jobs is not None else _AHEAD * max(1, fits)
         memory = None if resources.memory_gb is None else math.ceil(resources.memory_gb * _GIB)
         asked = {"num_cpus": resources.cpus, "num_gpus": resources.gpus, "memory": memory, "max_retries": 0}
-        remote: Any = ray.remote
-        self._work = remote(**{k: v for k, v in asked.items() if v is not None})(run_task)
+        self._work = ray.remote(**{k: v for k, v in asked.items() if v is not None})(run_task)
         self._open: dict[Any, BatchJob] = {}
 
     def submit(self, job: BatchJob) -> None:
