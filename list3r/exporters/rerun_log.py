@@ -41,10 +41,10 @@ def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
             root = component.name or "world"
             if store.facts.gravity != "unknown":
                 log.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-            for structure in (False, True):
-                members = [i for i in component.instances if bool(i.structure) == structure]
-                for name, group in _groups(members).items():
-                    _log_group(rr, log, f"{root}/{'structure' if structure else 'instances'}/{name}", group, store)
+            for name, group in _groups([i for i in component.instances if not i.structure]).items():
+                _log_group(rr, log, f"{root}/instances/{name}", group, store)
+            for name, group in _groups([i for i in component.instances if i.structure]).items():
+                _log_group(rr, log, f"{root}/structure/{name}", group, store)
             _log_relations(rr, log, root, component, store)
             _log_camera(rr, log, root, component, store)
         log.flush()

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.witness import ChunkViews, Witness, WitnessSettings, witness
+from list3r.association.revisits.whole_chunks.witness import ChunkKeyframes, Witness, WitnessSettings, witness
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
 
@@ -74,7 +74,7 @@ def place_by_all_keyframes(
     measured = [e for e in edges if e.S_v_u.translation.any()]
     if not any(e.accepted for e in measured):
         return []
-    views = ChunkViews(old, s.witness), ChunkViews(new, s.witness)
+    views = ChunkKeyframes(old, s.witness), ChunkKeyframes(new, s.witness)
     centers = np.array([k.T_chunk_cam[:3, 3] for k in old])
     places = [_asked(group, *views) for group in _by_place(measured, centers, s)]
     likely = sorted((p for p in places if p.witness.seen >= s.least_seen), key=lambda p: -p.witness.agreement)
@@ -94,7 +94,7 @@ def contradicted(
     s = settings or AllKeyframesSettings()
     if edge.frames is None:
         return False
-    views = ChunkViews(old, s.witness), ChunkViews(new, s.witness)
+    views = ChunkKeyframes(old, s.witness), ChunkKeyframes(new, s.witness)
     found = witness(edge.S_v_u.as_matrix(), *views, edge.frames)
     return found.seen >= s.least_seen and found.agreement < s.contradicted
 
@@ -122,7 +122,7 @@ def _one_place(a: Sim3, b: Sim3, centers: Array, s: AllKeyframesSettings) -> boo
     return float(turn) <= s.one_place_deg and off <= s.one_place_m
 
 
-def _asked(edges: list[Edge], u: ChunkViews, v: ChunkViews) -> _Place:
+def _asked(edges: list[Edge], u: ChunkKeyframes, v: ChunkKeyframes) -> _Place:
     best = edges[0]
     assert best.frames is not None
     return _Place(edges, witness(best.S_v_u.as_matrix(), u, v, best.frames))

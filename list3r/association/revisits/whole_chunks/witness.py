@@ -59,7 +59,7 @@ class Witness:
     in [0, 1]."""
 
 
-class ChunkViews:
+class ChunkKeyframes:
     """The keyframes of a chunk with depth, as views and as points of the chunk."""
 
     def __init__(self, keyframes: Sequence[Keyframe], settings: WitnessSettings) -> None:
@@ -109,7 +109,7 @@ class ChunkViews:
         return on, judged
 
 
-def witness(T_v_u: Array, u: ChunkViews, v: ChunkViews, frames: tuple[int, int]) -> Witness:
+def witness(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[int, int]) -> Witness:
     """Return what two chunks say of a relation (4, 4) of two keyframes (Frame.index of u and of v), metres."""
     T_u_v = np.linalg.inv(T_v_u)
     shares = []
