@@ -86,7 +86,7 @@ def upright(up: str) -> NDArray[np.float64]:
 
 
 def _write(store: Store, source: Path, found: ImportedMap, R: NDArray[np.float64]) -> ImportReport:
-    library = ConsolidationSettings(evidence=EvidenceSettings(min_frames=0))
+    library = ConsolidationSettings(evidence=EvidenceSettings(min_frames=0, least_confidence=0.0))
     settings = BuildSettings(reconstruction="precomputed", poses="given", up="source", library=library)
     with store.transaction():
         store.facts.created_by = f"list3r {__version__}"
