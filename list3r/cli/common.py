@@ -6,6 +6,7 @@ import contextlib
 import functools
 import inspect
 import math
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import Field, fields, is_dataclass
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 
 import typer
 
-from list3r.cli.terminal import say, tell
+from list3r.cli.terminal import draws, say, tell, write
 from list3r.memory.description.printable import shown
 
 if TYPE_CHECKING:
@@ -157,13 +158,24 @@ def _given(group: Any, name: str, value: Any) -> Any:
     return tuple(value or ()) if several and isinstance(default, tuple) else value
 
 
+_DRAWN_ROWS = 200
+"""Rows of a table that is drawn: half a millisecond of processor time each (docs/decisions/0004)."""
+
+
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
-    """Left-aligned columns under a header; a word where there are no rows."""
-    rows = list(rows)
-    if not rows:
+    """Left-aligned columns under a header; a word where there are no rows. A short table on a terminal is drawn."""
+    told = [[_cell(v) for v in row] for row in rows]
+    if not told:
         say("nothing found")
         return
-    cells = [list(header), *[[_cell(v) for v in row] for row in rows]]
+    if len(told) <= _DRAWN_ROWS and draws(sys.stdout):
+        from list3r.cli.drawing import drawn_table
+
+        table = drawn_table(header, told)
+        if table is not None:
+            write(table)
+            return
+    cells = [list(header), *told]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

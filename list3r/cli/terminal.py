@@ -52,6 +52,12 @@ def tell(*lines: object) -> None:
         sys.stderr.flush()
 
 
+def draws(stream: object) -> bool:
+    """Whether a stream is a terminal that can be drawn on."""
+    isatty = getattr(stream, "isatty", None)
+    return isatty is not None and isatty() and os.environ.get("TERM", "").lower() not in ("dumb", "unknown")
+
+
 def mute() -> None:
     """Give up standard output, so that what is left in its buffer fails nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

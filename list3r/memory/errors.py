@@ -59,7 +59,6 @@ EXTRA_OF_PACKAGE = {
     "numba": "build",
     "av": "build",
     "PIL": "export",
-    "tqdm": "build",
     "threadpoolctl": "build",
     "torch": "colour",
     "pycolmap": "colour",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from list3r.api import SceneMemory
+from list3r.cli.bar import progress_bar
 from list3r.cli.build.progress import build_interrupted, report_lines, watching
 from list3r.cli.common import open_memory, print_table
 from list3r.cli.measure.commands import score_rows
@@ -31,7 +31,7 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     from list3r.pipeline.build import build
 
     request, run = BuildRequest(poses="estimate"), RunOptions(workers=workers, resume=memory.exists())
-    with watching("building", build_interrupted(memory, run.resume), quiet=True) as watch:
+    with watching("building", build_interrupted(memory, run.resume), quiet=quiet) as watch:
         report = build(walk, memory, settings=request, run=run, watch=watch)
     _say(quiet, "\n".join(report_lines(memory, report)))
     with open_memory(memory) as scene:
@@ -43,8 +43,6 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
 
 
 def _render(walk: Path, *, seed: int, frames: int | None, workers: int | None, quiet: bool) -> None:
-    from tqdm import tqdm
-
     from list3r.pipeline.workers import default_workers
     from list3r.simulation.dataset import WalkSettings, write_walk
 
@@ -57,9 +55,15 @@ def _render(walk: Path, *, seed: int, frames: int | None, workers: int | None, q
         raise OptionError(f"{walk} holds another walk; name another folder with --out, or remove it")
     if walk.exists():
         _remove_unfinished(walk)
-    hidden = quiet or not sys.stderr.isatty()
-    with tqdm(unit="frame", desc="rendering", disable=hidden, file=sys.stderr) as bar:
-        write_walk(walk, settings, workers=workers or default_workers(), progress=lambda n: bar.update(n) and None)
+    count, rendered = len(settings.poses()[0]), 0
+    with progress_bar("rendering", "frames", quiet=quiet) as bar:
+
+        def progress(more: int) -> None:
+            nonlocal rendered
+            rendered += more
+            bar.show(rendered, count)
+
+        write_walk(walk, settings, workers=workers or default_workers(), progress=progress)
     done.write_text(json.dumps(made), encoding="utf-8")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.bar import ProgressBar, progress_bar
 from list3r.cli.common import note
 from list3r.cli.terminal import say
 from list3r.pipeline.request import Watch
@@ -29,41 +29,34 @@ def watching(
 
     Ctrl-C ends the command with what `interrupted` says, which is told whether a chunk was finished.
     """
-    from tqdm import tqdm
-
-    tqdm.monitor_interval = 0
     begun = False
-    with tqdm(unit="frame", desc=title, disable=quiet or not sys.stderr.isatty(), file=sys.stderr) as bar:
+    try:
+        with progress_bar(title, "frames", quiet=quiet) as bar:
 
-        def progress(done: int, total: int) -> None:
-            nonlocal begun
-            begun = begun or done > 0
-            show(bar, done, total)
+            def progress(done: int, total: int) -> None:
+                nonlocal begun
+                begun = begun or done > 0
+                bar.show(done, total)
 
-        try:
             yield Watch(progress, looking(bar, title), None if quiet else (lambda line: note(f"note: {line}")), debug)
-        except KeyboardInterrupt:
-            bar.close()
-            note("", interrupted(begun))
-            raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        note("", interrupted(begun))
+        raise typer.Exit(1) from None
 
 
-def show(bar: Any, done: int, total: int) -> None:
-    """Move a progress bar to where the work is."""
-    bar.total = total
-    bar.update(done - bar.n)
-    bar.refresh()
-
-
-def looking(bar: Any, then: str) -> Callable[[str, int, int], None]:
+def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
     """Return what moves a progress bar while a video is looked at before its chunks; then it begins anew as `then`."""
+    now = then
 
     def look(what: str, done: int, total: int) -> None:
-        bar.set_description(f"looking for {what}", refresh=False)
-        show(bar, done, total)
+        nonlocal now
+        if now != what:
+            bar.stage(f"looking for {what}")
+            now = what
+        bar.show(done, total)
         if done == total and what != "names":
-            bar.set_description(then, refresh=False)
-            bar.reset(total)
+            bar.stage(then, "frames")
+            now = then
 
     return look
 

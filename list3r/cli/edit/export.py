@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.bar import progress_bar
 from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, spread
 from list3r.cli.terminal import say
 from list3r.exporters.registry import FORMATS, find_format
@@ -103,17 +104,9 @@ def export(
 
 @contextlib.contextmanager
 def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Any]]:
-    """The option that shows how far a long export is, of formats that tell."""
-    if quiet or not sys.stderr.isatty() or "progress" not in find_format(to).options:
-        yield {}
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn(to), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(to, total=None)
-        yield {"progress": lambda done, total: bar.update(task, completed=done, total=total)}
+    """Show how far an export is: the option by which some formats tell it."""
+    with progress_bar(f"writing {to}", "things", quiet=quiet) as bar:
+        yield {"progress": bar.show} if "progress" in find_format(to).options else {}
 
 
 def _told(size: int) -> str:

@@ -27,6 +27,7 @@ _PACKAGES = (
     ("usd-core", "export --to usd"),
     ("trimesh", "export --to glb"),
     ("typer", "the command line"),
+    ("rich", "tables and progress on a terminal"),
     ("torch", "dense depth of RGB video, networks"),
     ("pycolmap", "RGB video without networks (sfm)"),
     ("transformers", "discovery, tracking, features and free words by networks"),
@@ -39,7 +40,7 @@ _PACKAGES = (
     ("rerun-sdk", "export --to rerun"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
-_NEEDED = {"numpy", "scipy", "networkx", "faiss-cpu", "typer"}
+_NEEDED = {"numpy", "scipy", "networkx", "faiss-cpu", "typer", "rich"}
 """What asking a memory takes; the others come with extras, which a command that lacks one names."""
 _LIBRARIES = (
     ("GL", "Open3D only (apt-get install libgl1 libegl1)"),

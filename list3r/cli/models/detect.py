@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.bar import progress_bar
 from list3r.cli.build import source_options as src
-from list3r.cli.build.progress import show
 from list3r.cli.common import JsonOption, MemoryArgument, only, print_table, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
@@ -51,14 +49,11 @@ def detect(
 
     if source is None and words != src.SourceWords():
         raise OptionError("options that say how a video is read, such as --every, need the video: --source SOURCE")
-    from tqdm import tqdm
-
     from list3r.pipeline.finishing import load_detector, name_things
 
     network, options = load_detector(detector, run.detector_classes), words.options()
-    tqdm.monitor_interval = 0
-    with tqdm(unit="chunk", desc="detecting", disable=json or not sys.stderr.isatty(), file=sys.stderr) as bar:
-        report = name_things(memory, network, source, options, functools.partial(show, bar))
+    with progress_bar("detecting", "chunks", quiet=json) as bar:
+        report = name_things(memory, network, source, options, bar.show)
     if json:
         print_answer([{"memory": str(memory), **report.as_dict()}])
         return

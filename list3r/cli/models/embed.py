@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.bar import progress_bar
 from list3r.cli.common import JsonOption, MemoryArgument, only, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
@@ -34,17 +35,10 @@ def embed(
 
     Example: list3r embed house.l3r --model siglip2
     """
-    from tqdm import tqdm
-
     from list3r.semantics.embedding import embed_memory
 
-    with tqdm(total=1, desc="embed", unit="chunk", disable=None if not json else True) as bar:
-
-        def shown(done: int, total: int) -> None:
-            bar.total, bar.n = total, done
-            bar.refresh()
-
-        report = embed_memory(memory, weights, device, shown, model=model, licence=run.licence)
+    with progress_bar("embedding", "chunks", quiet=json) as bar:
+        report = embed_memory(memory, weights, device, bar.show, model=model, licence=run.licence)
     if json:
         print_answer([vars(report)])
         return
