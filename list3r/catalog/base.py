@@ -42,14 +42,19 @@ class Backend(Protocol):
         """Return one instance."""
         ...
 
-    def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
-        """Return the k instances whose axis-aligned boxes are nearest to a point, the nearest first."""
+    def near(
+        self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
+    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and its k instances whose axis-aligned boxes are nearest to a point, the nearest first.
+
+        None where there is no memory of that name.
+        """
         ...
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> list[CatalogThing]:
-        """Return instances whose axis-aligned boxes meet a box."""
+    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and its instances whose axis-aligned boxes meet a box; None where there is no such memory."""
         ...
 
     def named(

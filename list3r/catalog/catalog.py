@@ -105,7 +105,7 @@ class Catalog:
     def remove(self, name: str) -> None:
         """Forget a memory; its file stays. Raises `CatalogError` where there is none of that name."""
         if not self._backend.drop(printable(name)):
-            raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
+            raise _unknown(name)
 
     def memories(self) -> list[MemoryEntry]:
         """Return all memories by name."""
@@ -115,7 +115,7 @@ class Catalog:
         """Return one memory. Raises `CatalogError` where there is none of that name."""
         found = self._backend.memories([printable(name)])
         if not found:
-            raise UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
+            raise _unknown(name)
         return found[0]
 
     # ------------------------------------------------------------------ questions
@@ -130,13 +130,13 @@ class Catalog:
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
         """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
-        entry, k, filters = self.memory(memory), _count(k), filters or CatalogFilters()
+        k, filters = _count(k), filters or CatalogFilters()
         if (point is None) == (instance_id is None):
             raise OptionError("give a point or an instance to be near to, one of the two")
         at = checked_point(point, "point") if point is not None else self._known(memory, instance_id).box.center
         count, own = k + 8, instance_id
         while True:
-            near = self._backend.near(memory, at.tolist(), count, filters)
+            entry, near = _of(memory, self._backend.near(printable(memory), at.tolist(), count, filters))
             found = [f for f in _by_distance(near, at) if f[1] != own][:k]
             # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
             if len(near) < count or (len(found) == k and found[-1][0] <= aabb_distance(near[-1], at)):
@@ -156,7 +156,7 @@ class Catalog:
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
         """Find the things of one memory whose boxes meet a box or a sphere, those nearest to its middle first."""
-        entry, filters = self.memory(memory), filters or CatalogFilters()
+        filters = filters or CatalogFilters()
         box, sphere = lower is not None and upper is not None, center is not None and radius is not None
         if box == sphere:
             raise OptionError("give one region: a box (lower and upper corner) or a sphere (center and radius)")
@@ -170,7 +170,8 @@ class Catalog:
             assert center is not None and radius is not None
             middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
             low, high = middle - reach, middle + reach
-        met = self._backend.inside(memory, low.tolist(), high.tolist(), filters, MOST_ANSWERS + 1)
+        region = low.tolist(), high.tolist()
+        entry, met = _of(memory, self._backend.inside(printable(memory), *region, filters, MOST_ANSWERS + 1))
         found = _by_distance(met, middle)
         notes = [f"more than {MOST_ANSWERS} things are there; so many are told"] if len(met) > MOST_ANSWERS else []
         rows = (
@@ -264,7 +265,11 @@ class Catalog:
 
     def _known(self, memory: str, instance_id: int | None) -> CatalogThing:
         assert instance_id is not None
-        found = self._backend.thing(memory, instance_id) if 0 <= instance_id <= _LARGEST_ID else None
+        found, name = None, printable(memory)
+        if 0 <= instance_id <= _LARGEST_ID:
+            found = self._backend.thing(name, instance_id)
+            if found is None:  # there is no such memory, or it was taken in anew since it was last asked for
+                found = self._backend.thing(self.memory(name).name, instance_id)
         if found is None:
             raise UnknownIdError(f"the catalogue has no instance {instance_id} in {memory}")
         return found
@@ -311,6 +316,17 @@ class Catalog:
         stale = sorted({m.memory for m in found if m.stale})
         told = [f"{n} has changed since it was catalogued; `list3r catalog add` takes it in again" for n in stale]
         return CatalogAnswers(found, [*notes, *told])
+
+
+def _of(name: str, found: tuple[MemoryEntry, list[CatalogThing]] | None) -> tuple[MemoryEntry, list[CatalogThing]]:
+    """Return what a database found in a memory. Raises `UnknownMemoryError` where there is none of that name."""
+    if found is None:
+        raise _unknown(name)
+    return found
+
+
+def _unknown(name: str) -> UnknownMemoryError:
+    return UnknownMemoryError(f"the catalogue has no memory {name!r}; `list3r catalog list` shows them")
 
 
 def is_stale(entry: MemoryEntry) -> bool | None:

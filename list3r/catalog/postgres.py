@@ -27,10 +27,10 @@ from list3r.catalog.records import (
 )
 from list3r.catalog.sqlite import thing_of, unit_vectors
 
-_ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
-_THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
-_THING_OF_ONE = _THING.replace("m.name", "?::text")
-"""Of the instances of one memory, whose name is given as a value."""
+_ENTRY_FIELDS = fields(MemoryEntry)
+_ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)
+_OF_ONE = "i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
+_THING = f"m.name, {_OF_ONE}"
 _PROBED = 400
 """Candidates that a search for vectors keeps at each step; more finds more and takes longer."""
 _BUILD_MEMORY = "2GB"
@@ -59,7 +59,7 @@ class PostgresBackend:
         """Write a memory in place of what has its name, in one transaction."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
-            names, marks = ", ".join(f.name for f in fields(MemoryEntry)), ", ".join("%s" for _ in fields(MemoryEntry))
+            names, marks = ", ".join(f.name for f in _ENTRY_FIELDS), ", ".join("%s" for _ in _ENTRY_FIELDS)
             statement = (
                 f"INSERT INTO memory ({names}) VALUES ({marks}) ON CONFLICT (name) DO UPDATE SET name = excluded.name "
                 f"RETURNING memory_id, {_ENTRY.replace('m.', 'memory.')}"
@@ -70,7 +70,7 @@ class PostgresBackend:
                 return known
             same = known.revision and known.sha256 == content.entry.sha256
             entry = replace(content.entry, revision=known.revision + (not same))
-            own = ", ".join(f"{f.name} = %s" for f in fields(MemoryEntry))
+            own = ", ".join(f"{f.name} = %s" for f in _ENTRY_FIELDS)
             connection.execute(
                 f"UPDATE memory SET {own}, added_at = now() WHERE memory_id = %s", (*astuple(entry), memory)
             )
@@ -148,32 +148,42 @@ class PostgresBackend:
 
     def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
         """Return one instance."""
-        query = f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? AND i.id = ?"
-        rows = self._rows(query, (memory, self._number(memory), instance_id))
-        return _thing(rows[0]) if rows else None
+        query = f"SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ? AND i.id = ?"
+        rows = self._rows(query, (self._number(memory), instance_id))
+        return _thing((memory, *rows[0])) if rows else None
 
-    def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
-        """Return the k nearest by axis-aligned boxes, through the index of boxes."""
+    def near(
+        self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
+    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and the k nearest by axis-aligned boxes, through the index of boxes."""
         passing, values = filters_sql(filters, "i")
-        query = (
-            f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? AND {passing} "
-            "ORDER BY i.bounds <-> ?::cube LIMIT ?"
-        )
-        asked = (memory, self._number(memory), *values, _corner(point), k)
-        return [_thing(row) for row in self._rows(query, asked)]
+        return self._placed(memory, f"{passing} ORDER BY i.bounds <-> ?::cube LIMIT ?", [*values, _corner(point), k])
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> list[CatalogThing]:
-        """Return instances whose axis-aligned boxes meet a box."""
+    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and its instances whose axis-aligned boxes meet a box."""
         passing, values = filters_sql(filters, "i")
-        query = (
-            f"SELECT {_THING_OF_ONE} FROM instance i WHERE i.memory_id = ? "
-            f"AND i.bounds && ?::cube AND {passing} ORDER BY i.id LIMIT ?"
-        )
         region = f"{_corner(lower)},{_corner(upper)}"
-        asked = (memory, self._number(memory), region, *values, None if limit < 0 else limit)
-        return [_thing(row) for row in self._rows(query, asked)]
+        given = [region, *values, None if limit < 0 else limit]
+        return self._placed(memory, f"i.bounds && ?::cube AND {passing} ORDER BY i.id LIMIT ?", given)
+
+    def _placed(self, memory: str, which: str, values: Sequence[Any]) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and those of its instances that a condition tells, by one way to the server.
+
+        The number that is known of the memory leaves one partition to the plan; where it is gone, it is looked up anew.
+        """
+        chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ? AND {which}) i"
+        query = f"SELECT {_ENTRY}, i.* FROM memory m LEFT JOIN {chosen} ON TRUE WHERE m.memory_id = ?"
+        for _ in range(2):
+            number = self._number(memory)
+            rows = self._rows(query, (number, *values, number)) if number else []
+            if rows:
+                entry = MemoryEntry(*rows[0][: len(_ENTRY_FIELDS)])
+                of_things = (row[len(_ENTRY_FIELDS) :] for row in rows)
+                return entry, [_thing((memory, *row)) for row in of_things if row[0] is not None]
+            self._numbers.pop(memory, None)
+        return None
 
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters

@@ -151,11 +151,18 @@ class SqliteBackend:
         rows = self._rows(f"SELECT {_THING} {_FROM} WHERE {_OF_MEMORY} AND i.id = ?", (memory, instance_id))
         return _thing(rows[0]) if rows else None
 
-    def near(self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters) -> list[CatalogThing]:
-        """Return the k nearest by axis-aligned boxes: of those within a distance that grows until they are enough."""
-        at, reach, farthest = np.asarray(point, np.float64), 1.0, np.inf
+    def near(
+        self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
+    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and the k nearest by axis-aligned boxes."""
+        entry = self.memories([memory])
+        return (entry[0], self._near(memory, np.asarray(point, np.float64), k, filters)) if entry else None
+
+    def _near(self, memory: str, at: NDArray[np.float64], k: int, filters: CatalogFilters) -> list[CatalogThing]:
+        """Return the k nearest: of those within a distance that grows until they are enough."""
+        reach, farthest = 1.0, np.inf
         while True:
-            found = self.inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
+            found = self._inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
             gaps = [_gap(t, at) for t in found]
             if sum(g <= reach for g in gaps) >= k or reach >= farthest:
                 order = sorted(range(len(found)), key=lambda n: (gaps[n], found[n].id))
@@ -176,6 +183,13 @@ class SqliteBackend:
         return float(np.linalg.norm(np.abs(corners - point).max(axis=0))) + 1.0
 
     def inside(
+        self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
+    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+        """Return a memory and its instances whose axis-aligned boxes meet a box."""
+        entry = self.memories([memory])
+        return (entry[0], self._inside(memory, lower, upper, filters, limit)) if entry else None
+
+    def _inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
     ) -> list[CatalogThing]:
         """Return instances whose axis-aligned boxes meet a box; all with a negative limit."""
