@@ -16,7 +16,10 @@ import pytest
 import list3r
 from list3r.cli.app import GROUPS, MODULES, commands
 from list3r.exporters.registry import FORMATS
+from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
+from list3r.memory.records import Relation
 from list3r.memory.store.store import Store
+from list3r.models.presets import PRESETS
 from tests.conftest import write_small_room
 from tests.program import as_user, in_process
 
@@ -124,6 +127,25 @@ def test_list_and_show(room: Path) -> None:
     assert re.search(r"mug \(3\) on table \(2\)", run("show", room, "3"))
 
 
+def test_show_says_of_each_other_thing_what_tells_most(room: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "room.l3r"
+    shutil.copy(room, copy)
+    with Store.open(copy, writable=True) as store, store.transaction():
+        said = [(2, "near", 5), (2, "next_to", 5), (2, "near", 3), (2, "supports", 3)]
+        store.relations.replace(None, [Relation(a, predicate, b, 0.9, 0.1) for a, predicate, b in said])
+    told = [line for line in run("show", copy, "2").splitlines() if "margin" in line]
+    assert [re.sub(r" +confidence.*", "", line).strip() for line in told] == [
+        "table (2) supports mug (3)",
+        "table (2) next to chair (5)",
+    ]
+
+
+def test_the_help_shows_the_choices_there_are() -> None:
+    text = run("build", "--help")
+    for known in (PRESETS, DISCOVERERS, TRACKERS, FEATURES):
+        assert "|".join(known) in text
+
+
 def test_nearest_gives_surface_and_centre_distances(room: Path) -> None:
     first, second = ask("query", "nearest", room, "--point", "1.8,0.1,0.90", "-k", "2")
     assert first["id"] == 3
@@ -204,6 +226,7 @@ complete_words() {
 }
 complete_words query ne
 complete_words export a.l3r --to no
+complete_words build a --preset li
 """
 
 
@@ -214,4 +237,4 @@ def test_bash_completes_commands_and_formats(tmp_path: Path) -> None:
     program.chmod(0o755)
     environment = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
     bash = subprocess.run(["bash"], input=COMPLETING, env=environment, capture_output=True, text=True)
-    assert bash.stdout.split("\n") == ["nearest", "node-link", ""], bash.stderr
+    assert bash.stdout.split("\n") == ["nearest", "node-link", "light", ""], bash.stderr

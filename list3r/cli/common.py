@@ -144,10 +144,16 @@ def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:
         metavar=told.metavar,
         help=told.text,
         show_default=default is not None and default is not False,
+        autocompletion=_choices(told.metavar or ""),
     )
     return inspect.Parameter(
         f.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
     )
+
+
+def _choices(metavar: str) -> Callable[[], list[str]] | None:
+    """Return what a shell completes, of an option that is one of several words."""
+    return metavar.split("|").copy if "|" in metavar and metavar.islower() else None
 
 
 def _given(group: Any, name: str, value: Any) -> Any:

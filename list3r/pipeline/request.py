@@ -49,20 +49,25 @@ class BuildRequest:
     preset: str | None = field(
         default=None,
         metadata=option(
-            "cpu (nothing to fetch), light (small networks, free for any use), paper, or auto (what this machine has)."
+            "cpu: nothing to fetch; light: small networks, free for any use; auto: by what this machine has.",
+            "cpu|light|paper|auto",
         ),
     )
     discovery: str | None = field(
         default=None,
-        metadata=option("What finds things: learned (the default), eomt, mask2former, sam2, sam3 or precomputed."),
+        metadata=option("What finds things; default: learned.", "learned|eomt|mask2former|sam2|sam3|precomputed"),
     )
     tracking: str | None = field(
-        default=None, metadata=option("What follows things from frame to frame: reprojection, sam2, sam3 or edgetam.")
+        default=None,
+        metadata=option("What follows things from frame to frame.", "reprojection|sam2|sam3|edgetam"),
     )
     features: str | None = field(
-        default=None, metadata=option("What describes the look of a thing: geometric, own, dinov2 or dinov3.")
+        default=None,
+        metadata=option(
+            "What describes the look of a thing; default: by the discovery.", "geometric|own|dinov2|dinov3"
+        ),
     )
-    device: str = field(default="auto", metadata=option("Where networks run: cpu, cuda, cuda:1, or auto."))
+    device: str = field(default="auto", metadata=option("Where networks run.", "auto|cpu|cuda|cuda:N"))
     weights: tuple[str, ...] = field(
         default=(),
         metadata=option(
@@ -81,7 +86,10 @@ class BuildRequest:
     )
     poses: str = field(
         default="auto",
-        metadata=option("estimate, given, prior (given, but corrected) or auto (given; prior of phones with depth)."),
+        metadata=option(
+            "The poses. prior: given, but corrected; auto: given if there are any, prior of phones with depth.",
+            "auto|estimate|given|prior",
+        ),
     )
     chunk: int | None = field(
         default=None, metadata=option("Frames in a chunk; default: 100, or what the GPU holds of a network.", "N")
@@ -108,7 +116,10 @@ class RunOptions:
 
     licence: str = field(
         default="research",
-        metadata=option("permissive (nothing non-commercial, gated, copyleft or of own terms), research, or any."),
+        metadata=option(
+            "What weights may be under. permissive: nothing non-commercial, gated, copyleft or of own terms.",
+            "permissive|research|any",
+        ),
     )
     workers: int | None = field(
         default=None, metadata=option("Processes; 0: none beside this one; default: cores, up to 4.", "N")

@@ -59,7 +59,7 @@ def within(
         share = float(inside.mean())
         if share > 0.0:
             away = float(np.linalg.norm(i.center - middle))
-            reason = f"{share:.0%} of its surface is inside"
+            reason = f"{'less than 1%' if share < 0.01 else f'{share:.0%}'} of its surface is inside"
             found.append(Match(i, round(share, 4), distance_to_point(store, i, middle), away, reason))
     return sorted(found, key=lambda m: (-m.score, m.center_distance_m or 0.0, m.instance.id))
 

@@ -13,7 +13,7 @@ from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_tab
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
-    from list3r.memory.records import DetectedLabel, Instance
+    from list3r.memory.records import DetectedLabel, Instance, Relation
 
 
 def register(app: typer.Typer) -> None:
@@ -118,11 +118,12 @@ def show(
     ],
     json: JsonOption = False,
 ) -> None:
-    """Show one instance: where, how big, when seen, its relations.
+    """Show one instance: where, how big, when seen, its relations, to each other the one that tells most.
 
     Example: list3r show house.l3r 12
     """
     from list3r.memory.library.labels import label_source
+    from list3r.queries.path import telling
 
     with open_memory(memory) as scene:
         instance = scene.instance(instance_id)
@@ -151,9 +152,13 @@ def show(
         *(() if track is None else _track_lines(*track, units)),
     ):
         say(f"  {key:11} {value}")
-    for r in relations:
+    most: dict[frozenset[int], Relation] = {}
+    for r in sorted(relations, key=telling):
+        most.setdefault(frozenset((r.subject, r.object)), r)
+    for r in most.values():
+        subject, object_ = (f"{names.get(k, '?')} ({k})" for k in (r.subject, r.object))
         say(
-            f"  {names.get(r.subject, '?')} ({r.subject}) {r.predicate} {names.get(r.object, '?')} ({r.object})"
+            f"  {subject} {r.predicate.replace('_', ' ')} {object_}"
             f"  confidence {r.confidence:.2f}, margin {r.margin:.3f} {units}"
         )
 

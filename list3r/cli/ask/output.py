@@ -32,11 +32,14 @@ Label = Annotated[
     str | None,
     typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these words."),
 ]
-Color = Annotated[str | None, typer.Option("--color", help="Only things of this colour.")]
+Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only things of this colour.")]
 MinSize = Annotated[float | None, typer.Option("--min-size", help="Longest edge at least this.")]
 MaxSize = Annotated[float | None, typer.Option("--max-size", help="Longest edge at most this.")]
 State = Annotated[
-    str | None, typer.Option("--state", help="present, moved, removed, added, unseen, any; else all but removed.")
+    str | None,
+    typer.Option(
+        "--state", metavar="present|moved|removed|added|unseen|any", help="Only these; default: all but removed."
+    ),
 ]
 Component = Annotated[int | None, typer.Option("--component", help="Only this part of a memory in parts.")]
 View = Annotated[int | None, typer.Option("--view", metavar="FRAME", help="What the camera of this frame sees.")]

@@ -129,7 +129,13 @@ class RelationWords:
         str | None, typer.Option("--subject", metavar="ID|WORDS", help="Who stands in the relation.")
     ] = None
     predicate: Annotated[
-        str | None, typer.Option("--predicate", help="on, in, next_to, near, above, left_of, behind, between, ...")
+        str | None,
+        typer.Option(
+            "--predicate",
+            metavar="PREDICATE",
+            help="on, supports, in, contains, above, below, under, next_to, near, attached_to, between; for who looks "
+            "(--from) left_of, right_of, in_front_of, behind.",
+        ),
     ] = None
     object: Annotated[str | None, typer.Option("--object", metavar="ID|WORDS", help="To whom.")] = None
     other: Annotated[str | None, typer.Option("--and", metavar="ID|WORDS", help="The second object of between.")] = None

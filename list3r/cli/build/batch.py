@@ -27,8 +27,10 @@ _RUN = only("licence", "scale_anchor", "detector", "detector_classes")
 class BatchPlace:
     """Where the tasks of a batch run, as options."""
 
-    engine: Annotated[str, typer.Option("--engine", help="What runs the tasks: local or ray.")] = "local"
-    address: Annotated[str | None, typer.Option("--address", help="Of the Ray cluster; default: RAY_ADDRESS.")] = None
+    engine: Annotated[str, typer.Option("--engine", metavar="local|ray", help="What runs the tasks.")] = "local"
+    address: Annotated[
+        str | None, typer.Option("--address", metavar="ADDRESS", help="Of the Ray cluster; default: RAY_ADDRESS.")
+    ] = None
     jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Tasks side by side; default: what fits.")] = (
         None
     )

@@ -22,7 +22,9 @@ MoreArgument = Annotated[
     list[str] | None,
     typer.Argument(metavar="MORE", help="Further video files of the same recording, in order.", show_default=False),
 ]
-Kind = Annotated[str, typer.Option("--kind", help="What the source is: auto, or one of docs/sources.md.")]
+Kind = Annotated[
+    str, typer.Option("--kind", metavar="FORMAT", help="What the source is: auto, or one of docs/sources.md.")
+]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Take every N-th frame.")]
 Frames = Annotated[
     str | None,
@@ -61,7 +63,11 @@ DepthScale = Annotated[
 ]
 Fps = Annotated[
     float | None,
-    typer.Option("--fps", help="Take so many frames a second; of a source without a clock, the rate it was filmed at."),
+    typer.Option(
+        "--fps",
+        metavar="RATE",
+        help="Take so many frames a second; of a source without a clock, the rate it was filmed at.",
+    ),
 ]
 Start = Annotated[float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the first frame.")]
 End = Annotated[float | None, typer.Option("--end", metavar="SECONDS", help="Stop so long after the first frame.")]

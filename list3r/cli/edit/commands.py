@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 IdArgument = Annotated[
     int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
 ]
-AuthorOption = Annotated[str | None, typer.Option("--author", help="Who says so; you, unless told.")]
+AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Who says so; you, unless told.")]
 
 
 def register(app: typer.Typer) -> None:

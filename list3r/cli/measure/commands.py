@@ -54,7 +54,10 @@ class TrajectoryWords:
     ] = "1"
     tolerance: Annotated[float, typer.Option("--tolerance", help="Greatest gap of associated times, seconds.")] = 0.01
     scale: Annotated[
-        str, typer.Option("--scale", help="Of the picture: free, fixed or auto (free for a memory of relative scale).")
+        str,
+        typer.Option(
+            "--scale", metavar="auto|free|fixed", help="Of the picture; auto: free for a memory of relative scale."
+        ),
     ] = "auto"
     plot: PlotOption = None
 

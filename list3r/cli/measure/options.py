@@ -19,7 +19,12 @@ PlotOption = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Also draw a picture: .png, .pdf or .svg.")
 ]
 ScaleOption = Annotated[
-    str, typer.Option("--scale", help="free (Sim(3)), fixed (SE(3)) or auto: free for a memory of relative scale.")
+    str,
+    typer.Option(
+        "--scale",
+        metavar="auto|free|fixed",
+        help="free: Sim(3); fixed: SE(3); auto: free for a memory of relative scale.",
+    ),
 ]
 EveryOption = Annotated[
     int | None,

@@ -34,7 +34,7 @@ def register(app: typer.Typer) -> None:
 @models.command("list")
 def list_models(
     licence: Annotated[
-        str, typer.Option("--licence", help="Show what this profile allows: permissive, research or any.")
+        str, typer.Option("--licence", metavar="permissive|research|any", help="Show what this profile allows.")
     ] = "any",
     json: JsonOption = False,
 ) -> None:

@@ -22,12 +22,12 @@ def register(app: typer.Typer) -> None:
 def embed(
     memory: MemoryArgument,
     *,
-    model: Annotated[str, typer.Option("--model", help="siglip2 or clip.")] = "siglip2",
+    model: Annotated[str, typer.Option("--model", metavar="siglip2|clip", help="Which model.")] = "siglip2",
     weights: Annotated[
         str | None,
         typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
     ] = None,
-    device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto.")] = "auto",
+    device: Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where it runs.")] = "auto",
     run: Annotated[RunOptions, only("licence")],
     json: JsonOption = False,
 ) -> None:

@@ -16,6 +16,8 @@ from list3r.memory.records import Instance, Support
 
 _START: Color = (22, 140, 100)
 _END: Color = (196, 48, 72)
+_WORD_PX = (56, 18)
+"""Room that the word of a mark takes; ends of a path that are nearer have their words on two sides."""
 _LOOP: Color = (118, 84, 190)
 
 
@@ -98,7 +100,8 @@ def draw_camera_path(sheet: Sheet, component: Component) -> None:
             tip = xy[k] + forward * [1.0, -1.0] * 13 * OVERSAMPLING
             sheet.stroke(xy[k], tip, _between(k / max(len(xy) - 1, 1)), 1.5)
         sheet.mark(xy[0], _START, "start", round_mark=True)
-        sheet.mark(xy[-1], _END, "end", round_mark=False)
+        close = np.abs(xy[-1] - xy[0]) < np.array(_WORD_PX) * OVERSAMPLING
+        sheet.mark(xy[-1], _END, "end", round_mark=False, left=bool(close.all()))
 
 
 def draw_tags(sheet: Sheet, things: list[Instance]) -> None:

@@ -41,7 +41,8 @@ def draw_grid(sheet: Sheet, unit: str) -> None:
     if left < x < right and top < y < bottom:
         for dx, dy in ((9 * k, 0), (0, 9 * k)):
             sheet.draw.line([(x - dx, y - dy), (x + dx, y + dy)], fill=INK, width=2 * k)
-        sheet.text((x + 5 * k, y - 4 * k), f"0 {unit}", font_of(11), INK, anchor="ls", halo=True)
+        # Below and left: a camera that starts at the origin has its word at the right.
+        sheet.text((x - 5 * k, y + 4 * k), f"0 {unit}", font_of(11), INK, anchor="ra", halo=True)
 
 
 def draw_axes(sheet: Sheet, remark: str) -> None:

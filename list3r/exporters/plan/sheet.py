@@ -81,13 +81,14 @@ class Sheet:
         ends = [(float(a[0]), float(a[1])), (float(b[0]), float(b[1]))]
         self.draw.line(ends, fill=(*color, 210), width=round(width * OVERSAMPLING))
 
-    def mark(self, xy: NDArray[np.float64], color: Color, word: str, *, round_mark: bool) -> None:
-        """Draw a mark with a word beside it."""
+    def mark(self, xy: NDArray[np.float64], color: Color, word: str, *, round_mark: bool, left: bool = False) -> None:
+        """Draw a mark with a word at its right or left."""
         x, y = (float(v) for v in xy)
         r = 6 * OVERSAMPLING
         shape = self.draw.ellipse if round_mark else self.draw.rectangle
         shape((x - r, y - r, x + r, y + r), fill=color, outline=(255, 255, 255), width=2 * OVERSAMPLING)
-        self.text((x + r * 1.6, y), word, self.text_font, color, anchor="lm", halo=True)
+        aside = -1.6 * r if left else 1.6 * r
+        self.text((x + aside, y), word, self.text_font, color, anchor="rm" if left else "lm", halo=True)
 
     def text(
         self,
