@@ -125,8 +125,9 @@ print("done")
 """
 
 
-def test_work_says_its_stage_how_much_is_done_the_rate_and_the_time_left() -> None:
-    drawn = on_terminal(sys.executable, "-c", WORK)
+@pytest.mark.parametrize("width", [80, 140])
+def test_work_says_its_stage_how_much_is_done_the_rate_and_the_time_left(width: int) -> None:
+    drawn = on_terminal(sys.executable, "-c", WORK, width=width)
     told = ESCAPES.sub("", drawn)
     assert re.search(r"building .*300/1000 frames  \d+\.\d frames/s  0:00:0\d left", told)
     assert "note: [red]the camera[/red]\n" in told

@@ -14,7 +14,7 @@ from rich import box
 from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from list3r.cli.bar import ProgressBar
@@ -23,7 +23,9 @@ _NUMBERS = re.compile(r"[\d\s.,:+-]*|nan|-?inf")
 _GAP = 2
 """Letters between two columns."""
 _LEAST = 12
-"""Letters that a column of words keeps where room is short."""
+"""Letters that a column of words, or a bar, keeps where room is short."""
+_BAR, _WORDS = 40, 62
+"""Letters of a bar at most, and of what stands beside it."""
 
 
 def drawn_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str | None:
@@ -61,8 +63,9 @@ def _without_margin(cells: Sequence[str]) -> list[str]:
 @contextmanager
 def drawn_bar() -> Iterator[ProgressBar]:
     """Draw a bar on standard error, with what is written there above it; gone at the end."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), _Numbers())
     console = Console(stderr=True, highlight=False)
+    width = max(_LEAST, min(_BAR, console.width - _WORDS))
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(width), _Numbers(Column(no_wrap=True)))
     with Progress(*columns, console=console, refresh_per_second=4, transient=True, redirect_stdout=False) as progress:
         # A process that is killed cannot bring the cursor back.
         console.show_cursor(True)
