@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
-from machine import descendants, write_json
+from machine import descendants, two_ray_nodes, write_json
 
 from list3r.batch.sealing import file_hash
 from list3r.simulation.dataset import WalkSettings, write_walk
@@ -62,7 +62,7 @@ def main() -> None:
             reference = reference or _hashes(out)
             continue
         kills = (asked.worker_kills, asked.driver_kills) if name.endswith("killed") else (0, 0)
-        with _cluster() if engine == "ray" else contextlib.nullcontext("") as address:
+        with two_ray_nodes() if engine == "ray" else contextlib.nullcontext("") as address:
             command = [sys.executable, "-m", "list3r", "batch", str(videos), "--out", str(out), "--retries", "100"]
             command += ["--engine", engine, *(["--address", address] if address else []), *jobs]
             found = _run(command, out, kills, random.Random(asked.seed))
@@ -93,19 +93,6 @@ def _videos(folder: Path, asked: argparse.Namespace) -> Path:
             shutil.copytree(first, video)
     (folder / "poisoned.mp4").write_bytes(b"not a video")
     return folder
-
-
-@contextlib.contextmanager
-def _cluster() -> Iterator[str]:
-    """Two Ray nodes of one core each on this machine; the address of the first."""
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    cluster.add_node(num_cpus=1)
-    try:
-        yield cluster.address
-    finally:
-        cluster.shutdown()
 
 
 def _run(command: list[str], out: Path, kills: tuple[int, int], chance: random.Random) -> dict[str, object]:

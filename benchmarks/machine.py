@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
@@ -11,6 +12,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +77,19 @@ def _resident(pid: int) -> float:
     except OSError:
         return 0.0
     return sum(float(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:"))
+
+
+@contextlib.contextmanager
+def two_ray_nodes() -> Iterator[str]:
+    """Two Ray nodes of one core each on this machine; the address of the first."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster.add_node(num_cpus=1)
+    try:
+        yield cluster.address
+    finally:
+        cluster.shutdown()
 
 
 def commit() -> str:

@@ -105,10 +105,10 @@ def build(
     `options` says what is known of the source (intrinsics, depth scale, ...). `settings` says how it is worked on: a
     `BuildRequest` names models or a preset and leaves the rest to the machine, `BuildSettings` decides all.
 
-    Further arguments: `workers`, processes; `resume` goes on with a build that was interrupted; `force` replaces an
-    existing memory. `licence` is what networks may be under: permissive (any use, no account), research
-    (non-commercial, gated and own terms too) or any. `scale_anchor` is a length that is known, `detector` (with
-    `detector_classes`) the file of a box detector that names things.
+    Further arguments: `workers`, processes; `engine`, "ray" for the machines of a cluster at an `address`; `resume`
+    goes on with a build that was interrupted; `force` replaces an existing memory. `licence` is what networks may be
+    under: permissive (any use, no account), research (non-commercial, gated and own terms too) or any. `scale_anchor`
+    is a length that is known, `detector` (with `detector_classes`) the file of a box detector that names things.
     Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`, each with the way to mend it.
 
         >>> list3r.build("walk/", "house.l3r", settings=list3r.BuildRequest(preset="light"), workers=2)

@@ -17,7 +17,7 @@ from list3r.batch.engines.base import TaskResources, make_engine
 from list3r.batch.engines.local import LocalEngine
 from list3r.batch.ledger import Ledger
 from list3r.batch.runner import BatchReport, BatchSettings, run_batch, run_here
-from list3r.batch.sealing import batch_keys, file_hash
+from list3r.batch.sealing import batch_keys, file_hash, seal
 from list3r.batch.storage import Output, fetched, listing
 from list3r.batch.tasks import Asked, BatchTask, read_tasks
 from list3r.batch.work import BatchJob, Outcome, run_task
@@ -25,7 +25,10 @@ from list3r.cli.app import run as list3r
 from list3r.cli.build.source_options import SourceWords
 from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
+from list3r.pipeline.build import build
+from list3r.pipeline.request import BuildRequest, RunOptions
 from list3r.pipeline.workers import TaskPool, WorkerError
+from list3r.pipeline.workers.ray_pool import RayPool
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 ASKED = Asked(lambda fields: replace(SourceWords(), **fields).options())
@@ -274,3 +277,24 @@ def test_ray_makes_the_same_files(folder: Path, built: tuple[Path, BatchReport])
         assert (
             file_hash(folder / "ray" / f"{row.memory}.l3r") == row.sha256 == file_hash(built[0] / f"{row.memory}.l3r")
         )
+
+
+def test_chunks_of_one_video_on_ray_make_the_same_file(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by a path from the folder that the command was given in; what is wrong with a video is said as ever."""
+    pytest.importorskip("ray", reason="ray is not installed (240 MB, ten seconds to start): pip install 'list3r[ray]'")
+    monkeypatch.chdir(folder)
+    request = BuildRequest(chunk=3, overlap=1)
+    hashes = set()
+    for name, run in (("here", RunOptions(workers=0)), ("ray", RunOptions(engine="ray"))):
+        assert build("walk", tmp_path / f"{name}.l3r", settings=request, run=run).chunks == 3
+        hashes.add(seal(tmp_path / f"{name}.l3r", tmp_path / f"{name}.sealed", ("key",), "walk"))
+    assert len(hashes) == 1
+    pool = RayPool(_refused)
+    with pool, pytest.raises(SourceError, match=r"^no such frame$"):
+        list(pool.map([1]))
+
+
+def _refused(task: int) -> None:
+    raise SourceError("no such frame")

@@ -30,6 +30,12 @@ def check_run(run: RunOptions) -> None:
     """Raise `OptionError` for what cannot be done, before hours are spent."""
     if run.workers is not None and run.workers < 0:
         raise OptionError(f"--workers {run.workers}: give how many processes to start, or 0 for none")
+    if run.engine not in ("local", "ray"):
+        raise OptionError(f"--engine {run.engine} is not known; choose local or ray")
+    if run.engine == "ray" and run.workers == 0:
+        raise OptionError("--workers 0 works in this process alone; leave it out with --engine ray, or give 1 or more")
+    if run.engine != "ray" and run.address is not None:
+        raise OptionError(f"--address {run.address} is of a Ray cluster; give it with --engine ray")
     if run.resume and run.force:
         raise OptionError("--resume goes on with what is there and --force gives it up; give one of them")
     if run.scale_anchor is not None:

@@ -128,6 +128,8 @@ def build_live(
     options, how = options or SourceOptions(), live or LiveSettings()
     if options.more:
         raise OptionError("a live source is one; several files together are of recordings")
+    if run.engine != "local":
+        raise OptionError("a live source is worked on as it comes, by this machine; leave out --engine")
     if run.resume:
         raise OptionError("a live source does not come again; --resume is of files, `update` adds a later session")
     if not run.force and memory.is_file() and memory.stat().st_size:

@@ -124,6 +124,15 @@ class RunOptions:
     workers: int | None = field(
         default=None, metadata=option("Processes; 0: none beside this one; default: cores, up to 4.", "N")
     )
+    engine: str = field(
+        default="local",
+        metadata=option(
+            "Where chunks are worked on: local, or ray: on the machines of a cluster, which all see SOURCE at its path."
+        ),
+    )
+    address: str | None = field(
+        default=None, metadata=option("Of the Ray cluster; default: RAY_ADDRESS, else one started here.", "HOST:PORT")
+    )
     scale_anchor: str | None = field(
         default=None,
         metadata=option(
@@ -156,6 +165,8 @@ class RunWords(TypedDict, total=False):
 
     licence: str
     workers: int | None
+    engine: str
+    address: str | None
     scale_anchor: str | None
     detector: Path | None
     detector_classes: Path | None

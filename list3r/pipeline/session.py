@@ -29,7 +29,7 @@ from list3r.models.presets import ModelSelection
 from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
 from list3r.pipeline.chunks.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
-from list3r.pipeline.chunks.joint_windows import joint_windows
+from list3r.pipeline.chunks.joint_windows import ChunkPool, joint_windows
 from list3r.pipeline.chunks.whole_map import map_spans, map_whole, takes_wide_steps
 from list3r.pipeline.finishing import check_run
 from list3r.pipeline.mapping import add_chunk
@@ -206,9 +206,7 @@ def add_chunks(
     watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
-    asked = job.run.workers
-    workers = min(usual_workers(job.settings) if asked is None else asked, plan.left)
-    with OrderedPool(process_parts, workers) as pool, threadpool_limits(1):
+    with _pool(job, plan.left) as pool, threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
         for task, results in zip(plan.tasks(), pool.map(plan.tasks()), strict=True):
             found = [row for part in results for row in part.bad_frames]
@@ -224,6 +222,17 @@ def add_chunks(
         from list3r.association.whole_map.loops import write_revisits
 
         write_revisits(store, session, plan.whole, how.revisits.search.suppress_frames)
+
+
+def _pool(job: Job, left: int) -> ChunkPool:
+    """Return what works on so many chunks: processes of this machine, or a Ray cluster."""
+    asked, settings = job.run.workers, job.settings
+    if job.run.engine == "ray":
+        from list3r.pipeline.workers.ray_pool import RayPool
+
+        gpu = settings.device != "cpu" and uses_networks(settings)
+        return RayPool(process_parts, asked, job.run.address, gpu=gpu)
+    return OrderedPool(process_parts, min(usual_workers(settings) if asked is None else asked, left))
 
 
 def _library_due(chunks: int, how: AssociationSettings) -> bool:
@@ -396,4 +405,9 @@ def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> Bui
 
 def usual_workers(settings: BuildSettings) -> int:
     """Processes unless more are asked for: one where networks run, whose weights each process would hold once more."""
-    return 1 if settings.instance_weights or find_card(settings.reconstruction, "geometry") else default_workers()
+    return 1 if uses_networks(settings) else default_workers()
+
+
+def uses_networks(settings: BuildSettings) -> bool:
+    """Return whether networks work on the chunks."""
+    return bool(settings.instance_weights) or find_card(settings.reconstruction, "geometry") is not None

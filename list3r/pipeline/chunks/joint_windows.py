@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING, TypeAlias
 
 from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
 from list3r.association.revisits.joint_window import JointReconstructor
@@ -17,7 +18,11 @@ from list3r.models.cards import find_card
 from list3r.pipeline.chunks.chunk import ChunkTask, joint_model
 from list3r.pipeline.workers import OrderedPool
 
-Pool = OrderedPool[ChunkTask, tuple[ChunkResult, ...]]
+if TYPE_CHECKING:
+    from list3r.pipeline.workers.ray_pool import RayPool
+
+Results: TypeAlias = tuple[ChunkResult, ...]
+ChunkPool: TypeAlias = "OrderedPool[ChunkTask, Results] | RayPool[ChunkTask, Results]"
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class WindowTask:
     """The same of the other."""
 
 
-def joint_windows(store: Store, session: int, chunk: ChunkTask, pool: Pool) -> JointReconstructor:
+def joint_windows(store: Store, session: int, chunk: ChunkTask, pool: ChunkPool) -> JointReconstructor:
     """What makes joint windows for a session: here, or where its chunks are made if that takes a network."""
     if find_card(chunk.settings.reconstruction, "geometry") is None:
         return RgbdJointReconstructor(_paths(store), {session: chunk.options}, joint_model(chunk))

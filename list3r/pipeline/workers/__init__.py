@@ -1,4 +1,4 @@
-"""Processes of a build and of a batch: `pool` keeps the order of tasks, `tasks` does not, `process` runs in one."""
+"""Processes of a build and of a batch: `pool` and `ray_pool` keep the order of tasks, `tasks` does not."""
 
 from list3r.pipeline.workers.pool import OrderedPool, default_workers
 from list3r.pipeline.workers.tasks import TaskPool

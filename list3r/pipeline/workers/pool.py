@@ -20,6 +20,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
+Job = TypeVar("Job")
 
 DEFAULT_LIMIT = 4
 """Processes started unless more are asked for; each holds one chunk of frames (about 0.4 GB at 640x480)."""
@@ -31,6 +32,19 @@ def default_workers() -> int:
     """Return as many processes as there are cores to run on, at most `DEFAULT_LIMIT`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     return max(1, min(cores, DEFAULT_LIMIT))
+
+
+def in_order(
+    tasks: Iterable[Task], submit: Callable[[Task], Job], outcome: Callable[[Job], Result], most: int
+) -> Iterator[Result]:
+    """Yield the outcomes of tasks in their order; at `most` so many are under way or waiting to be taken."""
+    ahead: deque[Job] = deque()
+    for task in tasks:
+        ahead.append(submit(task))
+        if len(ahead) >= most:
+            yield outcome(ahead.popleft())
+    while ahead:
+        yield outcome(ahead.popleft())
 
 
 class OrderedPool(Generic[Task, Result]):
@@ -62,13 +76,7 @@ class OrderedPool(Generic[Task, Result]):
 
         Raises what the function raised for a task, and `WorkerError` where a process was ended from outside.
         """
-        ahead: deque[WorkerJob] = deque()
-        for task in tasks:
-            ahead.append(self._submit(self._work, task))
-            if len(ahead) > self._workers:
-                yield self._outcome(ahead.popleft())
-        while ahead:
-            yield self._outcome(ahead.popleft())
+        return in_order(tasks, lambda task: self._submit(self._work, task), self._outcome, self._workers + 1)
 
     def ask(self, work: Callable[[Question], Answer], question: Question) -> Answer:
         """Return what another function makes of its argument, after the tasks that are under way."""
