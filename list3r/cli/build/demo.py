@@ -31,7 +31,8 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     from list3r.pipeline.build import build
 
     request, run = BuildRequest(poses="estimate"), RunOptions(workers=workers, resume=memory.exists())
-    with watching("building", build_interrupted(memory, run.resume), quiet=quiet) as watch:
+    interrupted = build_interrupted(memory, run.resume)
+    with watching("building", interrupted, quiet=quiet, notes=False) as watch:
         report = build(walk, memory, settings=request, run=run, watch=watch)
     _say(quiet, "\n".join(report_lines(memory, report)))
     with open_memory(memory) as scene:

@@ -23,9 +23,9 @@ Report = TypeVar("Report", "BuildReport", "UpdateReport")
 
 @contextmanager
 def watching(
-    title: str, interrupted: Callable[[bool], str], *, quiet: bool, debug: Path | None = None
+    title: str, interrupted: Callable[[bool], str], *, quiet: bool, notes: bool = True, debug: Path | None = None
 ) -> Iterator[Watch]:
-    """Show progress in a bar and notes above it.
+    """Show progress in a bar, and notes above it unless they are not wanted.
 
     Ctrl-C ends the command with what `interrupted` says, which is told whether a chunk was finished.
     """
@@ -38,7 +38,8 @@ def watching(
                 begun = begun or done > 0
                 bar.show(done, total)
 
-            yield Watch(progress, looking(bar, title), None if quiet else (lambda line: note(f"note: {line}")), debug)
+            told = (lambda line: note(f"note: {line}")) if notes and not quiet else None
+            yield Watch(progress, looking(bar, title), told, debug)
     except KeyboardInterrupt:
         note("", interrupted(begun))
         raise typer.Exit(1) from None
