@@ -5,7 +5,8 @@ set -euo pipefail
 source="${1:-}"
 [ -z "$source" ] || { shift; [ ! -e "$source" ] || source="$(realpath "$source")"; }
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
-make_environment all
+# The simulated walk has depth: it takes no PyTorch, which is several GB.
+make_environment "$([ -n "$source" ] && echo all || echo build,export,view)"
 out="${LIST3R_OUT:-out}"
 
 use_it() { echo; echo "To use the program in this shell: source $venv/bin/activate"; }
@@ -13,6 +14,7 @@ use_it() { echo; echo "To use the program in this shell: source $venv/bin/activa
 if [ -z "$source" ]; then
     list3r demo --out "$out/demo"
     use_it
+    echo "To look at the memory in the browser: list3r view $out/demo/rooms.l3r"
     exit 0
 fi
 

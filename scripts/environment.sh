@@ -1,5 +1,5 @@
 # Sourced by the other scripts: makes .venv with what they need and puts it first on PATH.
-# Called with the extras to install, such as "all" or "dev". A second call starts in well under a second.
+# Called with the extras to install, such as "build,export" or "dev". A second call starts in well under a second.
 make_environment() {
     extras="$1"
     root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
@@ -22,7 +22,9 @@ make_environment() {
     constraints="$(mktemp)"
     echo "torch==2.13.0" > "$constraints"
     # PyTorch first and under a constraint, so that no other package brings a second build of it.
-    "$venv/bin/python" -m pip install -q --disable-pip-version-check -c "$constraints" torch==2.13.0
+    case ",$extras," in *,all,* | *,dev,* | *,colour,*)
+        "$venv/bin/python" -m pip install -q --disable-pip-version-check -c "$constraints" torch==2.13.0 ;;
+    esac
     "$venv/bin/python" -m pip install -q --disable-pip-version-check -c "$constraints" -e ".${extras:+[$extras]}"
     rm -f "$constraints"
     rm -f "$venv"/.list3r-"$extras"-*
