@@ -12,7 +12,8 @@ import pytest
 import list3r
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.maintenance.scraps import derive_scraps
-from list3r.memory.records import FIRST_SCRAP, ChunkResult, LocalInstance
+from list3r.memory.maintenance.unlisted import derive_unlisted
+from list3r.memory.records import FIRST_SCRAP, FIRST_UNLISTED, ChunkResult, LocalInstance
 from list3r.memory.store.store import Store
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, Piece
 from tests.test_consolidation import add, chunk, content, create, local
@@ -83,6 +84,29 @@ def test_every_question_can_be_asked_of_scraps_too(tmp_path: Path) -> None:
     with list3r.open(path, min_confidence=0.35) as surer:
         assert all(i.confidence >= 0.35 and i.id < FIRST_SCRAP for i in surer.instances(structure=None))
     assert f'"id": {FIRST_SCRAP}' in (tmp_path / "more.json").read_text()
+
+
+def test_what_is_too_unsure_to_be_listed_is_there_for_who_asks(tmp_path: Path) -> None:
+    chunks = [with_unsure_mug(k) for k in range(3)]
+    path = build(tmp_path / "m.l3r", chunks)
+    with list3r.open(path) as plain, list3r.open(path, min_confidence=0.0) as more:
+        listed = {i.id for i in plain.instances(structure=None)}
+        (unsure,) = (i for i in more.instances(structure=None) if i.id not in listed)
+        assert unsure.id >= FIRST_UNLISTED and unsure.confidence < 0.3
+        assert np.allclose(unsure.center, MUG.center, atol=0.03)
+        assert more.nearest(MUG.center, k=1)[0].instance.id == unsure.id and more.relations() == plain.relations()
+        assert len(more.seen(unsure.id).frames) and len(more.support(unsure.id).points)
+    with Store.open(build(tmp_path / "sure.l3r", [chunk(k, LISTED) for k in range(3)])) as store:
+        assert derive_unlisted(store) == []
+
+
+def with_unsure_mug(index: int) -> ChunkResult:
+    """Chunk `index` in which discovery is hardly sure of the mug."""
+    result = chunk(index, [*LISTED, MUG])
+    found = result.library.instances
+    mug = min(found, key=lambda i: float(np.linalg.norm(i.support.points.mean(axis=0) - MUG.center)))
+    told = [replace(i, stability=0.001) if i is mug else i for i in found]
+    return replace(result, library=replace(result.library, instances=tuple(told)))
 
 
 def test_a_memory_with_its_scraps_can_only_be_read(tmp_path: Path) -> None:

@@ -331,6 +331,8 @@ class BestView:
 
 FIRST_SCRAP = 1_000_000_000
 """From this on ids are those of scraps, see `maintenance.scraps`."""
+FIRST_UNLISTED = 1_500_000_000
+"""From this on ids are those of groups that are not listed, see `maintenance.unlisted`."""
 
 
 @dataclass(frozen=True)

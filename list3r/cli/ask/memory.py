@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from bisect import bisect
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -60,7 +61,9 @@ def list_instances(
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
     min_confidence: Annotated[
         float | None,
-        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+        typer.Option(
+            "--min-confidence", help="All that is at least this sure to be one thing, listed or not."
+        ),
     ] = None,
     at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
     json: JsonOption = False,
@@ -70,7 +73,7 @@ def list_instances(
     Example: list3r list house.l3r --min-confidence 0.2
     """
     from list3r.memory.errors import OptionError
-    from list3r.memory.records import FIRST_SCRAP
+    from list3r.memory.records import FIRST_SCRAP, FIRST_UNLISTED
 
     least = min_confidence or 0.0
     if not 0.0 <= least <= 1.0:
@@ -83,6 +86,7 @@ def list_instances(
             found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.units
     kept = [i for i in found if i.confidence >= least]
+    kinds, starts = ("", "scrap", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
     if json:
         print_answer(map(instance_dict, kept), units, total=len(found))
         return
@@ -94,7 +98,7 @@ def list_instances(
             _triple(i.box.size),
             i.confidence,
             i.observations,
-            i.structure or ("dynamic" if i.dynamic else "scrap" if i.id >= FIRST_SCRAP else ""),
+            i.structure or ("dynamic" if i.dynamic else kinds[bisect(starts, i.id)]),
             "" if i.state == "present" else i.state,
         ]
         for i in kept

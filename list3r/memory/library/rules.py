@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +18,7 @@ from list3r.memory.library.settled_poses import HysteresisSettings
 from list3r.memory.merging.moving import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
 from list3r.memory.overlap.planes import place_planes
-from list3r.memory.overlap.summaries import Summaries, cameras_of, light_of, sample_of, world_unit
+from list3r.memory.overlap.summaries import Summaries, cameras_of, is_known, light_of, sample_of, world_unit
 from list3r.memory.overlap.voxels import ShapeSettings
 from list3r.memory.records import ChunkRow
 from list3r.memory.relations.settings import RelationSettings
@@ -145,6 +146,13 @@ WORLD = Fact[World | None]("library", World, None)
 """What the library was derived with; None where it has to be derived as a whole."""
 
 _UNIT, _FLOOR_M = 0.02, 0.03
+_CAMERA_M = 1.4
+"""Height at which people hold a camera; medians of recordings of others are 1.10, 1.42, 1.47 and 1.57 m (TUM
+fr3_cabinet, 7-Scenes RedKitchen, TUM fr2_desk and fr1_xyz)."""
+_CAMERA_SPREAD, _DEPTH_SPREAD = 0.15, 0.3
+"""Standard deviation of the logarithms of that height and of the median depth."""
+_MOST_APART = 2.0
+"""Deviations between what the two tell, beyond which the camera is not held by a person, or the floor is none."""
 _WHITE_L, _CAST = 3.0, 2.0
 """Changes that do not turn one colour name into another for more than borderline cases."""
 
@@ -155,11 +163,13 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
     upright = _upright(store)
     inside = [c for c in chunks if c.component == first]
     unit = world_unit(chunks, summaries)
+    floor = _floor(store, inside, summaries, unit) if upright else None
+    unit = unit if is_known(chunks, summaries) else _by_cameras(store, inside, floor, unit)
     spaces = {store.chunks.feature_space(c.chunk_id) for c in sample_of(chunks)}
     return World(
         unit=unit,
         light=light_of(chunks, summaries),
-        floor=_floor(store, inside, summaries, unit) if upright else None,
+        floor=floor,
         upright=upright,
         first=first,
         chunks=len(chunks),
@@ -192,6 +202,18 @@ def _floor(store: Store, inside: list[ChunkRow], summaries: Summaries, unit: flo
     cameras = cameras_of(store, some).translation
     planes = place_planes([(summaries.planes(c.chunk_id), c.S_world_chunk) for c in some])
     return floor_height(np.array([0.0, 0.0, 1.0]), planes, cameras, unit) if len(cameras) else None
+
+
+def _by_cameras(store: Store, inside: list[ChunkRow], floor: float | None, unit: float) -> float:
+    """Return what a metre is by the depths, which tell `unit`, and by how high over the floor the cameras were."""
+    heights = cameras_of(store, sample_of(inside)).translation[:, 2]
+    height = float(np.median(heights)) - floor if floor is not None and len(heights) else 0.0
+    if height <= 0.0:
+        return unit
+    more = math.log(height / _CAMERA_M / unit)
+    if abs(more) > _MOST_APART * math.hypot(_CAMERA_SPREAD, _DEPTH_SPREAD):
+        return unit
+    return unit * math.exp(more / (1.0 + (_CAMERA_SPREAD / _DEPTH_SPREAD) ** 2))
 
 
 def _stamp(store: Store, s: ConsolidationSettings) -> int:

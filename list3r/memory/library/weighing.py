@@ -74,6 +74,10 @@ class Weighing:
         self._weigh_into(out, groups)
         return out
 
+    def inside(self, group: Group, others: Collection[Group]) -> bool:
+        """Return whether a group that was weighed lies within one of the others."""
+        return any(g in others for g in self._within[group])
+
     def _weigh_into(self, out: Weighed, wanted: Sequence[Group]) -> None:
         region = self._region
         pairs = region.pairs_of(chunks_of(wanted))

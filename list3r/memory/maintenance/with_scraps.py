@@ -9,6 +9,7 @@ import numpy as np
 from list3r.memory.library.rules import WORLD
 from list3r.memory.maintenance.scraps import derive_scraps
 from list3r.memory.maintenance.shown import put_before, store_shown
+from list3r.memory.maintenance.unlisted import derive_unlisted
 from list3r.memory.records import Observation
 from list3r.memory.store.store import Store
 
@@ -22,7 +23,7 @@ def store_with_scraps(store: Store, min_confidence: float) -> Store:
 
 def _take_in(shown: Store, *, min_confidence: float) -> None:
     """Show the file as it is now, with its scraps."""
-    scraps = [s for s in derive_scraps(shown) if s.instance.confidence >= min_confidence]
+    scraps = [s for s in (*derive_scraps(shown), *derive_unlisted(shown)) if s.instance.confidence >= min_confidence]
     listed = [i for i in shown.instances.all() if i.confidence >= min_confidence]
     world, connection = shown.facts[WORLD], shown.connection
     put_before(shown, [*listed, *(s.instance for s in scraps)], "observations", "embeddings")

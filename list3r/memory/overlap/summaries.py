@@ -161,7 +161,7 @@ def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:
 def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> ChunkSummary:
     nodes = store.local_instances.nodes([chunk.chunk_id])
     planes = chunk_planes(nodes)
-    unit = 1.0 if chunk.scale_kind == "metric" else _unit(planes, store, chunk)
+    unit = 1.0 if chunk.scale_kind == "metric" else _unit(store, chunk)
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
     if chunk.scale_kind != "metric":
         shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
@@ -178,22 +178,28 @@ def _without(summary: ChunkSummary, left_out: frozenset[int]) -> ChunkSummary:
     return ChunkSummary(shapes, chunk_planes([]), links, summary.unit, motions)
 
 
-def _unit(planes: Planes, store: Store, chunk: ChunkRow) -> float:
-    placed = [k for k in store.keyframes.of(chunk.chunk_id) if k.descriptor.any()]
-    centers = [k.T_chunk_cam[:3, 3] for k in placed] or [np.zeros(3)]
-    if len(planes.points) == 0:
+def _unit(store: Store, chunk: ChunkRow) -> float:
+    """Return what a metre is in chunk units, by the median depth of what the cameras saw, as discovery reckons it."""
+    samples = store.chunks.samples(chunk.chunk_id)
+    if len(samples.points) == 0:
         return 1.0
-    distance = np.linalg.norm(planes.points[:, None] - np.array(centers)[None], axis=2)
-    return max(float(np.median(distance)) / ROOM_DEPTH_M, 1e-9)
+    T_chunk_cam = samples.T_chunk_cam[np.searchsorted(samples.camera_frames, samples.frame)]
+    depth = np.einsum("ni,ni->n", samples.points - T_chunk_cam[:, :3, 3], T_chunk_cam[:, :3, 2])
+    return max(float(np.median(depth)) / ROOM_DEPTH_M, 1e-9)
+
+
+def is_known(chunks: Iterable[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> bool:
+    """Return whether somebody knows what a metre is in world units: a sensor, or who gave an anchor."""
+    if getattr(summaries, "metre", None) is not None:
+        return True
+    return all(c.scale_kind == "metric" and float(c.S_world_chunk.scale) == 1.0 for c in chunks)
 
 
 def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> float:
     """Return what a metre is in world units: 1 for a metric memory, what an anchor says, or what the distances tell."""
     known = getattr(summaries, "metre", None)
-    if known is not None:
-        return float(known)
-    if all(c.scale_kind == "metric" and float(c.S_world_chunk.scale) == 1.0 for c in chunks):
-        return 1.0
+    if is_known(chunks, summaries):
+        return 1.0 if known is None else float(known)
     units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in sample_of(chunks)]
     return float(np.median(units)) if units else 1.0
 
