@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +160,8 @@ def test_a_side_must_be_clear_of_half_of_the_larger_of_the_two() -> None:
     )
     sides = [r for r in viewed(viewer, small, wide, 0.015) or [] if r.predicate == "left_of"]
     assert 0.2 < sides[0].margin < 0.35
+    unsure = replace(small, position_sigma_m=1e300)
+    assert {r.confidence for r in viewed(viewer, unsure, wide, 0.015) or []} == {0.5}, "nobody knows where it is"
     near = instance(2, (2, 0.4, 0), (0.1, 0.1, 0.1), (1, 1, 1))
     assert not [r for r in viewed(viewer, near, wide, 0.015) or [] if r.predicate in ("left_of", "right_of")]
 

@@ -61,9 +61,7 @@ def list_instances(
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
     min_confidence: Annotated[
         float | None,
-        typer.Option(
-            "--min-confidence", help="All that is at least this sure to be one thing, listed or not."
-        ),
+        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, listed or not."),
     ] = None,
     at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
     json: JsonOption = False,

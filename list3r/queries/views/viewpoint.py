@@ -10,6 +10,7 @@ none is said. The margin is how far the centres lie beyond that bound.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +64,7 @@ def viewed(viewer: Viewpoint, subject: Instance, object: Instance, noise: float)
     ahead = ahead / length
     right = np.cross(ahead, viewer.up)
     sure = [x for x in (subject.position_sigma_m, object.position_sigma_m) if x is not None]
-    spread = float(np.sqrt(noise**2 + sum(x**2 for x in sure)))
+    spread = math.hypot(noise, *sure)
     out = []
     for axis, less, more in ((right, "left_of", "right_of"), (ahead, "in_front_of", "behind")):
         offset = float((subject.center - object.center) @ axis)
