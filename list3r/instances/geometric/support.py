@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ def collect_supports(
     points, rgb, confidence, owner = [], [], [], []
     for candidates, image in zip(proposals, images, strict=True):
         view = views.view(candidates.position)
+        image = _without_rims(image, view.depth, count) if views.reconstruction.depth_noise is not None else image
         mask = (image > 0) & view.confirmed
         single = views.reconstruction.confidence[candidates.position][:: views.stride, :: views.stride]
         points.append(view.points[mask])
@@ -41,6 +43,25 @@ def collect_supports(
         mine = mine[without_fliers(xyz[mine], views.unit)]
         out.append(thin(xyz[mine], colors[mine], sure[mine], views.unit, max_points))
     return out
+
+
+RIM_STEP = 0.02
+"""Step of depth within one pixel, over the depth, at which an outline stands before something farther."""
+RIM_LEAST = 0.3
+"""Least share of its pixels that an instance keeps, else it is nothing but rim and keeps all."""
+
+
+def _without_rims(image: NDArray[np.int32], depth: NDArray[np.float32], count: int) -> NDArray[np.int32]:
+    """Return a label image without the pixels at outlines that stand before something farther.
+
+    Depth computed from pictures compares windows of them. Windows at such an outline hold both surfaces, so that what
+    lies behind is drawn forward and hangs on the instance like a skirt (docs/decisions/0140-metres-and-skirts.md).
+    """
+    label, around = image.astype(np.float32), np.ones((3, 3), np.uint8)
+    inner = (cv2.erode(label, around) == label) & (cv2.dilate(label, around) == label)
+    kept = np.where(inner | (cv2.dilate(depth, around) < depth * (1.0 + RIM_STEP)), image, 0)
+    size, left = (np.bincount(x.ravel(), minlength=count + 1) for x in (image, kept))
+    return np.where(np.isin(image, np.flatnonzero(left < RIM_LEAST * size)), image, kept)
 
 
 FLIER_VOXEL_M = 0.02
