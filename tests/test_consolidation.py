@@ -12,7 +12,7 @@ from list3r.memory.errors import UnknownIdError
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import ConsolidationReport, consolidate
 from list3r.memory.library.identities import assign_ids
-from list3r.memory.library.rules import ConsolidationSettings, settings_of
+from list3r.memory.library.rules import WORLD, ConsolidationSettings, settings_of
 from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.search.graphs import merge_graph, relation_graph
@@ -342,6 +342,23 @@ def test_a_relative_memory_tells_no_centimetres(tmp_path: Path) -> None:
             store.facts.scale_kind = "relative"
         add(store, dataclasses.replace(chunk(0), scale_kind="relative"))
         assert all("cm" not in i.description and " m" not in i.description for i in store.instances.all())
+
+
+@pytest.mark.parametrize(("depth", "metre"), [(2.0, 1.05), (3.0, 1.14), (8.0, 4.0)])
+def test_a_metre_of_a_relative_memory_is_told_by_depths_and_by_the_height_of_the_cameras(
+    tmp_path: Path, depth: float, metre: float
+) -> None:
+    """The cameras are 1.49 m over the floor; where the depths say something else altogether, they alone are heard."""
+    with create(tmp_path / "a.l3r") as store:
+        with store.transaction():
+            store.facts.scale_kind = "relative"
+        result = chunk(0)
+        T = result.T_chunk_cam[0]
+        points = np.tile(T[:3, 3] + depth * T[:3, 2], (len(result.samples.frame), 1)).astype(np.float32)
+        samples = dataclasses.replace(result.samples, points=points, T_chunk_cam=result.T_chunk_cam)
+        add(store, dataclasses.replace(result, scale_kind="relative", samples=samples))
+        world = store.facts[WORLD]
+        assert world is not None and world.unit == pytest.approx(metre, rel=0.02)
 
 
 def test_an_empty_memory_and_an_empty_chunk_are_no_trouble(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from list3r.frames.base import Frame
+from list3r.instances.geometric.support import without_rims
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.library import build_library
 from list3r.instances.settings import InstanceSettings
@@ -53,6 +54,18 @@ def test_boxes_on_a_box_are_things_of_their_own() -> None:
     found = [at(library, 12, T, point) for point in fronts]
     assert all(instance is not None for instance in found)
     assert len({instance.local_id for instance in found if instance is not None}) == 3
+
+
+def test_outlines_before_something_farther_are_left_out() -> None:
+    depth = np.full((40, 40), 2.0, np.float32)
+    depth[10:30, 10:30] = 1.0
+    depth[10:30, 24:30] = 0.9
+    labels = np.zeros((40, 40), np.int32)
+    labels[10:30, 10:24], labels[10:30, 24:30], labels[5, 5:15] = 1, 2, 3
+    kept = without_rims(labels, depth, 3)
+    assert (kept[11:29, 11:24] == 1).all(), "what stands before it takes nothing from it"
+    assert (kept[11:29, 25:29] == 2).all() and not kept[11:29, 24].any() and not kept[11:29, 10].any()
+    assert (kept[5, 5:15] == 3).all(), "hardly more than outline"
 
 
 def test_frames_that_share_their_errors_do_not_confirm_an_edge() -> None:

@@ -25,7 +25,7 @@ def collect_supports(
     points, rgb, confidence, owner = [], [], [], []
     for candidates, image in zip(proposals, images, strict=True):
         view = views.view(candidates.position)
-        image = _without_rims(image, view.depth, count) if views.reconstruction.depth_noise is not None else image
+        image = without_rims(image, view.depth, count) if views.reconstruction.depth_noise is not None else image
         mask = (image > 0) & view.confirmed
         single = views.reconstruction.confidence[candidates.position][:: views.stride, :: views.stride]
         points.append(view.points[mask])
@@ -51,7 +51,7 @@ RIM_LEAST = 0.3
 """Least share of its pixels that an instance keeps, else it is nothing but rim and keeps all."""
 
 
-def _without_rims(image: NDArray[np.int32], depth: NDArray[np.float32], count: int) -> NDArray[np.int32]:
+def without_rims(image: NDArray[np.int32], depth: NDArray[np.float32], count: int) -> NDArray[np.int32]:
     """Return a label image without the pixels at outlines that stand before something farther.
 
     Depth computed from pictures compares windows of them. Windows at such an outline hold both surfaces, so that what

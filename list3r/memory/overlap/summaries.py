@@ -181,11 +181,10 @@ def _without(summary: ChunkSummary, left_out: frozenset[int]) -> ChunkSummary:
 def _unit(store: Store, chunk: ChunkRow) -> float:
     """Return what a metre is in chunk units, by the median depth of what the cameras saw, as discovery reckons it."""
     samples = store.chunks.samples(chunk.chunk_id)
-    if len(samples.points) == 0:
-        return 1.0
     T_chunk_cam = samples.T_chunk_cam[np.searchsorted(samples.camera_frames, samples.frame)]
     depth = np.einsum("ni,ni->n", samples.points - T_chunk_cam[:, :3, 3], T_chunk_cam[:, :3, 2])
-    return max(float(np.median(depth)) / ROOM_DEPTH_M, 1e-9)
+    seen = depth[depth > 0]
+    return float(np.median(seen)) / ROOM_DEPTH_M if len(seen) else 1.0
 
 
 def is_known(chunks: Iterable[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> bool:
