@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import sqlite3
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,26 @@ def test_within_are_the_boxes_that_meet_a_region(catalog: Catalog) -> None:
     met = {m.id for m in catalog.within("random", lower=middle - 1, upper=middle + 1)}
     assert inside <= met
     assert all(aabb_distance(t, middle) > 1 for t in passing(CatalogFilters()) if t.id not in met)
+
+
+def test_places_of_one_memory_are_found_by_the_index_of_memory_and_box(server: PostgresServer) -> None:
+    """Values as they are bound: a number sent as another type than the column's is no condition to that index."""
+    from list3r.catalog.postgres import PostgresBackend
+
+    class Explained(PostgresBackend):
+        def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
+            if "bounds" in query:
+                told = "".join(row[0] for row in super()._rows(f"EXPLAIN {query}", values))
+                plans.append(told)
+            return super()._rows(query, values)
+
+    plans: list[str] = []
+    backend = Explained(server.url)
+    backend.put(content("explained"))
+    assert backend.near("explained", (1.0, 2.0, 3.0), 5, CatalogFilters())
+    backend.drop("explained")
+    backend.close()
+    assert re.search(r"memory_id_bounds_idx.*Index Cond: \(memory_id = \d+\)", plans[0]), plans
 
 
 def test_phrases_find_things_in_one_memory_and_over_all(catalog: Catalog) -> None:

@@ -172,8 +172,10 @@ class PostgresBackend:
         """Return a memory and those of its instances that a condition tells, by one way to the server.
 
         The number that is known of the memory leaves one partition to the plan; where it is gone, it is looked up anew.
+        It is told as what the column is: psycopg sends small numbers as `smallint`, which the index of (memory, box)
+        does not compare, so that it would be gone through over all memories of the partition.
         """
-        chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ? AND {which}) i"
+        chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ?::integer AND {which}) i"
         query = f"SELECT {_ENTRY}, i.* FROM memory m LEFT JOIN {chosen} ON TRUE WHERE m.memory_id = ?"
         for _ in range(2):
             number = self._number(memory)
