@@ -18,6 +18,7 @@ def info(store: Store) -> dict[str, Any]:
         "created_by": store.facts.created_by,
         "scale": store.facts.scale_kind,
         "scale_source": store.facts.scale_source,
+        "units_per_metre": _guessed_metre(store),
         "units": "unit" if store.facts.scale_kind == "relative" else "m",
         "gravity": store.facts.gravity,
         "frames": len(frames),
@@ -36,6 +37,16 @@ def info(store: Store) -> dict[str, Any]:
             for s in store.sessions.all()
         ],
     }
+
+
+def _guessed_metre(store: Store) -> float | None:
+    """Return about how many units a metre is in a memory of relative scale, by depths and the height of the cameras."""
+    if store.facts.scale_kind != "relative":
+        return None
+    from list3r.memory.library.rules import WORLD
+
+    world = store.facts[WORLD]
+    return None if world is None else round(world.unit, 3)
 
 
 def describe_counts(store: Store) -> str:

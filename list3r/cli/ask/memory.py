@@ -48,7 +48,9 @@ def info(
         print_answer([{**report, **chunks}], report.pop("units"))
         return
     for key, value in report.items():
-        if key != "sessions" and (key, value) != ("beside", None):
+        if key == "units_per_metre" and value is not None:
+            say(f"{'a metre is about':20} {value:g} units, by depths and the height of the cameras (a guess)")
+        elif key != "sessions" and (key, value) not in (("beside", None), ("units_per_metre", None)):
             say(f"{key.replace('_', ' '):20} {', '.join(value) if isinstance(value, list) else value}")
     for session in report["sessions"]:
         say(f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}")
