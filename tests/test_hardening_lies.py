@@ -7,6 +7,7 @@ import resource
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -129,6 +130,23 @@ def test_an_edit_refuses_overlaps_of_local_instances_that_are_gone(
     assert "chunk_id, local_id 2, 3 is not in local_instances" in capsys.readouterr().out
     assert run(["merge", str(rich), "2", "5"]) == 2
     assert "local" in capsys.readouterr().err
+
+
+def test_a_lie_about_what_is_not_listed_is_one_line(
+    hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Store.open(rich, writable=True) as store, store.transaction():
+        held = store.library.members.of([c.chunk_id for c in store.chunks.all()])
+        hidden = held[max(held)].first
+        store.library.members.put([replace(m, shown=False) for m in held.values() if m.first == hidden])
+    assert run(["list", str(rich), "--min-confidence", "0"]) == 0
+    with sqlite3.connect(rich) as database:
+        database.execute("UPDATE overlaps SET v = '' WHERE u = 1 AND v = 2")
+        hostile.lies.sign(database)
+    capsys.readouterr()
+    assert run(["list", str(rich), "--min-confidence", "0"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1
 
 
 def test_an_edit_refuses_overlaps_of_a_chunk_that_is_redundant(

@@ -41,6 +41,7 @@ MOST_MB = 1024
 READS = (
     "list --structure",
     "list --at 1",
+    "list --min-confidence 0",
     "show 2",
     "show 3 --json",
     "info --loops",

@@ -40,6 +40,7 @@ def derive_unlisted(store: Store) -> list[Scrap]:
     listed = {g for g in groups if grouping.shown_before.get(g, False)}
     allowed = grouping.constraints.shown(groups, [True] * len(groups))
     hidden = [g for g, may in zip(groups, allowed, strict=True) if may and g not in listed]
+    hidden = [g for g in hidden if all(map(region.takes_part, g))]
     weighing = Weighing(grouping)
     weighed = weighing.weigh_only(hidden)
     rank = {key: n for n, key in enumerate(sorted(key for g in groups for key in g))}

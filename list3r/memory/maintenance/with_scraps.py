@@ -6,11 +6,13 @@ from functools import partial
 
 import numpy as np
 
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.rules import WORLD
 from list3r.memory.maintenance.scraps import derive_scraps
 from list3r.memory.maintenance.shown import put_before, store_shown
 from list3r.memory.maintenance.unlisted import derive_unlisted
 from list3r.memory.records import Observation
+from list3r.memory.store.rows.columns import UNREADABLE
 from list3r.memory.store.store import Store
 
 
@@ -23,7 +25,14 @@ def store_with_scraps(store: Store, min_confidence: float) -> Store:
 
 def _take_in(shown: Store, *, min_confidence: float) -> None:
     """Show the file as it is now, with its scraps."""
-    scraps = [s for s in (*derive_scraps(shown), *derive_unlisted(shown)) if s.instance.confidence >= min_confidence]
+    try:
+        derived = [*derive_scraps(shown), *derive_unlisted(shown)]
+    except MemoryFileError:
+        raise
+    except UNREADABLE as error:
+        what = f"what the chunks of {shown.path} found cannot be put together ({error})"
+        raise MemoryFileError(f"{what}; run `list3r verify` on the file") from error
+    scraps = [s for s in derived if s.instance.confidence >= min_confidence]
     listed = [i for i in shown.instances.all() if i.confidence >= min_confidence]
     world, connection = shown.facts[WORLD], shown.connection
     put_before(shown, [*listed, *(s.instance for s in scraps)], "observations", "embeddings")
