@@ -40,11 +40,15 @@ from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from tests.postgres_server import PostgresServer, running_postgres
 
-SPACE = "benchmark@1/{}"
+SPACE, EVEN = "benchmark@1/{}", "benchmark even@1/{}"
+"""Vectors whose variances fall with their number, as those of learned ones do, and vectors that vary alike in all
+directions, in which a graph of neighbours loses its way."""
 COLORS = ("red", "blue", "green", "white", "black", "grey", "brown", "yellow")
 KINDS = tuple(f"kind{n}" for n in range(400))
 SERVER = "-c shared_buffers=2GB -c max_wal_size=4GB -c max_parallel_maintenance_workers=0"
 """Settings of the server: the second keeps checkpoints rare while it is loaded, the third all work in one process."""
+DECAY = 1.0
+"""How the variances of learned vectors fall: with about this power of their number (Agrawal et al. 2022, alpha-ReQ)."""
 Vectors = NDArray[np.float32]
 
 
@@ -79,8 +83,12 @@ class Growth:
     def __init__(self, url: str, server: PostgresServer | None, asked: argparse.Namespace) -> None:
         self._url, self._server, self._asked = url, server, asked
         self._chance = np.random.default_rng(1)
-        self._looks = self._chance.normal(size=(3000, asked.dimension)).astype(np.float32)
-        self._vectors: list[Vectors] = []
+        self._looks = {
+            name.format(asked.dimension): Looks(asked.dimension, decay, self._chance)
+            for name, decay in ((SPACE, DECAY), (EVEN, 0.0))
+        }
+        self._space, self._even = self._looks
+        self._vectors: list[list[Vectors]] = []
         self._backend = open_backend(url)
         self._catalog = Catalog(self._backend)
         told = ("instances", "dimension", "questions")
@@ -115,28 +123,30 @@ class Growth:
                 began = time.process_time()
                 content = make_content(f"m{n:05d}", self._asked.instances, self._looks, self._chance)
                 made += time.process_time() - began
-                self._vectors.append(content.spaces[0].vectors.astype(np.float16))
+                self._vectors.append([held.vectors.astype(np.float16) for held in content.spaces])
                 self._backend.put(content)
         spent["client_cpu_s"] = round(spent["client_cpu_s"] - made, 1)
         row |= {"loaded": {"memories": missing, **spent}, "bytes": self._bytes(), "put of 1000": self._put(server)}
         for name, ask in self._questions().items():
-            many = self._server is not None or name != "similar, all"
+            many = self._server is not None or not name.startswith("similar, all")
             row[name] = _timed(ask, self._asked.questions if many else 5, server)
             print(count, name, row[name], flush=True)
-        row["recall@10, similar, all"] = self._recall()
+        row["recall@10, similar, all"] = self._recall(self._space, 0)
+        row["recall@10, similar, all, even"] = self._recall(self._even, 1)
         row["load_average"] = round(os.getloadavg()[0], 1)
         return row
 
     def _put(self, server: int) -> dict[str, float]:
         """Add a memory of 1,000 three times, each of other things."""
-        contents = [make_content(f"small{n}", 1000, self._looks, self._chance) for n in range(3)]
+        looks = {self._space: self._looks[self._space]}
+        contents = [make_content(f"small{n}", 1000, looks, self._chance) for n in range(3)]
         found = _timed(lambda n: self._backend.put(contents[n]), 3, server, warm=0)
         for content in contents:
             self._backend.drop(content.entry.name)
         return found
 
     def _questions(self) -> dict[str, Callable[[int], object]]:
-        catalog, chance, space = self._catalog, np.random.default_rng(2), SPACE.format(self._asked.dimension)
+        catalog, chance, space, even = self._catalog, np.random.default_rng(2), self._space, self._even
 
         def point() -> NDArray[np.float64]:
             return chance.uniform(0, 10, 3)
@@ -153,17 +163,18 @@ class Growth:
             "similar, one memory": lambda n: catalog.similar(
                 self._name(n), instance_id=n % 100, space=space, anywhere=False, k=10
             ),
-            "similar, all": lambda n: catalog.similar(vector=_near(self._looks, n), space=space, k=10),
+            "similar, all": lambda n: catalog.similar(vector=self._looks[space].near(n), space=space, k=10),
+            "similar, all, even": lambda n: catalog.similar(vector=self._looks[even].near(n), space=even, k=10),
             "relations, one memory": lambda n: catalog.relations(self._name(n), subject=KINDS[n % 400], k=10),
         }
 
-    def _recall(self) -> float:
+    def _recall(self, space: str, number: int) -> float:
         """Share of the true ten that are found, over 50 questions."""
-        hits, size, space = 0, self._asked.instances, SPACE.format(self._asked.dimension)
-        for n in range(50):
-            query = _near(self._looks, n)
-            cosine = np.concatenate([v.astype(np.float32) @ query for v in self._vectors])
-            truth = {(f"m{k // size:05d}", k % size) for k in np.argpartition(-cosine, 10)[:10].tolist()}
+        size, queries = self._asked.instances, np.array([self._looks[space].near(n) for n in range(50)])
+        cosine = np.concatenate([queries @ v[number].astype(np.float32).T for v in self._vectors], axis=1)
+        hits = 0
+        for query, best in zip(queries, np.argpartition(-cosine, 10, axis=1)[:, :10].tolist(), strict=True):
+            truth = {(f"m{k // size:05d}", k % size) for k in best}
             hits += len(truth & {(m.memory, m.id) for m in self._catalog.similar(vector=query, space=space, k=10)})
         return hits / 500
 
@@ -241,7 +252,7 @@ class Growth:
         n = int(chance.integers(1_000_000))
         near = catalog.nearest(self._name(n), point=chance.uniform(0, 10, 3), k=10)
         named = catalog.find(KINDS[n % 400], k=10)
-        alike = catalog.similar(vector=_near(self._looks, n), space=SPACE.format(self._asked.dimension), k=10)
+        alike = catalog.similar(vector=self._looks[self._space].near(n), space=self._space, k=10)
         if len(near) != 10 or not named or len(alike) != 10:
             raise CatalogError(f"answers are missing: {len(near)}, {len(named)}, {len(alike)}")
 
@@ -251,12 +262,12 @@ class Growth:
 
         def answers() -> list[object]:
             near = [list(self._catalog.nearest(n, point=(5, 5, 5), k=20)) for n in names]
-            space = SPACE.format(self._asked.dimension)
-            alike = [list(self._catalog.similar(vector=_near(self._looks, n), space=space)) for n in range(5)]
+            looks, space = self._looks[self._space], self._space
+            alike = [list(self._catalog.similar(vector=looks.near(n), space=space)) for n in range(5)]
             return [*near, *alike, self._catalog.memories()]
 
         before, said = answers(), list[str]()
-        content = make_content("cut off", 4000, self._looks, self._chance)
+        content = make_content("cut off", 20_000, self._looks, self._chance)
 
         def write() -> None:
             backend = open_backend(self._url)
@@ -303,7 +314,27 @@ class Growth:
         return f"m{n * 7919 % len(self._vectors):05d}"
 
 
-def make_content(name: str, count: int, looks: Vectors, chance: np.random.Generator) -> MemoryContent:
+class Looks:
+    """Vectors of one space: 3,000 kinds of look, and those of things about them."""
+
+    def __init__(self, dimension: int, decay: float, chance: np.random.Generator) -> None:
+        """Let the variance of the n-th number be n to the power of -decay."""
+        self._spread = np.arange(1, dimension + 1) ** (-decay / 2)
+        self._kinds = chance.normal(size=(3000, dimension)) * self._spread
+
+    def of(self, count: int, chance: np.random.Generator) -> Vectors:
+        """Return the vectors of so many things, of unit length."""
+        kinds = self._kinds[chance.integers(0, len(self._kinds), count)]
+        vectors = kinds + 0.5 * self._spread * chance.normal(size=kinds.shape)
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
+
+    def near(self, number: int) -> Vectors:
+        """Return a look with noise of its own, the same for the same number."""
+        noise = np.random.default_rng(number).normal(size=len(self._spread))
+        return np.asarray(self._kinds[number % len(self._kinds)] + 0.5 * self._spread * noise, np.float32)
+
+
+def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.random.Generator) -> MemoryContent:
     """A memory of things of random places, names, looks and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
@@ -317,19 +348,11 @@ def make_content(name: str, count: int, looks: Vectors, chance: np.random.Genera
     relations = [
         (int(a), "on" if k % 2 else "near", int(b), 0.8, 0.1) for k, (a, b) in enumerate(np.unique(pairs, axis=0))
     ]
-    vectors = looks[chance.integers(0, len(looks), count)] + 0.5 * chance.normal(size=(count, looks.shape[1]))
-    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     entry = MemoryEntry(
         name, f"/nowhere/{name}.l3r", 0, f"{chance.integers(2**60):x}", 1, 0, "metric", "known", count, 1
     )
-    space = SpaceVectors(SPACE.format(looks.shape[1]), np.arange(count), vectors)
-    return MemoryContent(entry, things, relations, [space])
-
-
-def _near(looks: Vectors, n: int) -> Vectors:
-    """A look with noise of its own, the same for the same number."""
-    noise = np.random.default_rng(n).normal(size=looks.shape[1])
-    return np.asarray(looks[n % len(looks)] + 0.5 * noise, np.float32)
+    spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in looks.items()]
+    return MemoryContent(entry, things, relations, spaces)
 
 
 @contextlib.contextmanager
