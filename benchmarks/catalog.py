@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from list3r.catalog.base import open_backend
 from list3r.catalog.catalog import Catalog
 from list3r.catalog.records import (
+    CatalogAnswers,
     CatalogError,
     CatalogFilters,
     CatalogThing,
@@ -40,15 +41,19 @@ from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from tests.postgres_server import PostgresServer, running_postgres
 
-SPACE, EVEN = "benchmark@1/{}", "benchmark even@1/{}"
-"""Vectors whose variances fall with their number, as those of learned ones do, and vectors that vary alike in all
-directions, in which a graph of neighbours loses its way."""
+SPACES = {
+    "benchmark@1/{}": (1.0, 3000),
+    "benchmark even@1/{}": (0.0, 3000),
+    "benchmark lone@1/{}": (1.0, 0),
+}
+"""Vectors, by how their variances fall and how many kinds of look there are. Of learned ones the variance of the n-th
+number is about 1 / n (Agrawal et al. 2022, alpha-ReQ), and things of one kind lie together: the first. Beside it such
+as vary alike in all directions, in which a graph of neighbours loses its way, and such as lie nowhere together, which
+lists divide badly."""
 COLORS = ("red", "blue", "green", "white", "black", "grey", "brown", "yellow")
 KINDS = tuple(f"kind{n}" for n in range(400))
 SERVER = "-c shared_buffers=2GB -c max_wal_size=4GB -c max_parallel_maintenance_workers=0"
 """Settings of the server: the second keeps checkpoints rare while it is loaded, the third all work in one process."""
-DECAY = 1.0
-"""How the variances of learned vectors fall: with about this power of their number (Agrawal et al. 2022, alpha-ReQ)."""
 Vectors = NDArray[np.float32]
 
 
@@ -84,10 +89,9 @@ class Growth:
         self._url, self._server, self._asked = url, server, asked
         self._chance = np.random.default_rng(1)
         self._looks = {
-            name.format(asked.dimension): Looks(asked.dimension, decay, self._chance)
-            for name, decay in ((SPACE, DECAY), (EVEN, 0.0))
+            name.format(asked.dimension): Looks(asked.dimension, *how, self._chance) for name, how in SPACES.items()
         }
-        self._space, self._even = self._looks
+        self._space, self._even, self._lone = self._looks
         self._vectors: list[list[Vectors]] = []
         self._backend = open_backend(url)
         self._catalog = Catalog(self._backend)
@@ -133,6 +137,7 @@ class Growth:
             print(count, name, row[name], flush=True)
         row["recall@10, similar, all"] = self._recall(self._space, 0)
         row["recall@10, similar, all, even"] = self._recall(self._even, 1)
+        row["recall@10, similar, all, lone"] = self._recall(self._lone, 2)
         row["load_average"] = round(os.getloadavg()[0], 1)
         return row
 
@@ -146,7 +151,7 @@ class Growth:
         return found
 
     def _questions(self) -> dict[str, Callable[[int], object]]:
-        catalog, chance, space, even = self._catalog, np.random.default_rng(2), self._space, self._even
+        catalog, chance, space = self._catalog, np.random.default_rng(2), self._space
 
         def point() -> NDArray[np.float64]:
             return chance.uniform(0, 10, 3)
@@ -163,19 +168,23 @@ class Growth:
             "similar, one memory": lambda n: catalog.similar(
                 self._name(n), instance_id=n % 100, space=space, anywhere=False, k=10
             ),
-            "similar, all": lambda n: catalog.similar(vector=self._looks[space].near(n), space=space, k=10),
-            "similar, all, even": lambda n: catalog.similar(vector=self._looks[even].near(n), space=even, k=10),
+            "similar, all": lambda n: self._alike(space, n),
+            "similar, all, even": lambda n: self._alike(self._even, n),
+            "similar, all, lone": lambda n: self._alike(self._lone, n),
             "relations, one memory": lambda n: catalog.relations(self._name(n), subject=KINDS[n % 400], k=10),
         }
+
+    def _alike(self, space: str, n: int) -> CatalogAnswers:
+        return self._catalog.similar(vector=self._looks[space].near(n), space=space, k=10)
 
     def _recall(self, space: str, number: int) -> float:
         """Share of the true ten that are found, over 50 questions."""
         size, queries = self._asked.instances, np.array([self._looks[space].near(n) for n in range(50)])
         cosine = np.concatenate([queries @ v[number].astype(np.float32).T for v in self._vectors], axis=1)
         hits = 0
-        for query, best in zip(queries, np.argpartition(-cosine, 10, axis=1)[:, :10].tolist(), strict=True):
+        for n, best in enumerate(np.argpartition(-cosine, 10, axis=1)[:, :10].tolist()):
             truth = {(f"m{k // size:05d}", k % size) for k in best}
-            hits += len(truth & {(m.memory, m.id) for m in self._catalog.similar(vector=query, space=space, k=10)})
+            hits += len(truth & {(m.memory, m.id) for m in self._alike(space, n)})
         return hits / 500
 
     def _from_files(self) -> dict[str, Any]:
@@ -262,8 +271,7 @@ class Growth:
 
         def answers() -> list[object]:
             near = [list(self._catalog.nearest(n, point=(5, 5, 5), k=20)) for n in names]
-            looks, space = self._looks[self._space], self._space
-            alike = [list(self._catalog.similar(vector=looks.near(n), space=space)) for n in range(5)]
+            alike = [list(self._alike(self._space, n)) for n in range(5)]
             return [*near, *alike, self._catalog.memories()]
 
         before, said = answers(), list[str]()
@@ -315,23 +323,24 @@ class Growth:
 
 
 class Looks:
-    """Vectors of one space: 3,000 kinds of look, and those of things about them."""
+    """Vectors of one space: things about some kinds of look, or each of a look of its own where there are none."""
 
-    def __init__(self, dimension: int, decay: float, chance: np.random.Generator) -> None:
+    def __init__(self, dimension: int, decay: float, kinds: int, chance: np.random.Generator) -> None:
         """Let the variance of the n-th number be n to the power of -decay."""
         self._spread = np.arange(1, dimension + 1) ** (-decay / 2)
-        self._kinds = chance.normal(size=(3000, dimension)) * self._spread
+        self._kinds = chance.normal(size=(kinds, dimension)) * self._spread if kinds else np.zeros((1, dimension))
 
     def of(self, count: int, chance: np.random.Generator) -> Vectors:
         """Return the vectors of so many things, of unit length."""
-        kinds = self._kinds[chance.integers(0, len(self._kinds), count)]
-        vectors = kinds + 0.5 * self._spread * chance.normal(size=kinds.shape)
-        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
+        return self._about(chance.integers(0, len(self._kinds), count), chance)
 
     def near(self, number: int) -> Vectors:
-        """Return a look with noise of its own, the same for the same number."""
-        noise = np.random.default_rng(number).normal(size=len(self._spread))
-        return np.asarray(self._kinds[number % len(self._kinds)] + 0.5 * self._spread * noise, np.float32)
+        """Return the vector of a thing, the same for the same number."""
+        return self._about(np.array([number % len(self._kinds)]), np.random.default_rng(number))[0]
+
+    def _about(self, kinds: NDArray[np.int64], chance: np.random.Generator) -> Vectors:
+        vectors = self._kinds[kinds] + 0.5 * self._spread * chance.normal(size=(len(kinds), len(self._spread)))
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
 
 
 def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.random.Generator) -> MemoryContent:

@@ -21,7 +21,7 @@ _SILENT_S = 20
 _PLANS = "-c jit=off -c enable_partitionwise_join=on -c max_parallel_workers_per_gather=0"
 """How questions are planned: relations are joined within each partition, where the rows of a memory lie, in place of
 reading them all; many small questions share the processors better than one that takes several."""
-_VECTORS = "-c ivfflat.probes=30 -c ivfflat.iterative_scan=relaxed_order -c work_mem=16MB"
+_VECTORS = "-c ivfflat.probes=40 -c ivfflat.iterative_scan=relaxed_order -c work_mem=16MB"
 """How vectors are searched: so many lists, and as many more where they hold too few; all that is there is sorted."""
 
 
