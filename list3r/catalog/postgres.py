@@ -131,8 +131,8 @@ class PostgresBackend:
         with self._connected(_WRITTEN) as connection, _unhurried(connection):
             for (n,) in connection.execute("SELECT space_id FROM space ORDER BY space_id").fetchall():
                 _keep_index(connection, n)
-            if many:  # from then on relations are read from their indices alone
-                connection.execute("VACUUM (ANALYZE)")
+            if many:
+                connection.execute("ANALYZE")
 
     # ------------------------------------------------------------------ asking
 
