@@ -494,7 +494,7 @@ def test_a_full_disk_of_the_server_is_told_and_changes_nothing() -> None:
             backend.put(content("kept"))
             before = catalog.find("mug", "kept", k=50), catalog.memories()
             with pytest.raises(CatalogError, match="No space left on device") as told:
-                backend.put(content("more", count=15_000))
+                backend.put(content("more", count=30_000))
             assert "nothing was changed" in str(told.value) and "\n" not in str(told.value)
             assert (catalog.find("mug", "kept", k=50), catalog.memories()) == before
             subprocess.run(["mount", "-o", "remount,size=96m", str(disk)], check=True)
