@@ -78,9 +78,10 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
 
 
 def exposed(T_world_cam: Array, k: int, fps: float, exposure_s: float, count: int = 7) -> list[Array]:
-    """Return the poses during the exposure of frame k, on its way to the next one. Shape (4, 4) each."""
-    T, after = T_world_cam[k], T_world_cam[min(k + 1, len(T_world_cam) - 1)]
-    return [_mixed(T, after, s) for s in np.linspace(0.0, exposure_s * fps, count)]
+    """Return the poses during the exposure in whose middle frame k was taken. Shape (4, 4) each."""
+    before, T, after = (T_world_cam[min(max(j, 0), len(T_world_cam) - 1)] for j in (k - 1, k, k + 1))
+    shares = np.linspace(-0.5, 0.5, count) * exposure_s * fps
+    return [_mixed(T, before if s < 0 else after, abs(s)) for s in shares]
 
 
 def _bare_wall(walk: WalkSettings, scene: SolidScene, here: Array, blind: BlindSettings) -> tuple[Array, Array]:
