@@ -241,7 +241,7 @@ class CameraTracker:
         s, view = self.settings, self.view(position)
         found = register(samples, view, T_guess, s.registration, s.noise, prior)
         if found is not None and not blind:
-            mover = find_mover(samples, view, T_guess, found, s)
+            mover = find_mover(samples, view, T_guess, found, s, prior)
             if mover is not None and self._trusted(mover[1], samples, position, blind):
                 self._moving[position] = self._moving.get(position, np.zeros_like(mover[0])) | mover[0]
                 found = mover[1]
