@@ -90,6 +90,14 @@ def test_frames_without_light_and_depth_follow_the_prior(frames: list[Frame], tr
     assert RgbdReconstructor(poses="estimate")(seen, CAMERA).posed.tolist() == [not 3 <= k < 7 for k in range(15)]
 
 
+def test_a_jump_without_light_is_told_afterwards(frames: list[Frame], truth: np.ndarray) -> None:
+    dark = range(JUMP - 3, JUMP + 3)
+    seen = [lightless(f) if k in dark else f for k, f in enumerate(frames)]
+    made = RgbdReconstructor(poses="prior")(seen, CAMERA)
+    assert made.posed.tolist() == [k not in dark for k in range(15)]
+    assert pose_errors(made.T_chunk_cam[made.posed], truth[made.posed])[0].max() < 0.015
+
+
 def test_frames_without_light_at_which_poses_jump_have_none(truth: np.ndarray) -> None:
     given, posed, settings = imperfect(truth), np.ones(len(truth), bool), PriorSettings()
     posed[JUMP - 2 : JUMP + 2] = False
