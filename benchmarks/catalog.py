@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from list3r.catalog.base import open_backend
 from list3r.catalog.catalog import Catalog
 from list3r.catalog.records import (
+    CatalogAnswers,
     CatalogError,
     CatalogFilters,
     CatalogThing,
@@ -40,7 +41,15 @@ from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from tests.postgres_server import PostgresServer, running_postgres
 
-SPACE = "benchmark@1/{}"
+SPACES = {
+    "benchmark@1/{}": (1.0, 3000),
+    "benchmark even@1/{}": (0.0, 3000),
+    "benchmark lone@1/{}": (1.0, 0),
+}
+"""Vectors, by how their variances fall and how many kinds of look there are. Of learned ones the variance of the n-th
+number is about 1 / n (Agrawal et al. 2022, alpha-ReQ), and things of one kind lie together: the first. Beside it such
+as vary alike in all directions, in which a graph of neighbours loses its way, and such as lie nowhere together, which
+lists divide badly."""
 COLORS = ("red", "blue", "green", "white", "black", "grey", "brown", "yellow")
 KINDS = tuple(f"kind{n}" for n in range(400))
 SERVER = "-c shared_buffers=2GB -c max_wal_size=4GB -c max_parallel_maintenance_workers=0"
@@ -79,8 +88,11 @@ class Growth:
     def __init__(self, url: str, server: PostgresServer | None, asked: argparse.Namespace) -> None:
         self._url, self._server, self._asked = url, server, asked
         self._chance = np.random.default_rng(1)
-        self._looks = self._chance.normal(size=(3000, asked.dimension)).astype(np.float32)
-        self._vectors: list[Vectors] = []
+        self._looks = {
+            name.format(asked.dimension): Looks(asked.dimension, *how, self._chance) for name, how in SPACES.items()
+        }
+        self._space, self._even, self._lone = self._looks
+        self._vectors: list[list[Vectors]] = []
         self._backend = open_backend(url)
         self._catalog = Catalog(self._backend)
         told = ("instances", "dimension", "questions")
@@ -115,28 +127,31 @@ class Growth:
                 began = time.process_time()
                 content = make_content(f"m{n:05d}", self._asked.instances, self._looks, self._chance)
                 made += time.process_time() - began
-                self._vectors.append(content.spaces[0].vectors.astype(np.float16))
+                self._vectors.append([held.vectors.astype(np.float16) for held in content.spaces])
                 self._backend.put(content)
         spent["client_cpu_s"] = round(spent["client_cpu_s"] - made, 1)
         row |= {"loaded": {"memories": missing, **spent}, "bytes": self._bytes(), "put of 1000": self._put(server)}
         for name, ask in self._questions().items():
-            many = self._server is not None or name != "similar, all"
+            many = self._server is not None or not name.startswith("similar, all")
             row[name] = _timed(ask, self._asked.questions if many else 5, server)
             print(count, name, row[name], flush=True)
-        row["recall@10, similar, all"] = self._recall()
+        row["recall@10, similar, all"] = self._recall(self._space, 0)
+        row["recall@10, similar, all, even"] = self._recall(self._even, 1)
+        row["recall@10, similar, all, lone"] = self._recall(self._lone, 2)
         row["load_average"] = round(os.getloadavg()[0], 1)
         return row
 
     def _put(self, server: int) -> dict[str, float]:
         """Add a memory of 1,000 three times, each of other things."""
-        contents = [make_content(f"small{n}", 1000, self._looks, self._chance) for n in range(3)]
+        looks = {self._space: self._looks[self._space]}
+        contents = [make_content(f"small{n}", 1000, looks, self._chance) for n in range(3)]
         found = _timed(lambda n: self._backend.put(contents[n]), 3, server, warm=0)
         for content in contents:
             self._backend.drop(content.entry.name)
         return found
 
     def _questions(self) -> dict[str, Callable[[int], object]]:
-        catalog, chance, space = self._catalog, np.random.default_rng(2), SPACE.format(self._asked.dimension)
+        catalog, chance, space = self._catalog, np.random.default_rng(2), self._space
 
         def point() -> NDArray[np.float64]:
             return chance.uniform(0, 10, 3)
@@ -153,18 +168,23 @@ class Growth:
             "similar, one memory": lambda n: catalog.similar(
                 self._name(n), instance_id=n % 100, space=space, anywhere=False, k=10
             ),
-            "similar, all": lambda n: catalog.similar(vector=_near(self._looks, n), space=space, k=10),
+            "similar, all": lambda n: self._alike(space, n),
+            "similar, all, even": lambda n: self._alike(self._even, n),
+            "similar, all, lone": lambda n: self._alike(self._lone, n),
             "relations, one memory": lambda n: catalog.relations(self._name(n), subject=KINDS[n % 400], k=10),
         }
 
-    def _recall(self) -> float:
+    def _alike(self, space: str, n: int) -> CatalogAnswers:
+        return self._catalog.similar(vector=self._looks[space].near(n), space=space, k=10)
+
+    def _recall(self, space: str, number: int) -> float:
         """Share of the true ten that are found, over 50 questions."""
-        hits, size, space = 0, self._asked.instances, SPACE.format(self._asked.dimension)
-        for n in range(50):
-            query = _near(self._looks, n)
-            cosine = np.concatenate([v.astype(np.float32) @ query for v in self._vectors])
-            truth = {(f"m{k // size:05d}", k % size) for k in np.argpartition(-cosine, 10)[:10].tolist()}
-            hits += len(truth & {(m.memory, m.id) for m in self._catalog.similar(vector=query, space=space, k=10)})
+        size, queries = self._asked.instances, np.array([self._looks[space].near(n) for n in range(50)])
+        cosine = np.concatenate([queries @ v[number].astype(np.float32).T for v in self._vectors], axis=1)
+        hits = 0
+        for n, best in enumerate(np.argpartition(-cosine, 10, axis=1)[:, :10].tolist()):
+            truth = {(f"m{k // size:05d}", k % size) for k in best}
+            hits += len(truth & {(m.memory, m.id) for m in self._alike(space, n)})
         return hits / 500
 
     def _from_files(self) -> dict[str, Any]:
@@ -241,7 +261,7 @@ class Growth:
         n = int(chance.integers(1_000_000))
         near = catalog.nearest(self._name(n), point=chance.uniform(0, 10, 3), k=10)
         named = catalog.find(KINDS[n % 400], k=10)
-        alike = catalog.similar(vector=_near(self._looks, n), space=SPACE.format(self._asked.dimension), k=10)
+        alike = catalog.similar(vector=self._looks[self._space].near(n), space=self._space, k=10)
         if len(near) != 10 or not named or len(alike) != 10:
             raise CatalogError(f"answers are missing: {len(near)}, {len(named)}, {len(alike)}")
 
@@ -251,12 +271,11 @@ class Growth:
 
         def answers() -> list[object]:
             near = [list(self._catalog.nearest(n, point=(5, 5, 5), k=20)) for n in names]
-            space = SPACE.format(self._asked.dimension)
-            alike = [list(self._catalog.similar(vector=_near(self._looks, n), space=space)) for n in range(5)]
+            alike = [list(self._alike(self._space, n)) for n in range(5)]
             return [*near, *alike, self._catalog.memories()]
 
         before, said = answers(), list[str]()
-        content = make_content("cut off", 4000, self._looks, self._chance)
+        content = make_content("cut off", 20_000, self._looks, self._chance)
 
         def write() -> None:
             backend = open_backend(self._url)
@@ -303,7 +322,28 @@ class Growth:
         return f"m{n * 7919 % len(self._vectors):05d}"
 
 
-def make_content(name: str, count: int, looks: Vectors, chance: np.random.Generator) -> MemoryContent:
+class Looks:
+    """Vectors of one space: things about some kinds of look, or each of a look of its own where there are none."""
+
+    def __init__(self, dimension: int, decay: float, kinds: int, chance: np.random.Generator) -> None:
+        """Let the variance of the n-th number be n to the power of -decay."""
+        self._spread = np.arange(1, dimension + 1) ** (-decay / 2)
+        self._kinds = chance.normal(size=(kinds, dimension)) * self._spread if kinds else np.zeros((1, dimension))
+
+    def of(self, count: int, chance: np.random.Generator) -> Vectors:
+        """Return the vectors of so many things, of unit length."""
+        return self._about(chance.integers(0, len(self._kinds), count), chance)
+
+    def near(self, number: int) -> Vectors:
+        """Return the vector of a thing, the same for the same number."""
+        return self._about(np.array([number % len(self._kinds)]), np.random.default_rng(number))[0]
+
+    def _about(self, kinds: NDArray[np.int64], chance: np.random.Generator) -> Vectors:
+        vectors = self._kinds[kinds] + 0.5 * self._spread * chance.normal(size=(len(kinds), len(self._spread)))
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
+
+
+def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.random.Generator) -> MemoryContent:
     """A memory of things of random places, names, looks and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
@@ -317,19 +357,11 @@ def make_content(name: str, count: int, looks: Vectors, chance: np.random.Genera
     relations = [
         (int(a), "on" if k % 2 else "near", int(b), 0.8, 0.1) for k, (a, b) in enumerate(np.unique(pairs, axis=0))
     ]
-    vectors = looks[chance.integers(0, len(looks), count)] + 0.5 * chance.normal(size=(count, looks.shape[1]))
-    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     entry = MemoryEntry(
         name, f"/nowhere/{name}.l3r", 0, f"{chance.integers(2**60):x}", 1, 0, "metric", "known", count, 1
     )
-    space = SpaceVectors(SPACE.format(looks.shape[1]), np.arange(count), vectors)
-    return MemoryContent(entry, things, relations, [space])
-
-
-def _near(looks: Vectors, n: int) -> Vectors:
-    """A look with noise of its own, the same for the same number."""
-    noise = np.random.default_rng(n).normal(size=looks.shape[1])
-    return np.asarray(looks[n % len(looks)] + 0.5 * noise, np.float32)
+    spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in looks.items()]
+    return MemoryContent(entry, things, relations, spaces)
 
 
 @contextlib.contextmanager

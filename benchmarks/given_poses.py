@@ -2,12 +2,17 @@
 ones (which is the most that poses can give).
 
 python benchmarks/given_poses.py --seeds 1,2,3,4,5 --json benchmarks/results/given_poses.json
+python benchmarks/given_poses.py --blind --modes given,prior,estimate --json benchmarks/results/given_poses_blind.json
 
 The recording is like Record3D's: depth of 256 x 192 with a LiDAR's noise and confidence, ARKit's poses with a drift of
 1 % and a jump (`simulation/phone.py`). ATE after a rigid alignment; tilt is the angle between the memory's vertical
 and the true one; instances by boxes of the truth at an overlap of 0.25 and 0.5. `center_cm` is how far the centres of
 pairs at 0.25 lie apart (mean) after the one rigid alignment, `nearest_cm` how far from each true thing the centre of
 any instance lies (median), whether they make a pair or not. With `--keep` memories that are there are not built again.
+
+With `--blind` the walk has stretches where the camera cannot be followed by what it sees (`simulation/blind.py`).
+`posed` is how many frames have a pose in the memory, of `frames`; ATE and tilt are of those alone. `posed_blind` and
+`blind_cm` (root mean square) are of the blind stretches alone, `components` the parts that the memory falls into.
 """
 
 from __future__ import annotations
@@ -26,9 +31,10 @@ from machine import machine, run_list3r, write_json
 from scipy.spatial.transform import Rotation
 
 import list3r
+from benchmarks.simulation.blind import WALKED, BlindSettings
 from benchmarks.simulation.phone import LidarSettings, write_phone_walk
 from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene, scene_boxes
-from list3r.evaluation.trajectory import evaluate_trajectory, read_tum
+from list3r.evaluation.trajectory import Trajectory, associate, evaluate_trajectory, read_tum
 from list3r.frames.recordings.axes import arkit_of_pose
 from list3r.memory.geometry import Sim3
 from list3r.simulation.dataset import WalkSettings
@@ -45,6 +51,7 @@ def main() -> None:
     parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--frames", type=int, default=64, help="pictures of each walk; the whole round has about 115")
     parser.add_argument("--unsure", type=float, default=1.0, help="so many times larger errors where depth is not sure")
+    parser.add_argument("--blind", action="store_true", help="with a bare wall, quick turns and a second of dark")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     words = parser.parse_args()
@@ -54,7 +61,8 @@ def main() -> None:
             folder = (words.keep or Path(scratch)) / f"seed-{seed}"
             if not (folder / "truth.json").exists():
                 walk = WalkSettings(seed=seed, frames=words.frames, path=PACE)
-                write_phone_walk(folder, walk, LidarSettings(unsure_times=words.unsure))
+                blind = BlindSettings() if words.blind else None
+                write_phone_walk(folder, walk, LidarSettings(unsure_times=words.unsure), blind=blind)
             for mode in words.modes.split(","):
                 rows.append({"seed": seed, "poses": mode, **measured(folder, mode)})
                 print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
@@ -86,6 +94,7 @@ def measured(folder: Path, mode: str) -> dict[str, Any]:
     with list3r.open(memory) as scene:
         scene.export("json", folder / f"{mode}.json")
         scene.export("tum", folder / f"{mode}.txt")
+        components = len({chunk.component for chunk in scene.store.chunks.all()})
     truth, estimate = read_tum(folder / "groundtruth.txt"), read_tum(folder / f"{mode}.txt")
     errors = evaluate_trajectory(truth, estimate)
     S_truth_scene = alignment_of(truth, estimate, with_scale=False)
@@ -93,6 +102,9 @@ def measured(folder: Path, mode: str) -> dict[str, Any]:
     scores = evaluate_scene(scene_json, truth_json, S_truth_scene)
     tilt = np.degrees(np.arccos(np.clip(S_truth_scene.rotation[2, 2], -1.0, 1.0)))
     row = {"ate_cm": round(100 * errors.ate_se3_m.rmse, 2), "posed": errors.pairs, "tilt_deg": round(float(tilt), 2)}
+    row |= {"frames": len(truth.time_s), "components": components} | blind_errors(
+        folder, truth, estimate, S_truth_scene
+    )
     for overlap in ("0.25", "0.50"):
         found = scores[f"instances_{overlap}"]
         row |= {f"recall_{overlap}": found["recall"], f"precision_{overlap}": found["precision"]}
@@ -100,6 +112,20 @@ def measured(folder: Path, mode: str) -> dict[str, Any]:
     row["center_cm"] = round(100 * scores["instances_0.25"]["mean_center_error_m"], 2)
     row["nearest_cm"] = round(100 * nearest_m(scene_json, truth_json, scores, S_truth_scene), 2)
     return row | ({} if wall_s is None else {"wall_s": wall_s})
+
+
+def blind_errors(folder: Path, truth: Trajectory, estimate: Trajectory, S_truth_scene: Sim3) -> dict[str, Any]:
+    """Return how many frames of the blind stretches have a pose, and how far those are from the truth."""
+    names = folder / "stretches.json"
+    stretches = json.loads(names.read_text()) if names.exists() else []
+    blind = {k for k, name in enumerate(stretches) if name != WALKED}
+    if not blind:
+        return {}
+    pairs = [(k, j) for k, j in zip(*associate(truth.time_s, estimate.time_s), strict=True) if int(k) in blind]
+    rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    off = S_truth_scene.apply(estimate.positions()[rows[:, 1]]) - truth.positions()[rows[:, 0]]
+    error_cm = 100 * float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(rows) else 0.0
+    return {"blind": len(blind), "posed_blind": len(rows), "blind_cm": round(error_cm, 2)}
 
 
 def nearest_m(

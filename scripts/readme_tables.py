@@ -382,7 +382,8 @@ def catalogue() -> str:
         lines.append(
             [told, *(f"{cpu} ({c['p10_ms']:.3g}, {c['p50_ms']:.3g})" for cpu, c in zip(cost, cells, strict=True))]
         )
-    lines.append(["recall@10 of similar, all", *(f"{s['recall@10, similar, all']:.3f}" for s in stages)])
+    for told in ("similar, all", "similar, all, even", "similar, all, lone"):
+        lines.append([f"recall@10 of {told}", *(f"{s[f'recall@10, {told}']:.3f}" for s in stages)])
     lines.append(["GB on disk", *(f"{s['bytes']['all'] / 1e9:.2f}" for s in stages)])
     load = [s["loaded"] for s in stages]
     spent = [1e3 * (x["client_cpu_s"] + x["server_cpu_s"]) / x["memories"] for x in load]

@@ -142,6 +142,8 @@ def test_phrases_find_things_in_one_memory_and_over_all(catalog: Catalog) -> Non
     assert confident == sorted(confident, reverse=True)
     on = {m.id for m in catalog.find("mug on a box", "random", k=100)}
     assert on == {n for n in mugs if n % 2 == 0 and (n + 1) % 3 == 1}
+    found = [(m.memory, m.id) for m in catalog.find("mug on a box", k=1000) if m.memory in ("random", "other")]
+    assert sorted(found) == [(n, i) for n in ("other", "random") for i in sorted(on)]
     assert catalog.find("purple mug") == []
     for text in ("small mug", "mug left of box", "#3", "mug between box and lamp"):
         with pytest.raises(OptionError, match="ask the memory's file"):
@@ -181,6 +183,96 @@ def test_vectors_find_what_is_alike(catalog: Catalog) -> None:
         catalog.similar(vector=np.ones(3), space=SPACE)
     with pytest.raises(OptionError, match="not all zero"):
         catalog.similar(vector=np.zeros(16), space=SPACE)
+
+
+@pytest.fixture
+def vectors(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Catalog]:
+    """A catalogue in which few vectors get an index already; the test is skipped where the server has no pgvector."""
+    from list3r.catalog import postgres_schema
+
+    monkeypatch.setattr(postgres_schema, "FEWEST_INDEXED", 500)
+    monkeypatch.setattr(postgres_schema, "_A_LIST", 20)
+    with Catalog.open(server.url) as catalog:
+        if not catalog._backend.has_vectors:  # type: ignore[attr-defined]
+            pytest.skip("the server has no pgvector")
+        yield catalog
+
+
+def lists(server: PostgresServer, space: str) -> str | None:
+    """The options of the index of a space, None where it has none."""
+    psycopg = pytest.importorskip("psycopg")
+    query = (
+        "SELECT array_to_string(reloptions, ',') FROM pg_class JOIN list3r.space ON relname = "
+        "format('vector_%s_alike', space_id) WHERE name = %s"
+    )
+    with psycopg.connect(server.url) as connection:
+        found = connection.execute(query.replace("%s_", "%%s_"), (space,)).fetchone()
+    return found[0] if found else None
+
+
+def looking(name: str, count: int, seed: int, space: str = "many@1/16") -> MemoryContent:
+    held = content(name, count, seed)
+    return replace(held, spaces=[replace(held.spaces[0], space=space)])
+
+
+def test_the_index_of_vectors_grows_with_them(vectors: Catalog, server: PostgresServer) -> None:
+    backend, space = vectors._backend, "many@1/16"
+    held = {name: looking(name, 300, seed) for seed, name in enumerate(("m1", "m2", "m3", "m4", "m5"), 10)}
+    found = []
+    for one in held.values():
+        with backend.loading(many=False):
+            backend.put(one)
+        found.append(lists(server, space))
+    assert found == [None, "lists=30", "lists=30", "lists=60", "lists=60"]
+    shown = {
+        n: one.spaces[0].vectors / np.linalg.norm(one.spaces[0].vectors, axis=1)[:, None] for n, one in held.items()
+    }
+    filters = CatalogFilters(structure=True, state="any")
+    query = shown["m2"][7]
+    cosine = sorted(((n, i) for n, v in shown.items() for i in range(300)), key=lambda p: -shown[p[0]][p[1]] @ query)
+
+    def answer(k: int) -> list[tuple[str, int]]:
+        return [(m.memory, m.id) for m in vectors.similar(vector=query, space=space, k=k, filters=filters)]
+
+    before = answer(20)
+    assert len(set(before) & set(cosine[:20])) >= 19
+    with backend.loading(many=False):
+        for name in ("m4", "m2"):
+            assert backend.put(held[name], anew=True).revision == 1
+    assert answer(20) == before
+    assert len(answer(900)) == 900  # more than the lists that are looked at first hold
+    with backend.loading(many=True):
+        assert lists(server, space) is None
+        assert answer(5) == cosine[:5]
+    assert lists(server, space) == "lists=75"
+    for name in held:
+        backend.drop(name)
+
+
+def test_what_is_equally_alike_comes_by_name(vectors: Catalog) -> None:
+    backend, space = vectors._backend, "ties@1/16"
+    names = ("b", "c", "a")
+    for name in names:
+        backend.put(looking(name, 50, 3, space))
+    query = looking("a", 50, 3).spaces[0].vectors[5]
+    assert [m.memory for m in vectors.similar(vector=query, space=space, k=2)] == ["a", "b"]
+    for name in names:
+        backend.drop(name)
+
+
+def test_an_index_of_an_earlier_version_is_dropped(vectors: Catalog, server: PostgresServer) -> None:
+    psycopg = pytest.importorskip("psycopg")
+    vectors._backend.put(looking("kept", 50, 3, "older@1/16"))
+    with psycopg.connect(server.url) as owner:
+        number = owner.execute("SELECT space_id FROM list3r.space WHERE name = 'older@1/16'").fetchone()[0]
+        kind = "USING hnsw (v public.halfvec_cosine_ops) WITH (m = 12)"
+        owner.execute(f"CREATE INDEX vector_{number}_alike ON list3r.vector_{number} {kind}")
+        owner.execute("DELETE FROM list3r.version WHERE number = 2")
+    assert lists(server, "older@1/16") == "m=12"
+    with Catalog.open(server.url) as again:
+        assert lists(server, "older@1/16") is None
+        assert again.similar("kept", instance_id=3)
+        again.remove("kept")
 
 
 @pytest.mark.parametrize("text", STRANGE)
@@ -402,7 +494,7 @@ def test_a_full_disk_of_the_server_is_told_and_changes_nothing() -> None:
             backend.put(content("kept"))
             before = catalog.find("mug", "kept", k=50), catalog.memories()
             with pytest.raises(CatalogError, match="No space left on device") as told:
-                backend.put(content("more", count=15_000))
+                backend.put(content("more", count=30_000))
             assert "nothing was changed" in str(told.value) and "\n" not in str(told.value)
             assert (catalog.find("mug", "kept", k=50), catalog.memories()) == before
             subprocess.run(["mount", "-o", "remount,size=96m", str(disk)], check=True)

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
-from list3r.frames.recordings.aria_lens import quarter_turns
 from list3r.frames.recordings.aria_trajectory import read_trajectory
+from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
 from tests.recordings import put

@@ -391,7 +391,7 @@ def test_poses_of_a_body_are_carried_to_its_camera(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("write", "said"),
     [
-        (write_record3d, ("in metres, of a camera of its own, at its place", "--poses prior", "metric, by the depth")),
+        (write_record3d, ("in metres, seen from where the colour is", "--poses prior", "metric, by the depth")),
         (write_euroc, ("none", "--poses given", "metric, by the poses")),
         (write_colmap, ("none", "--poses given", "relative, in the unit of the poses")),
     ],

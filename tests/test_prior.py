@@ -15,8 +15,12 @@ from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, FrameSamples,
 from list3r.pipeline.session import check_buildable, resolve_settings
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.prior import PriorSettings, mean_alignment, source_from_chunk, steady_runs
+from list3r.reconstruction.motion import movers
+from list3r.reconstruction.prior import PriorSettings, bridged, mean_alignment, source_from_chunk, steady_runs
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
+from list3r.reconstruction.rgbd.registration import PosePrior, Samples, register
+from list3r.reconstruction.rgbd.settings import OdometrySettings
+from list3r.reconstruction.rgbd.view import make_view
 from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, walk
 
 JUMP = 9
@@ -70,6 +74,67 @@ def test_frames_that_show_nothing_follow_the_prior(truth: np.ndarray) -> None:
     made = RgbdReconstructor(poses="prior")(empty, CAMERA)
     assert made.posed.all()
     assert pose_errors(made.T_chunk_cam, truth[:9])[0].max() < 0.05
+
+
+def lightless(frame: Frame) -> Frame:
+    assert frame.depth is not None
+    return replace(black(frame), depth=np.zeros_like(frame.depth))
+
+
+def test_frames_without_light_and_depth_follow_the_prior(frames: list[Frame], truth: np.ndarray) -> None:
+    seen = [*frames[:3], *map(lightless, frames[3:7]), *frames[7:]]
+    made = RgbdReconstructor(poses="prior")(seen, CAMERA)
+    assert made.posed.all()
+    assert pose_errors(made.T_chunk_cam, truth)[0].max() < 0.01
+    assert not set(made.keyframes.tolist()) & {3, 4, 5, 6}
+    assert RgbdReconstructor(poses="estimate")(seen, CAMERA).posed.tolist() == [not 3 <= k < 7 for k in range(15)]
+
+
+def test_a_jump_without_light_is_told_afterwards(frames: list[Frame], truth: np.ndarray) -> None:
+    dark = range(JUMP - 3, JUMP + 3)
+    seen = [lightless(f) if k in dark else f for k, f in enumerate(frames)]
+    made = RgbdReconstructor(poses="prior")(seen, CAMERA)
+    assert made.posed.tolist() == [k not in dark for k in range(15)]
+    assert pose_errors(made.T_chunk_cam[made.posed], truth[made.posed])[0].max() < 0.015
+
+
+def test_frames_without_light_at_which_poses_jump_have_none(truth: np.ndarray) -> None:
+    given, posed, settings = imperfect(truth), np.ones(len(truth), bool), PriorSettings()
+    posed[JUMP - 2 : JUMP + 2] = False
+    assert (bridged(truth, posed, given, settings)[1] == posed).all()
+    posed[:] = True
+    posed[[0, 3, 4, 14]] = False
+    T, known = bridged(np.where(posed[:, None, None], truth, np.eye(4)), posed, given, settings)
+    assert known.all()
+    assert np.abs(T - truth).max() < 0.01
+    nothing = np.full_like(given, np.nan)
+    assert (bridged(truth, posed, nothing, settings)[1] == posed).all()
+
+
+def test_a_surface_that_seems_to_move_does_not_free_the_camera_from_its_prior(truth: np.ndarray) -> None:
+    """A wall that fills the picture, and a box before it: without the box nothing but the prior holds the camera."""
+    told: list[object] = []
+    frame = frames_along(truth[:1])[0]
+
+    def spy(*arguments: object) -> object:
+        told.append(arguments[5] if len(arguments) > 5 else None)
+        return register(*arguments)  # type: ignore[arg-type]
+
+    assert frame.depth is not None
+    settings = OdometrySettings()
+    view = make_view(frame.color, frame.depth, CAMERA.shrunk(160), settings.noise)
+    model = Samples(view.points[view.valid], view.normals[view.valid], view.gray[view.valid])
+    prior = PosePrior(np.eye(4), 0.002, 0.002, 30.0)
+    found = register(model, view, np.eye(4), settings.registration, settings.noise, prior)
+    assert found is not None
+    half = np.zeros_like(view.valid)
+    half[:, : half.shape[1] // 2] = True
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(movers, "register", spy)
+        patch.setattr(movers, "suspects", lambda *_: [half])
+        movers.find_mover(model, view, np.eye(4), found, settings, prior)
+    assert told
+    assert all(one is prior for one in told)
 
 
 def test_runs_end_where_poses_jump(truth: np.ndarray) -> None:

@@ -7,13 +7,14 @@ the picture, an error of centimetres that neighbouring pixels share, and confide
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.simulation.blind import DARK, TURN, WALKED, BlindSettings, BlindWalk, blind_walk, exposed
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera, Frame
 from list3r.frames.writers.record3d import Record3dWriter
@@ -131,28 +132,47 @@ def _slope(depth: Floats) -> Floats:
 
 
 def write_phone_walk(
-    folder: Path, walk: WalkSettings, lidar: LidarSettings | None = None, drift: DriftSettings | None = None
+    folder: Path,
+    walk: WalkSettings,
+    lidar: LidarSettings | None = None,
+    drift: DriftSettings | None = None,
+    blind: BlindSettings | None = None,
 ) -> Path:
-    """Film a walk into `folder`: `walk.r3d`, and beside it `groundtruth.txt` and `truth.json`."""
+    """Film a walk into `folder`: `walk.r3d`, and beside it `groundtruth.txt` and `truth.json`.
+
+    With `blind` it has stretches where the camera cannot be followed; `stretches.json` has the name of each frame's.
+    """
     lidar, drift = lidar or LidarSettings(), drift or DriftSettings()
     folder.mkdir(parents=True, exist_ok=True)
     camera = walk.camera()
     small = Camera(*DEPTH_SIZE, *_shrunk(camera))
-    times, poses = walk.poses()
-    given = drifted(poses, drift, walk.seed)
+    if blind is None:
+        times, poses = walk.poses()
+        way = BlindWalk(times, poses, (WALKED,) * len(times))
+    else:
+        way = blind_walk(walk, blind)
+    given = drifted(way.T_world_cam, drift, walk.seed)
     pictures, depths = Renderer(walk.world(), camera), Renderer(walk.world(), small)
     seen: dict[int, dict[str, int]] = {}
     out = Record3dWriter(folder, camera, walk.path.fps)
-    for k, T_world_cam in enumerate(poses):
-        drawn, time_s = pictures.render(T_world_cam), float(times[k])
+    for k, (T_world_cam, stretch) in enumerate(zip(way.T_world_cam, way.stretch, strict=True)):
+        drawn, time_s = pictures.render(T_world_cam), float(way.time_s[k])
+        if stretch == TURN and blind is not None:
+            during = exposed(way.T_world_cam, k, walk.path.fps, blind.exposure_s)
+            drawn = replace(drawn, color=np.mean([pictures.render(T).color for T in during], axis=0, dtype=np.float32))
+        elif stretch == DARK:
+            drawn = replace(drawn, color=np.zeros_like(drawn.color), ids=np.zeros_like(drawn.ids))
         color = sense(drawn, walk.sensor, walk.seed, k, time_s).color
         depth, sure = lidar_depth(depths.render(T_world_cam), lidar, np.random.default_rng([walk.seed, 18, k]))
+        if stretch == DARK:
+            depth, sure = np.zeros_like(depth), np.zeros_like(sure)
         out.add(Frame(k, time_s, color, depth, given[k]), sure)
         for thing, area in zip(*np.unique(drawn.ids[drawn.ids > 0], return_counts=True), strict=True):
             entry = seen.setdefault(int(thing), {"frames": 0, "largest_px": 0})
             entry["frames"], entry["largest_px"] = entry["frames"] + 1, max(entry["largest_px"], int(area))
     out.close()
-    write_tum(folder / "groundtruth.txt", Trajectory(times, poses))
+    write_tum(folder / "groundtruth.txt", Trajectory(way.time_s, way.T_world_cam))
+    (folder / "stretches.json").write_text(json.dumps(way.stretch), encoding="utf-8")
     (folder / "truth.json").write_text(json.dumps(walk.truth(seen)), encoding="utf-8")
     return folder / "walk.r3d"
 

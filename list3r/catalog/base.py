@@ -112,11 +112,14 @@ def open_backend(url: str, connections: int = 1, *, make: bool = True) -> Backen
     raise CatalogError(f"{kind}:// is no catalogue; give postgresql://host/name, or a file such as catalog.sqlite")
 
 
-def wanted_sql(wanted: Wanted, alias: str, words: Any, depth: int = 0) -> tuple[str, list[Any]]:
+def wanted_sql(
+    wanted: Wanted, alias: str, words: Any, *, joined: bool = False, depth: int = 0
+) -> tuple[str, list[Any]]:
     """Return the condition (with `?` for values) that an instance is wanted, and its values.
 
     `words` makes the condition of bearing words, of an alias and the words. Relations are looked up for each that bears
-    the words: OFFSET keeps PostgreSQL from joining them instead, which takes minutes where it has no statistics yet.
+    the words: OFFSET keeps PostgreSQL from joining them instead, which takes minutes in one memory where it has no
+    statistics yet. Over all memories joining them is many times faster, from the end that fewer bear: `joined`.
     """
     parts, values = ["TRUE"], []
     if wanted.words:
@@ -128,14 +131,17 @@ def wanted_sql(wanted: Wanted, alias: str, words: Any, depth: int = 0) -> tuple[
         values.append(wanted.instance_id)
     for predicates, object in wanted.where:
         o, r = f"o{depth}", f"r{depth}"
-        text, given = wanted_sql(object, o, words, depth + 1)
+        text, given = wanted_sql(object, o, words, joined=joined, depth=depth + 1)
         marks = ", ".join("?" for _ in predicates)
-        parts.append(
-            f"EXISTS (SELECT 1 FROM relation {r} "
-            f"JOIN instance {o} ON {o}.memory_id = {r}.memory_id AND {o}.id = {r}.object "
-            f"WHERE {r}.memory_id = {alias}.memory_id AND {r}.subject = {alias}.id AND {r}.predicate IN ({marks}) "
-            f"AND {text} LIMIT 1 OFFSET 0)"
+        ends = (
+            f"FROM relation {r} JOIN instance {o} ON {o}.memory_id = {r}.memory_id AND {o}.id = {r}.object "
+            f"WHERE {r}.predicate IN ({marks}) AND {text}"
         )
+        if joined:
+            parts.append(f"({alias}.memory_id, {alias}.id) IN (SELECT {r}.memory_id, {r}.subject {ends})")
+        else:
+            own = f"{r}.memory_id = {alias}.memory_id AND {r}.subject = {alias}.id"
+            parts.append(f"EXISTS (SELECT 1 {ends} AND {own} LIMIT 1 OFFSET 0)")
         values += [*predicates, *given]
     return " AND ".join(parts), values
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, fields, replace
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
 from list3r.catalog.postgres_connections import Connections
-from list3r.catalog.postgres_schema import MIGRATIONS, vector_index, vector_table
+from list3r.catalog.postgres_schema import MIGRATIONS, lists_of, vector_index, vector_table
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
@@ -31,10 +32,8 @@ _ENTRY_FIELDS = fields(MemoryEntry)
 _ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)
 _OF_ONE = "i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _THING = f"m.name, {_OF_ONE}"
-_PROBED = 400
-"""Candidates that a search for vectors keeps at each step; more finds more and takes longer."""
 _BUILD_MEMORY = "2GB"
-"""What the server may take while it makes an index anew; one of vectors that does not fit is made far more slowly."""
+"""What the server may take while it makes an index of vectors."""
 _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
 _WRITTEN = "written"
@@ -98,7 +97,6 @@ class PostgresBackend:
                 statement = "INSERT INTO space (name, dimension) VALUES (%s, %s) RETURNING space_id, dimension"
                 known = _first(connection.execute(statement, (held.space, dimension)))
                 connection.execute(vector_table(known[0], dimension).encode())
-                connection.execute(vector_index(known[0]).encode())
             if known[1] != dimension:
                 raise CatalogError(f"vectors of {dimension} numbers are none of {held.space}, which has {known[1]}")
             out.append((int(known[0]), held))
@@ -120,20 +118,19 @@ class PostgresBackend:
 
     @contextlib.contextmanager
     def loading(self, *, many: bool) -> Iterator[None]:
-        """Write memories; where they are many, the indices of vectors are made anew at the end, not kept up meanwhile.
+        """Write memories; at the end vectors that have become many get an index, or one of more lists.
 
-        Meanwhile `similar` over all compares all vectors. An index that is missing, since a load was ended, is made.
+        Where `many` are written, indices are made anew at the end and not kept up meanwhile: until then `similar` over
+        all compares all vectors. An index that is missing, since a load was ended, is made.
         """
         if many:
             with self._connected(_WRITTEN) as connection:
                 for (n,) in connection.execute("SELECT space_id FROM space").fetchall():
                     connection.execute(f"DROP INDEX IF EXISTS vector_{int(n)}_alike")
         yield
-        with self._connected(_WRITTEN) as connection, connection.transaction():
-            connection.execute("SET LOCAL statement_timeout = 0")
-            connection.execute(f"SET LOCAL maintenance_work_mem = '{_BUILD_MEMORY}'")
+        with self._connected(_WRITTEN) as connection, _unhurried(connection):
             for (n,) in connection.execute("SELECT space_id FROM space ORDER BY space_id").fetchall():
-                connection.execute(vector_index(n).encode())
+                _keep_index(connection, n)
             if many:
                 connection.execute("ANALYZE")
 
@@ -191,7 +188,8 @@ class PostgresBackend:
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
     ) -> tuple[list[tuple[CatalogThing, float]], int]:
         """Return the k that are wanted with how well the words name them."""
-        (a, values), (b, more) = wanted_sql(wanted, "i", _bearing), filters_sql(filters, "i")
+        a, values = wanted_sql(wanted, "i", _bearing, joined=memory is None)
+        b, more = filters_sql(filters, "i")
         only, given = ("", ()) if memory is None else (" AND i.memory_id = ?", (self._number(memory),))
         weight = "(SELECT avg(w.n) FROM unnest(i.words, i.weights) w (word, n) WHERE w.word = ANY(?))"
         query = (
@@ -244,23 +242,27 @@ class PostgresBackend:
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogThing, float]]:
-        """Return the k most alike: in one memory exactly, over all through the index of vectors."""
-        table, asked, count = f"vector_{self._space(space)}", _halfvec(vector), k
+        """Return the k most alike: in one memory exactly, over all through the index of vectors.
+
+        Of vectors that are equally alike those of the first names and ids come, so that an answer does not depend on
+        the order in which memories were written.
+        """
+        asked, count = _halfvec(vector), k
         only, apart = "", "v <=> ?::halfvec"
         given: tuple[int, ...] = ()
         if memory is not None:  # an order by the sum is one that the index of vectors does not know
-            only, given, apart = " WHERE memory_id = ?", (self._number(memory),), f"({apart}) + 0"
-        query = _marked(f"SELECT memory_id, id, 1 - (v <=> ?::halfvec) FROM {table}{only} ORDER BY {apart} LIMIT ?")
+            only, apart, given = " WHERE memory_id = ?", f"({apart}) + 0", (self._number(memory),)
+        query = (
+            f"SELECT memory_id, id, 1 - apart FROM (SELECT memory_id, id, v <=> ?::halfvec AS apart "
+            f"FROM vector_{self._space(space)}{only} ORDER BY {apart} FETCH FIRST (?) ROWS WITH TIES) near LIMIT ?"
+        )
         while True:
-            with self._connected("asked") as connection, connection.transaction():
-                connection.execute(f"SET LOCAL hnsw.ef_search = {max(_PROBED, min(2 * count, 1000))}")
-                connection.execute("SET LOCAL hnsw.iterative_scan = strict_order")
-                rows = connection.execute(query, (asked, *given, asked, count)).fetchall()
+            rows = self._rows(query, (asked, *given, asked, count, _MOST_ALIKE))
             found = self._passing([row[:2] for row in rows], filters)
             out = [(found[n, i], float(c)) for n, i, c in rows if (n, i) in found]
             if len(out) >= k or len(rows) < count or count >= _MOST_ALIKE:
-                return out[:k]
-            count *= 4
+                return sorted(out, key=lambda f: (-f[1], f[0].memory, f[0].id))[:k]
+            count = min(4 * count, _MOST_ALIKE)
 
     def _passing(self, ids: Sequence[Any], filters: CatalogFilters) -> dict[tuple[int, int], CatalogThing]:
         """Return those of some instances that pass the filters, by memory and id."""
@@ -372,6 +374,41 @@ def _migrated(connection: psycopg.Connection[Any]) -> bool:
             connection.execute(statements.encode())
             connection.execute("INSERT INTO version VALUES (%s)", (number,))
     return connection.execute("SELECT 1 FROM pg_extension WHERE extname = 'vector'").fetchone() is not None
+
+
+@contextlib.contextmanager
+def _unhurried(connection: psycopg.Connection[Any]) -> Iterator[None]:
+    """Let statements take as long, and as much memory, as an index of vectors needs."""
+    connection.execute(f"SET statement_timeout = 0; SET maintenance_work_mem = '{_BUILD_MEMORY}'")
+    try:
+        yield
+    finally:
+        if not connection.closed:
+            connection.execute("RESET statement_timeout; RESET maintenance_work_mem")
+
+
+def _keep_index(connection: psycopg.Connection[Any], space: int) -> None:
+    """Make the index of the vectors of a space where there is none, or one of less than half the lists they need.
+
+    Where another process does that, it is left to it.
+    """
+    query = (
+        "SELECT option_value::integer FROM pg_class, pg_options_to_table(reloptions) "
+        f"WHERE oid = to_regclass('vector_{int(space)}_alike') AND option_name = 'lists'"
+    )
+    held = (_first(connection.execute(query.encode())) or (0,))[0]
+    if 2 * held > lists_of(sys.maxsize):  # there is nothing to count for
+        return
+    count = _first(connection.execute(f"SELECT count(*) FROM vector_{int(space)}".encode()))[0]
+    lists, lock = lists_of(count), (_SCHEMA_LOCK, space)
+    if lists == 0 or lists < 2 * held or not _first(connection.execute("SELECT pg_try_advisory_lock(%s, %s)", lock))[0]:
+        return
+    try:
+        for statement in vector_index(space, lists):
+            connection.execute(statement.encode())
+    finally:
+        if not connection.closed:
+            connection.execute("SELECT pg_advisory_unlock(%s, %s)", lock)
 
 
 def _copy_things(connection: psycopg.Connection[Any], memory: int, content: MemoryContent) -> None:

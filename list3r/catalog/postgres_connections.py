@@ -21,6 +21,8 @@ _SILENT_S = 20
 _PLANS = "-c jit=off -c enable_partitionwise_join=on -c max_parallel_workers_per_gather=0"
 """How questions are planned: relations are joined within each partition, where the rows of a memory lie, in place of
 reading them all; many small questions share the processors better than one that takes several."""
+_VECTORS = "-c ivfflat.probes=40 -c ivfflat.iterative_scan=relaxed_order -c work_mem=16MB"
+"""How vectors are searched: so many lists, and as many more where they hold too few; all that is there is sorted."""
 
 
 class Connections:
@@ -57,7 +59,7 @@ class Connections:
                     held.close()
 
     def _connect(self) -> psycopg.Connection[Any]:
-        options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} {_PLANS}"
+        options = f"-c search_path=list3r,public -c statement_timeout={_STATEMENT_MS} {_PLANS} {_VECTORS}"
         lost: dict[str, Any] = {"keepalives_idle": 5, "keepalives_interval": 5, "tcp_user_timeout": 1000 * _SILENT_S}
         return psycopg.connect(
             self._url,

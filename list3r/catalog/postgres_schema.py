@@ -5,9 +5,11 @@ from __future__ import annotations
 PARTITIONS = 16
 """Of the tables of instances and relations, by memory."""
 
-_LINKS, _LOOKED_AT = 12, 32
-"""Of the index of vectors: links of each and candidates looked at for them. Half of what pgvector takes: a third of the
-time to add a vector. With 8 links a tenth of what is alike is not found among 500,000, however long is searched."""
+FEWEST_INDEXED = 20_000
+"""Vectors of a space from which on they have an index; fewer are all compared in a few milliseconds."""
+_A_LIST, _MOST_LISTS = 500, 2000
+"""Vectors of a list of the index, as long as there are not more lists than that: learning takes the square of them, in
+time and memory (0.8 GB). docs/decisions/0141-lists-of-vectors.md."""
 
 
 def _partitioned(table: str) -> str:
@@ -42,6 +44,13 @@ MIGRATIONS: tuple[str, ...] = (
         space_id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, name text NOT NULL UNIQUE,
         dimension integer NOT NULL);
     """,
+    # Vectors lie in lists since; the next load makes their index.
+    """
+    DO $$ DECLARE old text; BEGIN
+        FOR old IN SELECT indexname FROM pg_indexes WHERE schemaname = 'list3r' AND indexname ~ '^vector_[0-9]+_alike$'
+        LOOP EXECUTE format('DROP INDEX list3r.%I', old); END LOOP;
+    END $$;
+    """,
 )
 
 
@@ -53,10 +62,20 @@ def vector_table(space_id: int, dimension: int) -> str:
     )
 
 
-def vector_index(space_id: int) -> str:
-    """Return the statement that makes the index of the vectors of one space where there is none."""
+def lists_of(vectors: int) -> int:
+    """Return into how many lists the index divides so many vectors, 0 for none."""
+    return min(vectors // _A_LIST, _MOST_LISTS) if vectors >= FEWEST_INDEXED else 0
+
+
+def vector_index(space_id: int, lists: int) -> tuple[str, ...]:
+    """Return the statements that make the index of the vectors of one space, in place of the one it has.
+
+    Meanwhile others read and write, and the old index answers. Each is a transaction of its own.
+    """
     table = f"vector_{int(space_id)}"
     return (
-        f"CREATE INDEX IF NOT EXISTS {table}_alike ON {table} USING hnsw (v halfvec_cosine_ops) "
-        f"WITH (m = {_LINKS}, ef_construction = {_LOOKED_AT})"
+        f"DROP INDEX IF EXISTS {table}_next",  # of one who was ended
+        f"CREATE INDEX CONCURRENTLY {table}_next ON {table} USING ivfflat (v halfvec_cosine_ops) "
+        f"WITH (lists = {int(lists)})",
+        f"DROP INDEX IF EXISTS {table}_alike; ALTER INDEX {table}_next RENAME TO {table}_alike",
     )

@@ -30,6 +30,7 @@ from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.leftovers import not_read
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
+from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
@@ -45,8 +46,6 @@ _FILES_TRIED = 12
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
 NOWHERE_SURE = "the sensor is sure of no depth that was looked at; is `confidence` of this recording?"
-_LEAST_UPRIGHT = 0.4
-"""Least z of the cameras' mean up, where z is up: people film level or look down at most by some 60 degrees."""
 
 
 class FolderSource:
@@ -245,11 +244,10 @@ class FolderSource:
         where = f"({camera.cx:.0f}, {camera.cy:.0f})"
         return (f"the camera's centre {where} lies far from the middle of {size}: is it of pictures of another size?",)
 
-    def _upright(self) -> bool:
-        """Whether cameras stand upright on average in a world whose z is said to point up."""
-        some = map(self._pose, self._some_that_hold(POSE_FILE | POSE))
-        ups = [-T[:3, 1] for T in some if T is not None]
-        return bool(ups) and float(np.mean(ups, axis=0)[2]) > _LEAST_UPRIGHT
+    def _turns(self) -> int | None:
+        """Return how the pictures are turned in the world whose z is said to point up, None where it does not."""
+        some = map(self._pose, self._some_that_hold(POSE_FILE | POSE)) if self._layout.z_up else ()
+        return turns_in_gravity([T for T in some if T is not None])
 
     def _some_that_hold(self, what: int) -> list[FrameFile]:
         """Return frames that hold something, spread over the source."""
@@ -292,7 +290,7 @@ class FolderSource:
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
-        guess = self._camera_guess()
+        guess, turns = self._camera_guess(), self._turns()
         missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
         if rig.color_size != rig.stored_size:
             notes = (*notes, reduced_note(rig))
@@ -300,6 +298,7 @@ class FolderSource:
             notes = (*notes, f"of the 16 bits of the pictures {self._bits} are in use, which count as full brightness")
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration
+        notes = (*notes, *lying_note(turns or 0))
         return SourceInfo(
             kind=layout.kind,
             path=str(root),
@@ -319,7 +318,7 @@ class FolderSource:
             stored_size=rig.stored_size,
             camera_guess=guess,
             poses_metric=layout.poses_metric,
-            z_up=layout.z_up and self._upright(),
+            z_up=turns is not None,
             poses_drift=layout.poses_drift,
         )
 

@@ -40,6 +40,7 @@ class SourceReport:
             "depth_to_color": None if info.T_color_depth is None else info.T_color_depth.tolist(),
             "poses": info.has_poses,
             "scale": info.scale_kind,
+            "z_up": info.z_up,
             "fingerprint": info.fingerprint,
             "notes": list(info.notes),
             "missing": list(info.missing),
@@ -60,6 +61,7 @@ class SourceReport:
             f"depth        {_depth_text(info)}",
             f"poses        {_poses_text(info)}",
             f"scale        {_scale_text(info)}",
+            f"vertical     {_vertical_text(info)}",
             *(f"note         {note}" for note in info.notes),
             *(f"missing      {what}" for what in info.missing),
             *([] if self.calibration is None else _calibration_lines(self.calibration)),
@@ -113,8 +115,11 @@ def _depth_text(info: SourceInfo) -> str:
     if info.depth_camera is None or info.T_color_depth is None:
         return f"{units}, on the pixels of the colour image"
     x, y, z = 1000.0 * info.T_color_depth[:3, 3]
-    place = f"{x:.0f} {y:.0f} {z:.0f} mm from the colour camera" if info.T_color_depth[:3, 3].any() else "at its place"
-    own = f"of a camera of its own, {place} ({_camera_text(info.depth_camera)})"
+    camera = _camera_text(info.depth_camera)
+    if info.T_color_depth[:3, 3].any():
+        own = f"of a camera of its own, ({x:.0f}, {y:.0f}, {z:.0f}) mm from the colour camera ({camera})"
+    else:
+        own = f"seen from where the colour is ({camera})"
     return f"{units}, {own}; build lays it on the pixels of the colour image"
 
 
@@ -134,3 +139,10 @@ def _scale_text(info: SourceInfo) -> str:
     if info.has_poses:
         return "metric, by the poses" if info.poses_metric else "relative, in the unit of the poses"
     return "relative; build --scale-anchor says how long something is"
+
+
+def _vertical_text(info: SourceInfo) -> str:
+    """Return what says which way is up."""
+    if info.z_up:
+        return "z of the poses is up, by the recorder's gravity (not with --poses estimate)"
+    return "build looks for it in floors, tables and walls"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.geometry import rotation_exp, rotation_log
 from list3r.reconstruction.poses import angle_deg, is_rigid
 
 Poses = NDArray[np.float64]
@@ -78,3 +79,39 @@ def source_from_chunk(
     """Return T_source_chunk (4, 4) by the frames after the last jump; None where no frame has both poses."""
     runs = steady_runs(np.where(posed[:, None, None], T_chunk_cam, np.nan), T_source_cam, settings)
     return mean_alignment(T_chunk_cam[runs[-1]], T_source_cam[runs[-1]]) if runs else None
+
+
+def bridged(
+    T_chunk_cam: Poses, posed: NDArray[np.bool_], T_source_cam: Poses, settings: PriorSettings
+) -> tuple[Poses, NDArray[np.bool_]]:
+    """Return the poses with those of frames that show nothing, by the given steps, and which frames have one.
+
+    Between two frames that were followed what the given steps miss the later one by is spread over them; where that is
+    a jump they are left out, for nothing tells when it was. Shapes (F, 4, 4), (F,), (F, 4, 4).
+    """
+    T, known = T_chunk_cam.copy(), posed.copy()
+    followed = np.flatnonzero(posed & np.isfinite(T_source_cam).all(axis=(1, 2)))
+    for k in np.flatnonzero(~posed & np.isfinite(T_source_cam).all(axis=(1, 2))).tolist():
+        at = int(np.searchsorted(followed, k))
+        before, after = followed[at - 1 : at].tolist() if at else [], followed[at : at + 1].tolist()
+        if not before and not after:
+            break
+        near = (before or after)[0]
+        T_near_source = T_chunk_cam[near] @ np.linalg.inv(T_source_cam[near])
+        missed = np.eye(4)
+        if before and after:
+            end = after[0]
+            missed = np.linalg.inv(T_near_source @ T_source_cam[end]) @ T_chunk_cam[end]
+            if np.linalg.norm(missed[:3, 3]) > settings.jump_m or angle_deg(missed) > settings.jump_deg:
+                continue
+            missed = _share(missed, (k - near) / (end - near))
+        T[k], known[k] = T_near_source @ T_source_cam[k] @ missed, True
+    return T, known
+
+
+def _share(motion: Poses, share: float) -> Poses:
+    """Return a share of a small motion. Shape (4, 4)."""
+    out = np.eye(4)
+    out[:3, :3] = rotation_exp(share * rotation_log(motion[:3, :3]))
+    out[:3, 3] = share * motion[:3, 3]
+    return out

@@ -23,8 +23,9 @@ from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
-from list3r.frames.recordings.aria_lens import AriaLens, UprightView, quarter_turns
+from list3r.frames.recordings.aria_lens import AriaLens, UprightView
 from list3r.frames.recordings.aria_trajectory import DeviceTrajectory, read_trajectory
+from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.registration.rig import WORKING_SIDES
 from list3r.frames.selection import select
 from list3r.memory.errors import FrameError, OptionError, SourceError

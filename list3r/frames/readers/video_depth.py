@@ -17,6 +17,7 @@ from list3r.frames.layout import Optics
 from list3r.frames.leftovers import not_read
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.readers.video import VideoSource
+from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
 from list3r.memory.errors import FrameError
@@ -120,6 +121,7 @@ class VideoWithDepth:
 
     def _describe(self, root: Path) -> SourceInfo:
         info, parts, registration = self._video.info, self._parts, self._rig.registration
+        turns = turns_in_gravity(list(parts.poses.values())) if parts.z_up else None
         return replace(
             info,
             kind=parts.kind,
@@ -130,8 +132,14 @@ class VideoWithDepth:
             depth_camera=registration.depth_camera if registration else None,
             T_color_depth=registration.T_color_depth if registration else None,
             depth_scale=self._rig.depth_scale if parts.depth else None,
-            notes=(*info.notes, parts.note, *self._doubts(), *not_read(root, parts.kind, self._some_files())),
+            notes=(
+                *info.notes,
+                parts.note,
+                *self._doubts(),
+                *lying_note(turns or 0),
+                *not_read(root, parts.kind, self._some_files()),
+            ),
             missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
-            z_up=parts.z_up,
+            z_up=turns is not None,
             poses_drift=parts.poses_drift,
         )

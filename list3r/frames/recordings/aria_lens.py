@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.frames.recordings.axes import CLOCKWISE
 from list3r.frames.selection import working_size
 
 _GRID = 8
@@ -41,7 +41,7 @@ class UprightView:
             width, height = height, width
         whole = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         self.camera = whole.resized(*working_size((height, width), limit))
-        self.T_cam_upright = np.linalg.matrix_power(_CLOCKWISE, turns)
+        self.T_cam_upright = np.linalg.matrix_power(CLOCKWISE, turns)
         column, row = (_grid(n) for n in (self.camera.width, self.camera.height))
         x, y = (column - self.camera.cx) / self.camera.fx, (row - self.camera.cy) / self.camera.fy
         rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1) @ self.T_cam_upright[:3, :3].T
@@ -69,16 +69,6 @@ class UprightView:
         return np.asarray(
             cv2.remap(depth, self._at[..., 0], self._at[..., 1], cv2.INTER_NEAREST) * self._seen, np.float32
         )
-
-
-_CLOCKWISE = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""The camera of a picture turned clockwise by a quarter, in the camera of the picture. Shape (4, 4)."""
-
-
-def quarter_turns(T_world_cam: Sequence[NDArray[np.float64]]) -> int:
-    """Return how many clockwise quarter turns put the pictures upright, on average, in a world with z up."""
-    turned = [np.linalg.matrix_power(_CLOCKWISE, k) for k in range(4)]
-    return int(np.argmax([-sum((T @ turn)[2, 1] for T in T_world_cam) for turn in turned]))
 
 
 def _grid(count: int) -> NDArray[np.float64]:

@@ -185,7 +185,8 @@ def _camera(
     fx, fy, cx, cy = intrinsics
     if not (0 <= cx < width and 0 <= cy < height):
         raise OptionError(
-            f"{name}: centre ({cx:g}, {cy:g}) lies outside the image of {_size(size)}; give those of such pictures"
+            f"{name}: centre ({cx:g}, {cy:g}) lies outside pictures of {_size(size)}: they are of pictures of another "
+            f"size; give those of {_size(size)}"
         )
     if _off_middle(cx, cy, width, height) > _OFF_MIDDLE and _off_middle(cx, cy, height, width) < _IN_MIDDLE:
         raise OptionError(

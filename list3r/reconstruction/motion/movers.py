@@ -16,7 +16,7 @@ from list3r.compiled import compiled
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.motion.settings import MoverSettings
 from list3r.reconstruction.rgbd.kernels import centred
-from list3r.reconstruction.rgbd.registration import FrameRegistration, Samples, register, steps_without
+from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register, steps_without
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
@@ -142,13 +142,17 @@ def find_mover(
     T_guess: Pose,
     found: FrameRegistration,
     odometry: OdometrySettings,
+    prior: PosePrior | None = None,
 ) -> tuple[Mask, FrameRegistration] | None:
-    """Return the surface that moves of its own most plainly, and the view registered without it; None without one."""
+    """Return the surface that moves of its own most plainly, and the view registered without it; None without one.
+
+    A `prior` that held the view holds what is left of it as well: a bare wall alone would let the camera slide.
+    """
     registration, settings, noise = odometry.registration, odometry.movers, odometry.noise
     best: tuple[float, Mask] | None = None
     few = _every(model, settings.check_stride)
     for mask in suspects(model, view, found, odometry):
-        rest = register(few, without(view, mask), T_guess, registration, noise)
+        rest = register(few, without(view, mask), T_guess, registration, noise, prior)
         if rest is None:
             continue
         before = fit(few, view, mask, found.T_model_cam, settings, noise)
@@ -166,7 +170,7 @@ def find_mover(
             best = (gain, mask)
     if best is None:
         return None
-    rest = register(model, without(view, best[1]), T_guess, registration, noise)
+    rest = register(model, without(view, best[1]), T_guess, registration, noise, prior)
     return None if rest is None else (best[1], rest)
 
 

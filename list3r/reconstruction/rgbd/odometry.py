@@ -174,9 +174,12 @@ class CameraTracker:
         given = self._given(segment, last, position, gap_s)
         if given is not None:
             found.append(self._place(segment, position, given.T_model_cam, prior=given))
-            if self._doubtful(segment, found[0]) and gap_s <= self.settings.gap_s:
-                T = self._predict(segment, last, gap_s)
-                found.append(None if T is None else self._place(segment, position, T))
+            if self._doubtful(segment, found[0]):  # the given poses may have jumped
+                T = self._predict(segment, last, gap_s) if gap_s <= self.settings.gap_s else None
+                nearby = gap_s <= self.settings.most_gap_s
+                found.append(
+                    self._search(segment, position, nearby) if T is None else self._place(segment, position, T)
+                )
         elif gap_s <= self.settings.gap_s:
             predicted = self._predict(segment, last, gap_s)
             for T in (predicted, segment.T_segment_cam[last]):
@@ -241,7 +244,7 @@ class CameraTracker:
         s, view = self.settings, self.view(position)
         found = register(samples, view, T_guess, s.registration, s.noise, prior)
         if found is not None and not blind:
-            mover = find_mover(samples, view, T_guess, found, s)
+            mover = find_mover(samples, view, T_guess, found, s, prior)
             if mover is not None and self._trusted(mover[1], samples, position, blind):
                 self._moving[position] = self._moving.get(position, np.zeros_like(mover[0])) | mover[0]
                 found = mover[1]

@@ -19,7 +19,7 @@ from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion.follow import follow_movers
 from list3r.reconstruction.motion.moving import SmallFrames, find_moving
 from list3r.reconstruction.poses import given_poses, select_keyframes
-from list3r.reconstruction.prior import source_from_chunk, stacked
+from list3r.reconstruction.prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker
@@ -126,6 +126,7 @@ class RgbdReconstructor:
         if self.poses == "prior":
             given = stacked([f.T_source_cam for f in frames])
             T_source_chunk = source_from_chunk(T, posed, given, self.settings.odometry.prior)
+            T, posed = bridged(T, posed, given, self.settings.odometry.prior)
             T[posed] = T[posed] if T_source_chunk is None else T_source_chunk @ T[posed]
         return T, posed, segments[0].keyframes, tracker
 

@@ -50,7 +50,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     optics = Optics(intrinsics, depth_scale=1000.0, intrinsics_size=size)
     notes = ("cameras of lowres_wide_intrinsics, poses of lowres_wide.traj",)
     return FolderLayout(
-        "arkitscenes", files, optics, "color", intrinsics, notes, (), LEAST_CONFIDENCE, upright_tags=False
+        "arkitscenes", files, optics, "color", intrinsics, notes, (), LEAST_CONFIDENCE, z_up=True, upright_tags=False
     )
 
 
