@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.settled_poses import settle
-from list3r.memory.overlap.summaries import chunk_summaries
+from list3r.memory.overlap.summaries import chunk_summaries, is_known, world_unit
 from list3r.memory.store.store import Store
 from tests.test_consolidation import add, chunk, create
 
@@ -81,3 +82,11 @@ def test_settled_poses_are_kept_in_the_memory(store: Store) -> None:
     store.close()
     with Store.open(path, writable=True) as again:
         assert np.array_equal(settled(again)[2].as_matrix(), before)
+
+
+def test_a_metric_memory_knows_its_metre_however_scales_are_rounded(store: Store) -> None:
+    rounded = Sim3(np.nextafter(1.0, 0.0), np.eye(3), np.zeros(3))
+    chunks = [dataclasses.replace(c, S_world_chunk=rounded) for c in store.chunks.all()]
+    assert is_known(chunks, {}) and world_unit(chunks, {}) == 1.0
+    shrunk = [dataclasses.replace(c, S_world_chunk=Sim3(np.asarray(0.98), np.eye(3), np.zeros(3))) for c in chunks]
+    assert not is_known(shrunk, {})

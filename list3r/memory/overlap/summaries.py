@@ -21,6 +21,8 @@ ROOM_DEPTH_M = 2.0
 """How far instances are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
 
 
+_ROUNDED = 1e-9
+"""Products of rigid poses have a scale that differs from 1 by no more."""
 _COLORS = 1000
 """Points of a chunk whose colours tell the light."""
 
@@ -210,7 +212,7 @@ def is_known(chunks: Iterable[ChunkRow], summaries: Mapping[int, ChunkSummary]) 
     """Return whether somebody knows what a metre is in world units: a sensor, or who gave an anchor."""
     if getattr(summaries, "metre", None) is not None:
         return True
-    return all(c.scale_kind == "metric" and float(c.S_world_chunk.scale) == 1.0 for c in chunks)
+    return all(c.scale_kind == "metric" and abs(float(c.S_world_chunk.scale) - 1.0) <= _ROUNDED for c in chunks)
 
 
 def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> float:
