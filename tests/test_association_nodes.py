@@ -12,6 +12,7 @@ import pytest
 from list3r.association.graph.chunk_nodes import ChunkNodes, NodeSettings, measured_walk, relate_frames
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
+from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.overlap.edges import EdgeEnd, measure_edge
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
@@ -84,7 +85,7 @@ def error(samples: dict[int, FrameSamples], graph: GraphResult, bends: dict[int,
 def test_bending_is_undone() -> None:
     samples = chunks(0.02)
     graph = graph_of(samples)
-    straight, bends = bend_chunks(samples.__getitem__, graph, (), False)
+    straight, bends = bend_chunks(SampledChunks(samples.__getitem__), graph, (), False)
     assert set(bends) == set(samples)
     assert error(samples, straight, bends) < 0.75 * error(samples, graph, {})
     assert np.allclose(straight.S_graph_chunk[1].as_matrix(), graph.S_graph_chunk[1].as_matrix(), atol=1e-9)
@@ -93,7 +94,7 @@ def test_bending_is_undone() -> None:
 def test_exact_chunks_stay_as_they_are() -> None:
     samples = chunks(0.0)
     graph = graph_of(samples)
-    straight, bends = bend_chunks(samples.__getitem__, graph, (), False)
+    straight, bends = bend_chunks(SampledChunks(samples.__getitem__), graph, (), False)
     assert max(np.abs(b.twists).max() for b in bends.values()) < 1e-3
     assert error(samples, straight, bends) < 1e-3
 
@@ -101,9 +102,9 @@ def test_exact_chunks_stay_as_they_are() -> None:
 def test_given_poses_and_a_switched_off_graph_do_not_bend() -> None:
     samples = chunks(0.02)
     graph = graph_of(samples)
-    _, bends = bend_chunks(samples.__getitem__, graph, (1, 2), False)
+    _, bends = bend_chunks(SampledChunks(samples.__getitem__), graph, (1, 2), False)
     assert set(bends) == {3, 4}
-    same, none = bend_chunks(samples.__getitem__, graph, (), False, NodeSettings(enabled=False))
+    same, none = bend_chunks(SampledChunks(samples.__getitem__), graph, (), False, NodeSettings(enabled=False))
     assert same is graph and not none
 
 
@@ -111,9 +112,49 @@ def test_metric_chunks_keep_their_scale() -> None:
     samples = {k: bent(film(first=STEP * (k - 1), frames=LENGTH), np.array([0.02] * 6 + [0.0])) for k in range(1, 4)}
     edges = [measure_edge(EdgeEnd(a, samples[a]), EdgeEnd(a + 1, samples[a + 1]), CAMERA, True).edge for a in (1, 2)]
     graph = optimize([1, 2, 3], edges, {}, metric=True)
-    straight, bends = bend_chunks(samples.__getitem__, graph, (), True)
+    straight, bends = bend_chunks(SampledChunks(samples.__getitem__), graph, (), True)
     assert all(float(S.scale) == pytest.approx(1.0, abs=1e-12) for S in straight.S_graph_chunk.values())
     assert all(np.abs(b.twists[:, 6]).max() < 1e-12 for b in bends.values())
+
+
+def test_metric_chunks_bend_alike_wherever_their_origins_lie() -> None:
+    """A chunk whose frame is that of a source far away holds its points at hundreds of metres."""
+    found = []
+    for far in (0.0, 400.0):
+        off = np.eye(4)
+        off[0, 3] = far
+        samples = {k: bent(film(first=STEP * (k - 1), frames=LENGTH), np.array([0.01] * 6 + [0.0])) for k in (1, 2, 3)}
+        samples = {
+            k: replace(s, points=s.points + np.float32([far, 0, 0]), T_chunk_cam=off @ s.T_chunk_cam)
+            for k, s in samples.items()
+        }
+        edges = [
+            measure_edge(EdgeEnd(a, samples[a]), EdgeEnd(a + 1, samples[a + 1]), CAMERA, True).edge for a in (1, 2)
+        ]
+        straight, _ = bend_chunks(
+            SampledChunks(samples.__getitem__), optimize([1, 2, 3], edges, {}, metric=True), (), True
+        )
+        here = Sim3.exp(np.array([far, 0, 0, 0, 0, 0, 0]))
+        found.append([here.inverse() @ S @ here for S in straight.S_graph_chunk.values()])
+    for near, away in zip(*found, strict=True):
+        assert np.allclose(near.as_matrix(), away.as_matrix(), atol=2e-4)
+
+
+def test_what_samples_tell_is_found_once_while_a_memory_is_open(tmp_path: Path) -> None:
+    from tests.test_consolidation import add, chunk, create
+
+    store = create(tmp_path / "a.l3r")
+    for k in range(2):
+        add(store, chunk(k))
+    edge = Edge(1, 2, "adjacent", Sim3.identity(), 0.9, 0.9, 99, 0.0, True, "")
+    first = SampledChunks.of(store).nodes(1, 10), SampledChunks.of(store).relations(edge, 10)
+    again = SampledChunks.of(store)
+    assert (again.nodes(1, 10), again.relations(edge, 10)) == first
+    assert again.nodes(1, 0) is not first[0]
+    alone = SampledChunks(store.chunks.samples)
+    assert np.array_equal(alone.nodes(1, 10).center, first[0].center)
+    assert np.array_equal(alone.relations(edge, 10).off, first[1].off)
+    store.close()
 
 
 def test_chunks_that_show_nothing_and_parts_apart() -> None:
@@ -125,7 +166,7 @@ def test_chunks_that_show_nothing_and_parts_apart() -> None:
     graph = graph_of({k: samples[k] for k in (1, 2, 3, 4)})
     alone = Sim3.exp([9.0, 0, 0, 0, 0, 0, 0])
     graph = replace(graph, S_graph_chunk={**graph.S_graph_chunk, 5: alone}, components={**graph.components, 5: 5})
-    straight, bends = bend_chunks(samples.__getitem__, graph, (), False)
+    straight, bends = bend_chunks(SampledChunks(samples.__getitem__), graph, (), False)
     assert 5 not in bends and np.allclose(straight.S_graph_chunk[5].as_matrix(), alone.as_matrix())
     assert all(np.isfinite(b.twists).all() for b in bends.values())
 
@@ -135,7 +176,7 @@ def test_an_edge_that_is_not_believed_holds_nothing_but_leaves_nothing_loose() -
     graph = graph_of(samples, loop=False)
     doubted = replace(graph.edges[1], accepted=False, scores={**graph.edges[1].scores, "trust": 0.0})
     graph = replace(graph, edges=(graph.edges[0], doubted, graph.edges[2]))
-    straight, bends = bend_chunks(samples.__getitem__, graph, (), False)
+    straight, bends = bend_chunks(SampledChunks(samples.__getitem__), graph, (), False)
     assert all(np.isfinite(S.as_matrix()).all() for S in straight.S_graph_chunk.values())
     assert all(np.abs(b.twists).max() < 0.5 for b in bends.values())
 

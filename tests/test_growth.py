@@ -14,6 +14,7 @@ import pytest
 from list3r.memory.description.colors import Reference
 from list3r.memory.geometry import Sim3
 from list3r.memory.library import instances as library_things
+from list3r.memory.library import writing as library_writing
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels, put_votes
 from list3r.memory.library.rules import WORLD, ConsolidationSettings
@@ -203,6 +204,22 @@ def test_one_floor_goes_on_under_another_id_after_a_while(walks: ModuleType, sto
     floors = store.instances.all(structure=True)
     assert len(floors) > 1
     assert all(np.ptp(i.aabb, axis=0).max() <= 20.0 for i in floors)
+
+
+def test_relations_found_place_by_place_are_those_found_at_once(
+    walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for index, place in enumerate(ORDERS["there and back"]):
+        add(store, visit(walks, index, place))
+    found = tables(store)["relations"]
+    for most in (1, 5):
+        monkeypatch.setattr(library_writing, "_TOGETHER", most)
+        with pytest.raises(_Undone), store.transaction():
+            store.library.forget()
+            consolidate(store, settings=GROW)
+            assert tables(store)["relations"] == found
+            raise _Undone
+    assert len(found) > 20
 
 
 def test_chunks_that_a_loop_closure_moves_are_followed(walks: ModuleType, store: Store) -> None:

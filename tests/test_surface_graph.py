@@ -8,6 +8,7 @@ import numpy as np
 
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
+from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.surface_graph import place_by_surfaces
 from list3r.association.overlap.camera_edge import camera_edge
 from list3r.memory.bends import Bend
@@ -38,7 +39,7 @@ def by_cameras(samples: dict[int, FrameSamples]) -> tuple[GraphResult, dict[int,
     edges = [camera_edge(samples[k], samples[k + 1], k, k + 1) for k in sorted(samples)[:-1]]
     assert all(e is not None for e in edges)
     graph = optimize(sorted(samples), [e for e in edges if e is not None], {}, metric=False)
-    return graph, bend_chunks(samples.__getitem__, graph, (), False)[1]
+    return graph, bend_chunks(SampledChunks(samples.__getitem__), graph, (), False)[1]
 
 
 def scale_errors(graph: GraphResult) -> list[float]:
@@ -62,7 +63,7 @@ def test_depth_tells_how_large_a_chunk_is_and_the_cameras_stay() -> None:
 
     samples = chunks(1.1)
     graph, bends = by_cameras(samples)
-    placed, beside = place_by_surfaces(samples.__getitem__, graph, bends)
+    placed, beside = place_by_surfaces(SampledChunks(samples.__getitem__), graph, bends)
     assert abs(scale_errors(graph)[0]) > 0.04
     assert max(abs(e) for e in scale_errors(placed)) < 0.01
     assert np.allclose(placed.S_graph_chunk[1].as_matrix(), graph.S_graph_chunk[1].as_matrix(), atol=1e-9)
@@ -73,7 +74,7 @@ def test_depth_tells_how_large_a_chunk_is_and_the_cameras_stay() -> None:
 def test_where_cameras_and_depth_agree_nothing_moves() -> None:
     samples = chunks(1.0)
     graph, bends = by_cameras(samples)
-    placed, beside = place_by_surfaces(samples.__getitem__, graph, bends)
+    placed, beside = place_by_surfaces(SampledChunks(samples.__getitem__), graph, bends)
     for k, S in placed.S_graph_chunk.items():
         assert np.abs((graph.S_graph_chunk[k].inverse() @ S).log()).max() < 5e-3
     assert np.abs(cameras(samples, placed, beside) - cameras(samples, graph, bends)).max() < 5e-3
@@ -82,5 +83,5 @@ def test_where_cameras_and_depth_agree_nothing_moves() -> None:
 def test_without_edges_nothing_is_said() -> None:
     samples = chunks(1.1)
     graph = optimize(sorted(samples), [], {}, metric=False)
-    placed, beside = place_by_surfaces(samples.__getitem__, graph, {})
+    placed, beside = place_by_surfaces(SampledChunks(samples.__getitem__), graph, {})
     assert placed is graph and not beside

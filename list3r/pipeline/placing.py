@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from list3r.association.graph.growth import extend
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
+from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.surface_graph import place_by_surfaces
 from list3r.association.overlap.camera_edge import in_one_frame
 from list3r.association.revisits.session_ties import hold_back
@@ -54,6 +55,8 @@ def place_chunks(
     store.edges.add(after for before, after in zip(measured, judged, strict=True) if after is not before)
     if bend:
         graph = _straightened(store, graph, chunks, metric, how)
+    elif new is not None and how.nodes.enabled:
+        _look_ahead(store, graph, new, how)
     known = {} if store.facts.poses == "given" else graph.covariances
     settled = store.facts.gravity in ("known", "estimated") or len(chunks) % how.up_again
     if fitted and len(chunks) > how.up_always and settled:
@@ -96,11 +99,22 @@ def _straightened(
     rigid |= {chunk for e in graph.edges if in_one_frame(e) for chunk in (e.u, e.v)}
     bends: dict[int, Bend] = {}
     if len(rigid) < len(chunks):
-        graph, bends = bend_chunks(store.chunks.samples, graph, rigid, metric, how.nodes, how.graph)
+        graph, bends = bend_chunks(SampledChunks.of(store), graph, rigid, metric, how.nodes, how.graph)
     if not metric and not rigid and all(knows_cameras(store, k) for k in {c.session_id for c in chunks}):
-        graph, bends = place_by_surfaces(store.chunks.samples, graph, bends, how.surfaces)
+        graph, bends = place_by_surfaces(SampledChunks.of(store), graph, bends, how.surfaces)
     store.bends.replace(bends)
     return graph
+
+
+def _look_ahead(store: Store, graph: GraphResult, new: int, how: AssociationSettings) -> None:
+    """Find what the samples of a new chunk tell of how it and the one before bend while they are at hand, so that the
+    end of the session has them all."""
+    samples = SampledChunks.of(store)
+    adjacent = (e for e in graph.edges if e.v == new and e.kind == "adjacent" and e.accepted and not in_one_frame(e))
+    for edge in adjacent:
+        if not poses_given(store, store.chunks.get(new).session_id):
+            samples.relations(edge, how.nodes.frames)
+            samples.nodes(new, how.nodes.frames)
 
 
 def _stated_up(store: Store, graph: GraphResult) -> NDArray[np.float64] | None:

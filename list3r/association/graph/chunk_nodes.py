@@ -8,7 +8,7 @@ reconstruction of it lies to the other: its camera in both chunks, and the ratio
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +101,10 @@ class FrameRelations:
     off: Array
     """x in S_v_u(frame) = S_v_u exp(x), S_v_u that of the edge, about the middle of what the frame sees in u, shifts as
     shares of how far that is. Shape (F, 7)."""
+
+    def rigid(self) -> FrameRelations:
+        """Return what they say of chunks whose scale is known: the shift of that middle, and the turn about it."""
+        return replace(self, off=self.off * ([1.0] * 6 + [0.0]))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ places the chunk, and what is left is the chunk's bend. What it gains: docs/deci
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,15 +22,15 @@ from list3r.association.graph.chunk_nodes import (
     NodeSettings,
     Tie,
     measured_walk,
-    relate_frames,
     ties_of,
     walk_covariance,
 )
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of
-from list3r.association.graph.solver import GraphProblem, stack, take
+from list3r.association.graph.sampled_chunks import SampledChunks
+from list3r.association.graph.solver import GraphProblem, stack, take, unstack
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ class NodeGraphParts:
 
 
 def bend_chunks(
-    read_samples: Callable[[int], FrameSamples],
+    chunks: SampledChunks,
     graph: GraphResult,
     rigid: Collection[int],
     metric: bool,
@@ -72,45 +72,31 @@ def bend_chunks(
     """Return the graph with every chunk where its nodes are on average, and the bend of each chunk.
 
     The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given); chunks
-    without posed frames have no bend. Samples are read chunk by chunk in order, two at a time are held.
+    without posed frames have no bend.
     """
     chosen = settings or NodeSettings()
     known = graph.S_graph_chunk
     believed = [e for e in graph.edges if e.u in known and e.v in known and (e.accepted or "trust" in e.scores)]
     if not chosen.enabled or not believed:
         return graph, {}
-    pieces = pieces_of(read_samples, sorted(graph.S_graph_chunk), believed, rigid, chosen)
+    pieces = pieces_of(chunks, sorted(graph.S_graph_chunk), believed, rigid, chosen)
     start = [graph.S_graph_chunk[c] for c, nodes in pieces.nodes.items() for _ in nodes.at]
     problem = _problem(pieces, believed, graph.components, metric, chosen, weights or GraphSettings())
     placed = problem.solve(stack(start), np.ones(len(problem.u)), _STEPS)
-    return _settled(placed, pieces.nodes, pieces.first, graph, rigid)
+    return _settled(placed, pieces.nodes, graph, rigid)
 
 
 def pieces_of(
-    read_samples: Callable[[int], FrameSamples],
-    ids: Sequence[int],
-    believed: Sequence[Edge],
-    rigid: Collection[int],
-    settings: NodeSettings,
+    chunks: SampledChunks, ids: Sequence[int], believed: Sequence[Edge], rigid: Collection[int], settings: NodeSettings
 ) -> NodeGraphParts:
     """Return nodes of all chunks and relations of adjacent ones, in one pass over the samples."""
     to = {e.v: e for e in believed if e.kind == "adjacent" and e.accepted}
-    nodes: dict[int, ChunkNodes] = {}
-    relations = []
-    before: tuple[int, FrameSamples] | None = None
+    length = {k: 0 if k in rigid else settings.frames for k in {*ids, *(e.u for e in to.values())}}
+    nodes, relations = {}, []
     for chunk in ids:
-        samples = read_samples(chunk)
-        samples = _known_poses(samples)
-        length = 0 if chunk in rigid else settings.frames
-        if len(samples.camera_frames) == 0:
-            nodes[chunk] = _one_node()
-        else:
-            nodes[chunk] = ChunkNodes.of(samples, length)
-        edge = to.get(chunk)
-        if edge is not None:
-            there = before[1] if before is not None and before[0] == edge.u else _known_poses(read_samples(edge.u))
-            relations.append((edge, relate_frames(there, samples, edge, nodes[edge.u])))
-        before = (chunk, samples)
+        nodes[chunk] = chunks.nodes(chunk, length[chunk])
+        if (edge := to.get(chunk)) is not None:
+            relations.append((edge, chunks.relations(edge, length[edge.u])))
     return NodeGraphParts(nodes, relations)
 
 
@@ -140,13 +126,16 @@ def _problem(
             add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), walk_covariance(nodes, k, walk))
     tied = set()
     for edge, relations in pieces.relations:
+        relations = relations.rigid() if metric else relations
         ties = ties_of(relations, edge, pieces.nodes[edge.u], pieces.nodes[edge.v], settings)
         for tie in ties:
             add(first[edge.u] + tie.u, first[edge.v] + tie.v, tie.S_v_u, tie.covariance)
         if ties:
             tied.add((edge.u, edge.v))
     size = 6 if metric else 7
-    information = inverses(np.array(covariances).reshape(-1, 7, 7)[:, :size, :size])
+    # Where scale is known it is not one more unknown: the block of the inverse, not the inverse of the block. Else what
+    # ratios of depths leave open would let a chunk slide towards its origin, however far that is.
+    information = inverses(np.array(covariances).reshape(-1, 7, 7))[:, :size, :size]
     rest = [e for e in believed if e.kind != "adjacent" or (e.u, e.v) not in tied]
     for edge in rest:
         tie = _whole(edge, pieces.nodes)
@@ -174,20 +163,23 @@ def _whole(edge: Edge, nodes: Mapping[int, ChunkNodes]) -> Tie:
 def _settled(
     placed: Sim3,
     nodes: Mapping[int, ChunkNodes],
-    first: Mapping[int, int],
     graph: GraphResult,
     rigid: Collection[int],
 ) -> tuple[GraphResult, dict[int, Bend]]:
     """Place the chunks at the mean of their nodes, moved so that the first chunk of each component stays, and their
     bends."""
-    poses, bends = {}, {}
-    for chunk, mine in nodes.items():
-        S = graph.S_graph_chunk[chunk]
-        here = take(placed, np.arange(first[chunk], first[chunk] + len(mine.at)))
-        x = (repeated(S.inverse(), len(mine.at)) @ here).log()
-        poses[chunk] = S @ Sim3.exp(np.asarray(mine.count @ x / mine.count.sum()))
-        if len(mine.at) > 1 and chunk not in rigid:
-            bends[chunk] = Bend(mine.at, (repeated(poses[chunk].inverse(), len(mine.at)) @ here).log())
+    chunks = list(nodes)
+    sizes = [len(nodes[c].at) for c in chunks]
+    owner, weight = np.repeat(np.arange(len(chunks)), sizes), np.concatenate([nodes[c].count for c in chunks])
+    S = stack([graph.S_graph_chunk[c] for c in chunks])
+    x = (take(S, owner).inverse() @ placed).log()
+    sums = np.stack([np.bincount(owner, weight * column) for column in x.T], axis=1)
+    middle = S @ Sim3.exp(sums / np.bincount(owner, weight)[:, None])
+    poses = unstack(middle, chunks)
+    twists = np.split((take(middle, owner).inverse() @ placed).log(), np.cumsum(sizes)[:-1])
+    bends = {
+        c: Bend(nodes[c].at, x) for c, x in zip(chunks, twists, strict=True) if len(nodes[c].at) > 1 and c not in rigid
+    }
     back = {c: graph.S_graph_chunk[c] @ poses[c].inverse() for c in poses if graph.components[c] == c}
     moved = {c: back[graph.components[c]] @ S for c, S in poses.items()}
     return replace(graph, S_graph_chunk=moved), bends
@@ -202,18 +194,3 @@ def inverses(covariance: Array) -> Array:
 def repeated(S: Sim3, count: int) -> Sim3:
     """Return the same similarity many times over."""
     return Sim3(np.full(count, float(S.scale)), np.tile(S.rotation, (count, 1, 1)), np.tile(S.translation, (count, 1)))
-
-
-def _known_poses(samples: FrameSamples) -> FrameSamples:
-    """Return the samples without frames whose pose is not finite."""
-    good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
-    if good.all():
-        return samples
-    return replace(samples, camera_frames=samples.camera_frames[good], T_chunk_cam=samples.T_chunk_cam[good])
-
-
-def _one_node() -> ChunkNodes:
-    """Return a chunk that shows nothing."""
-    zero = np.zeros(1)
-    none = np.zeros(1, np.int64)
-    return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64))

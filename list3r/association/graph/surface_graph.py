@@ -7,7 +7,7 @@ their graph has them; the difference is part of each chunk's bend.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,10 +17,11 @@ from list3r.association.graph.chunk_nodes import ChunkNodes, NodeSettings, ties_
 from list3r.association.graph.edge_information import about
 from list3r.association.graph.node_graph import inverses, pieces_of, repeated
 from list3r.association.graph.pose_graph import GraphResult
+from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.solver import GraphProblem, stack, unstack
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ class SurfaceSettings:
 
 
 def place_by_surfaces(
-    read_samples: Callable[[int], FrameSamples],
+    chunks: SampledChunks,
     graph: GraphResult,
     bends: Mapping[int, Bend],
     settings: SurfaceSettings | None = None,
@@ -58,7 +59,7 @@ def place_by_surfaces(
     believed = [e for e in graph.edges if e.accepted and e.u in known and e.v in known]
     if not believed:
         return graph, dict(bends)
-    pieces = pieces_of(read_samples, ids, believed, set(ids), NodeSettings())
+    pieces = pieces_of(chunks, ids, believed, set(ids), NodeSettings())
     relations = {(e.u, e.v): r for e, r in pieces.relations}
     ties: list[tuple[Edge, Sim3, Array]] = []
     for edge in believed:

@@ -69,7 +69,7 @@ def consolidate(
     if not chunks:
         return ConsolidationReport(0, 0, (), (), 0)
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
-    summaries, before = chunk_summaries(store, s.shapes), store.library.settled.all()
+    summaries, before = chunk_summaries(store, s.shapes, hold=True), store.library.settled.all()
     ledger, known = read_ledger(store, chunks), store.facts[WORLD]
     world = _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))

@@ -31,6 +31,9 @@ _REACH_M = 0.85
 _RINGS = 3
 """Whether two instances are related is decided by what holds them, and by what holds that."""
 
+_TOGETHER, _PLACE_M = 256, 8.0
+"""Most instances whose relations are found at once, and the edge of the places by which those are chosen."""
+
 
 class Writer:
     """Derives and writes the instances of one derivation."""
@@ -203,7 +206,15 @@ class Writer:
         return float(np.quantile(heights, self._s.structure.eye_level)) if len(heights) else np.inf
 
     def relate(self, touched: Mapping[int, Array]) -> None:
-        """Find the relations of what changed and of what is near it again, among all that is near those."""
+        """Find the relations of what changed and of what is near it again, among all that is near those.
+
+        A scene takes memory by the square of its instances, so many are looked at place by place.
+        """
+        order = sorted(touched, key=lambda n: (*np.floor(touched[n].mean(axis=0) / (_PLACE_M * self._world.unit)), n))
+        for first in range(0, len(order), _TOGETHER):
+            self._relate({n: touched[n] for n in order[first : first + _TOGETHER]})
+
+    def _relate(self, touched: Mapping[int, Array]) -> None:
         unit, s = self._world.unit, self._s.relations
         reach = np.array([_REACH_M, _REACH_M, max(_REACH_M, s.above_m)]) * unit
         near = self._stored({n for box in touched.values() for n in self._near(box, reach)})

@@ -67,6 +67,17 @@ class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None, frozenset[int]
         super().__init__(_KEPT_BYTES, _bytes_of)
 
 
+_HELD_BYTES = 256 << 20
+"""While a library is derived more are held: where all chunks moved they are asked for in one pass after another."""
+
+
+class _HeldSummaries(LruCache[tuple[int, frozenset[int]], ChunkSummary]):
+    """By chunk id and local instances that are left out."""
+
+    def __init__(self) -> None:
+        super().__init__(_HELD_BYTES, _bytes_of)
+
+
 class PlanesCache(LruCache[tuple[int, int], Planes]):
     """Planes by chunk id and checksum of what the chunk measured: of up to 64 chunks they are asked for with every new
     one, when much of what those saw is left out of their summaries.
@@ -79,15 +90,17 @@ class PlanesCache(LruCache[tuple[int, int], Planes]):
 class Summaries(Mapping[int, ChunkSummary]):
     """The summaries of chunks by id, derived when first asked for.
 
-    They depend on what the chunks measured, not on where they are placed.
+    They depend on what the chunks measured, not on where they are placed. With `hold` more of them are held as long as
+    this object is.
     """
 
-    def __init__(self, store: Store, settings: ShapeSettings | None = None) -> None:
+    def __init__(self, store: Store, settings: ShapeSettings | None = None, *, hold: bool = False) -> None:
         self._store = store
         self._settings = settings
         self._ids = [c.chunk_id for c in store.chunks.all()]
         self._known = store.derived.of(SummaryCache)
         self._checked: dict[int, int] = {}
+        self._held = _HeldSummaries() if hold else None
 
     def __getitem__(self, chunk_id: int) -> ChunkSummary:
         return self._found(chunk_id, frozenset())
@@ -97,6 +110,12 @@ class Summaries(Mapping[int, ChunkSummary]):
         return self._found(chunk_id, left_out)
 
     def _found(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
+        if self._held is None:
+            return self._known_or_derived(chunk_id, left_out)
+        held = self._held.get((chunk_id, left_out))
+        return held or self._held.put((chunk_id, left_out), self._known_or_derived(chunk_id, left_out))
+
+    def _known_or_derived(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
         key = chunk_id, self._checksum(chunk_id), self._settings, left_out
         found = self._known.get(key)
         if found is not None:
@@ -147,9 +166,9 @@ class SomeSummaries(Mapping[int, ChunkSummary]):
         return len(self._ids)
 
 
-def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> Summaries:
+def chunk_summaries(store: Store, settings: ShapeSettings | None = None, *, hold: bool = False) -> Summaries:
     """Return the summaries of all chunks by id; without settings, by those that the memory was begun with."""
-    return Summaries(store, settings or stored_settings(store, ShapeSettings, "library", "shapes"))
+    return Summaries(store, settings or stored_settings(store, ShapeSettings, "library", "shapes"), hold=hold)
 
 
 def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:

@@ -1,0 +1,96 @@
+"""What the samples of chunks alone tell of how they bend, each piece once: their nodes, and the relations of the frames
+that two chunks hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import replace
+
+import numpy as np
+
+from list3r.association.graph.chunk_nodes import ChunkNodes, FrameRelations, relate_frames
+from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.store.derived import Derived, LruCache
+from list3r.memory.store.store import Store
+
+_KEPT_BYTES = 12 << 20
+"""Of nodes, and of relations; each takes some 3 kB of a chunk. More are found again when they are asked for."""
+
+
+class _Nodes(LruCache[Hashable, ChunkNodes]):
+    """By chunk, checksum of what it measured, and frames of a node."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, _bytes_of)
+
+
+class _Relations(LruCache[Hashable, FrameRelations]):
+    """By the edge, checksums of what its chunks measured, and frames of a node."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, _bytes_of)
+
+
+class _Samples(LruCache[Hashable, FrameSamples]):
+    """Of the two chunks that were asked for last."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+
+
+class SampledChunks:
+    """The samples of chunks. Of two at a time they are held; with a store what follows from them is kept as long as it
+    is open, so that the end of a session need not read them all again."""
+
+    def __init__(self, read: Callable[[int], FrameSamples], store: Store | None = None) -> None:
+        self._read, self._store = read, store
+        derived = Derived() if store is None else store.derived
+        self._nodes, self._relations, self._held = derived.of(_Nodes), derived.of(_Relations), derived.of(_Samples)
+
+    @staticmethod
+    def of(store: Store) -> SampledChunks:
+        """Return those of a memory."""
+        return SampledChunks(store.chunks.samples, store)
+
+    def nodes(self, chunk: int, length: int) -> ChunkNodes:
+        """Return the nodes of a chunk, runs of `length` frames."""
+        key = chunk, self._stamp(chunk), length
+        found = self._nodes.get(key)
+        if found is None:
+            samples = self._samples(chunk)
+            found = ChunkNodes.of(samples, length) if len(samples.camera_frames) else _one_node()
+        return self._nodes.put(key, found)
+
+    def relations(self, edge: Edge, length: int) -> FrameRelations:
+        """Return the relation of every frame that both chunks of an edge hold; `length` is that of the nodes of u."""
+        key = edge.u, edge.v, self._stamp(edge.u), self._stamp(edge.v), edge.S_v_u.as_matrix().tobytes(), length
+        found = self._relations.get(key)
+        if found is None:
+            nodes = self.nodes(edge.u, length)
+            found = relate_frames(self._samples(edge.u), self._samples(edge.v), edge, nodes)
+        return self._relations.put(key, found)
+
+    def _stamp(self, chunk: int) -> int:
+        return 0 if self._store is None else self._store.chunks.checksum(chunk)
+
+    def _samples(self, chunk: int) -> FrameSamples:
+        """Return the samples of a chunk without frames whose pose is not finite."""
+        key = chunk, self._stamp(chunk)
+        held = self._held.get(key)
+        if held is not None:
+            return held
+        samples = self._read(chunk)
+        good = np.isfinite(samples.T_chunk_cam).all(axis=(1, 2))
+        if not good.all():
+            samples = replace(samples, camera_frames=samples.camera_frames[good], T_chunk_cam=samples.T_chunk_cam[good])
+        return self._held.put(key, samples)
+
+
+def _one_node() -> ChunkNodes:
+    """Return a chunk that shows nothing."""
+    zero, none = np.zeros(1), np.zeros(1, np.int64)
+    return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64))
+
+
+def _bytes_of(found: ChunkNodes | FrameRelations) -> int:
+    return sum(int(part.nbytes) + 100 for part in vars(found).values())
