@@ -249,6 +249,20 @@ def test_the_index_of_vectors_grows_with_them(vectors: Catalog, server: Postgres
         backend.drop(name)
 
 
+def test_of_wide_vectors_fewer_lists_are_looked_at(vectors: Catalog) -> None:
+    backend, space, wide = vectors._backend, "wide@1/200", np.random.default_rng(5).normal(size=(600, 200))
+    with backend.loading(many=False):
+        held = SpaceVectors(space, np.arange(600), wide.astype(np.float32))
+        backend.put(replace(content("wide", 600), spaces=[held]))
+    found = vectors.similar("wide", instance_id=4, k=400)  # more than the first lists hold
+    assert len(found) == 400
+    cosine = wide @ wide[4] / np.linalg.norm(wide, axis=1) / np.linalg.norm(wide[4])
+    assert [m.score for m in found] == pytest.approx([cosine[m.id] for m in found], abs=2e-3)
+    assert backend._rows_in_fewer_lists("SHOW ivfflat.probes", ()) == [("20",)]  # type: ignore[attr-defined]
+    assert backend._rows("SHOW ivfflat.probes", ()) == [("40",)]  # type: ignore[attr-defined]
+    backend.drop("wide")
+
+
 def test_what_is_equally_alike_comes_by_name(vectors: Catalog) -> None:
     backend, space = vectors._backend, "ties@1/16"
     names = ("b", "c", "a")

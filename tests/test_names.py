@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from list3r.evaluation.calibration import calibration
 from list3r.instances.geometric.support import without_fliers
+from list3r.instances.learned.belief import NameBelief, NameSigns, believed, name_signs
 from list3r.memory.library.labels import (
     OWN_NAMES,
     LabelSettings,
@@ -17,7 +22,7 @@ from list3r.memory.library.labels import (
 )
 
 
-@pytest.mark.parametrize("probability", [0.55, 0.7, 0.9])
+@pytest.mark.parametrize("probability", [0.67, 0.75, 0.9])
 def test_one_chunk_gives_the_probability_that_it_was_told(probability: float) -> None:
     votes = {OWN_NAMES: votes_of_probabilities([("chair", probability), ("table", 0.1 * (1 - probability))])}
     said = decide(votes)
@@ -28,7 +33,7 @@ def test_one_chunk_gives_the_probability_that_it_was_told(probability: float) ->
 def test_what_is_unsure_stays_unnamed_and_several_chunks_are_as_sure_as_in_the_mean() -> None:
     one = votes_of_probabilities([("chair", 0.45), ("stool", 0.3)])
     assert decide({OWN_NAMES: one}) is None
-    sure = votes_of_probabilities([("chair", 0.7)])
+    sure = votes_of_probabilities([("chair", 0.85)])
     single, double = decide({OWN_NAMES: sure}), decide({OWN_NAMES: sure + sure})
     assert single is not None and double is not None and double[1] == pytest.approx(single[1])
     doubted = decide({OWN_NAMES: sure + one})
@@ -42,6 +47,39 @@ def test_a_detector_overrules_the_discoverer() -> None:
     assert alone is not None and alone[0] == "couch" and both == alone
     silent = decide_by_rank({OWN_NAMES: own, "detector": votes_of_names([])})
     assert silent is not None and silent[0] == "chair"
+
+
+def test_what_only_the_discoverer_says_must_be_surer_than_what_a_detector_says() -> None:
+    votes = votes_of_probabilities([("chair", 0.6)])
+    assert decide({"detector": votes}) is not None
+    assert decide_by_rank({"detector": votes}) is not None and decide_by_rank({OWN_NAMES: votes}) is None
+    lenient = replace(LabelSettings(), min_own=0.5)
+    assert decide_by_rank({OWN_NAMES: votes}, settings=lenient) == decide({OWN_NAMES: votes})
+
+
+@given(st.integers(0, 10_000))
+def test_what_is_believed_keeps_the_likeliest_name_and_adds_up_to_no_more_than_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    names = rng.dirichlet(np.full(6, 0.5), 5) * rng.uniform(0.05, 1.0, (5, 1))
+    right = rng.uniform(0.0, 1.0, 5)
+    out = believed(names, right)
+    rows, best = np.arange(5), names.argmax(axis=1)
+    assert np.allclose(out[rows, best], right)
+    assert (out >= 0.0).all() and (out.sum(axis=1) <= 1.0 + 1e-9).all()
+    less = right <= names[rows, best]
+    assert (out.argmax(axis=1) == best)[less].all()
+
+
+def test_a_name_is_believed_less_in_a_room_full_of_doubt_and_of_what_is_no_whole() -> None:
+    belief, whole = NameBelief(), np.full(10, 0.9)
+    sure = np.array([[0.9, 0.1]])
+    names = np.concatenate([sure, np.repeat([[0.35, 0.3]], 9, axis=0)])
+    alone = belief.probability(name_signs(sure, whole[:1], np.zeros(1)))[0]
+    among = belief.probability(name_signs(names, whole, np.zeros(10)))[0]
+    walls = belief.probability(name_signs(names, whole, np.array([0.0] + 9 * [1.0])))[0]
+    assert among < alone and walls == pytest.approx(alone), "structure has no names"
+    signs = NameSigns(np.array([2.0, 2.0]), np.array([0.9, 0.4]), 1.0)
+    assert np.diff(belief.probability(signs))[0] < 0.0
 
 
 def test_readings_that_fly_are_left_out_and_small_things_kept() -> None:

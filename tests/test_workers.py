@@ -235,3 +235,17 @@ def test_workers_end_when_their_parent_is_ended(tmp_path: Path, how: signal.Sign
         script.kill()
         os.kill(child, signal.SIGKILL)
         script.stdout.close()
+
+
+def test_processes_that_were_started_before_serve_the_tasks() -> None:
+    """What they do first may fail; of those that were started only as many are kept as there are tasks."""
+    with OrderedPool(later, 3) as pool:
+        pool.start(die_of_nothing)
+        pool.keep(2)
+        found = list(pool.map(range(5)))
+    assert [number for number, _ in found] == list(range(5))
+    assert 1 <= len({process for _, process in found}) <= 2
+
+
+def die_of_nothing(number: int) -> None:
+    raise OptionError(f"process {number} cannot get ready")

@@ -36,6 +36,9 @@ _BUILD_MEMORY = "2GB"
 """What the server may take while it makes an index of vectors."""
 _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
+_WIDE, _LISTS_OF_WIDE = 128, 20
+"""Numbers of a vector beyond which so many lists are looked at instead of 40: wider vectors take longer to compare, and
+fewer lists find as many. docs/decisions/0141-lists-of-vectors.md."""
 _WRITTEN = "written"
 _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""
@@ -256,8 +259,9 @@ class PostgresBackend:
             f"SELECT memory_id, id, 1 - apart FROM (SELECT memory_id, id, v <=> ?::halfvec AS apart "
             f"FROM vector_{self._space(space)}{only} ORDER BY {apart} FETCH FIRST (?) ROWS WITH TIES) near LIMIT ?"
         )
+        ask = self._rows if len(vector) <= _WIDE else self._rows_in_fewer_lists
         while True:
-            rows = self._rows(query, (asked, *given, asked, count, _MOST_ALIKE))
+            rows = ask(query, (asked, *given, asked, count, _MOST_ALIKE))
             found = self._passing([row[:2] for row in rows], filters)
             out = [(found[n, i], float(c)) for n, i, c in rows if (n, i) in found]
             if len(out) >= k or len(rows) < count or count >= _MOST_ALIKE:
@@ -312,6 +316,11 @@ class PostgresBackend:
         except psycopg.Error as error:
             raise self._failed("asked", error) from error
         with self._connected("asked") as connection:
+            return _asked(connection, query, values)
+
+    def _rows_in_fewer_lists(self, query: str, values: Sequence[Any]) -> list[Any]:
+        with self._connected("asked") as connection, connection.transaction():
+            connection.execute(f"SET LOCAL ivfflat.probes = {_LISTS_OF_WIDE}")
             return _asked(connection, query, values)
 
     @contextlib.contextmanager

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -16,15 +17,16 @@ from list3r import __version__
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.memory.errors import TrackingError
+from list3r.memory.records import ChunkResult
 from list3r.memory.room import BUILD_MB, check_address_space
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import BuildReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Before, Job, Plan, add_chunks, lost_reasons, plan_session, prepare
+from list3r.pipeline.session import Before, Job, Plan, add_chunks, chunk_pool, lost_reasons, plan_session, prepare
 from list3r.pipeline.settings import BuildSettings
-from list3r.pipeline.target import make_folder, open_target
+from list3r.pipeline.target import Target, make_folder, open_target
 from list3r.reconstruction.registry import entry
 
 
@@ -52,8 +54,9 @@ def build(
         make_folder(watch.debug_dir)
     with open_target(memory, job.info, job.settings, resume=run.resume, force=run.force) as target:
         session = _session(target.store, job)
-        plan = plan_session(target.store, session, job, watch)
-        add_chunks(target.store, job, plan, watch, added=lambda part: target.keep() if part.posed.any() else None)
+        with chunk_pool(job) as pool:
+            plan = plan_session(target.store, session, job, watch)
+            add_chunks(target.store, job, plan, pool, watch, added=partial(_keep, target))
         _check_posed(target.store, job.info, plan)
         with threadpool_limits(1):
             finish_session(target.store, session, job.settings.association, job.settings.carving)
@@ -63,6 +66,12 @@ def build(
     if failure is not None:
         raise FinishingError(failure, report)
     return report
+
+
+def _keep(target: Target, part: ChunkResult) -> None:
+    """Keep the memory, whatever happens, once the camera is placed somewhere."""
+    if part.posed.any():
+        target.keep()
 
 
 def _session(store: Store, job: Job) -> int:

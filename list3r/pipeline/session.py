@@ -28,7 +28,7 @@ from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
 from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
 from list3r.pipeline.chunks.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
-from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
+from list3r.pipeline.chunks.chunk import ChunkTask, get_ready, process_parts
 from list3r.pipeline.chunks.joint_windows import ChunkPool, joint_windows
 from list3r.pipeline.chunks.whole_map import map_spans, map_whole, takes_wide_steps
 from list3r.pipeline.finishing import check_run
@@ -189,6 +189,7 @@ def add_chunks(
     store: Store,
     job: Job,
     plan: Plan,
+    pool: ChunkPool,
     watch: Watch,
     *,
     library: bool = True,
@@ -206,7 +207,9 @@ def add_chunks(
     watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
     how = job.settings.association
-    with _pool(job, plan.left) as pool, threadpool_limits(1):
+    if isinstance(pool, OrderedPool):
+        pool.keep(plan.left)
+    with threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
         for task, results in zip(plan.tasks(), pool.map(plan.tasks()), strict=True):
             found = [row for part in results for row in part.bad_frames]
@@ -224,15 +227,22 @@ def add_chunks(
         write_revisits(store, session, plan.whole, how.revisits.search.suppress_frames)
 
 
-def _pool(job: Job, left: int) -> ChunkPool:
-    """Return what works on so many chunks: processes of this machine, or a Ray cluster."""
+def chunk_pool(job: Job) -> ChunkPool:
+    """Return what works on the chunks of a video: processes of this machine, or a Ray cluster.
+
+    The processes start at once, so that they have imported what a chunk needs when the chunks are planned.
+    """
     asked, settings = job.run.workers, job.settings
     if job.run.engine == "ray":
         from list3r.pipeline.workers.ray_pool import RayPool
 
         gpu = settings.device != "cpu" and uses_networks(settings)
         return RayPool(process_parts, asked, job.run.address, gpu=gpu)
-    return OrderedPool(process_parts, min(usual_workers(settings) if asked is None else asked, left))
+    chunks = min(settings.chunks, settings.video_map.chunks, key=lambda c: c.length - c.overlap)
+    most = len(plan_chunks(job.info.frame_count, chunks))
+    pool = OrderedPool(process_parts, min(usual_workers(settings) if asked is None else asked, most))
+    pool.start(partial(get_ready, settings))
+    return pool
 
 
 def _library_due(chunks: int, how: AssociationSettings) -> bool:

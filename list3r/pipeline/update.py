@@ -22,7 +22,17 @@ from list3r.pipeline.finishing import FinishingError, finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import UpdateReport, update_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Before, Job, Plan, add_chunks, lost_reasons, plan_session, prepare, take_back
+from list3r.pipeline.session import (
+    Before,
+    Job,
+    Plan,
+    add_chunks,
+    chunk_pool,
+    lost_reasons,
+    plan_session,
+    prepare,
+    take_back,
+)
 from list3r.pipeline.settings import BuildSettings
 
 
@@ -63,8 +73,9 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     if _complete(store, session):
         return plan_session(store, session, job, watch)
     try:
-        plan = plan_session(store, session, job, watch)
-        add_chunks(store, job, plan, watch, library=False)
+        with chunk_pool(job) as pool:
+            plan = plan_session(store, session, job, watch)
+            add_chunks(store, job, plan, pool, watch, library=False)
         _check_posed(store, session, job.info)
     except BaseException:
         with suppress(MemoryFileError):  # what was wrong first is told; the next update takes it back

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from importlib import import_module
+from types import ModuleType
 
 from list3r.memory.errors import OptionError
 from list3r.reconstruction.base import Reconstructor
@@ -78,8 +79,12 @@ MODELS: dict[str, ModelEntry] = {
 
 def make_reconstructor(name: str, options: ModelOptions) -> Reconstructor:
     """Return the model of that name. Raises `OptionError` for a name that is not known or a package that is missing."""
-    model = import_module(f"list3r.reconstruction.{entry(name).module}").make(options)
-    return model  # type: ignore[no-any-return]
+    return import_model(name).make(options)  # type: ignore[no-any-return]
+
+
+def import_model(name: str) -> ModuleType:
+    """Return the module of the model of that name, imported."""
+    return import_module(f"list3r.reconstruction.{entry(name).module}")
 
 
 def usual_model(has_depth: bool) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.learned.agglomeration import STRONGEST
+from list3r.instances.learned.belief import NameBelief, believed, name_signs
 from list3r.instances.learned.graph import PieceGraph
 from list3r.instances.learned.network import Judgement, Weights, two_layers
 
@@ -42,17 +43,27 @@ def names_of(weights: Weights) -> tuple[str, ...]:
     return tuple(weights["names"].tolist())
 
 
-def judge_things(weights: Weights, own: NDArray[np.int64], graph: PieceGraph, told: Judgement) -> ThingVerdicts:
+def judge_things(
+    weights: Weights, own: NDArray[np.int64], graph: PieceGraph, told: Judgement, belief: NameBelief | None = None
+) -> ThingVerdicts:
     """Judge clusters of parts; `own` is the cluster of each part, from 0. Shape (P,)."""
     structure, x = thing_features(own, graph, told)
-    x = (x - weights["things.mean"]) / weights["things.std"]
-    out = two_layers(weights, "things.net", np.asarray(x, np.float32))
+    whole, names = first_verdicts(weights, x)
+    signs = name_signs(names, whole, structure)
+    names = believed(names, (belief or NameBelief()).probability(signs))
+    return ThingVerdicts(structure.astype(np.float32), whole.astype(np.float32), names.astype(np.float32))
+
+
+def first_verdicts(weights: Weights, x: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the probabilities of being one whole (T,) and of the names (T, C) by what the judge was trained on."""
+    out = two_layers(
+        weights, "things.net", np.asarray((x - weights["things.mean"]) / weights["things.std"], np.float32)
+    )
     a, b = (float(v) for v in weights["things.whole"])
     whole = 1.0 / (1.0 + np.exp(-np.clip(a * out[:, 0] + b, -20.0, 20.0)))
     odds = out[:, 1:] / np.maximum(weights["things.temperature"], np.float32(1e-3))
-    names = np.exp(odds - odds.max(axis=1, keepdims=True))
-    names = names / names.sum(axis=1, keepdims=True)
-    return ThingVerdicts(structure.astype(np.float32), whole.astype(np.float32), names.astype(np.float32))
+    names = np.exp((odds - odds.max(axis=1, keepdims=True)).astype(np.float64))
+    return whole.astype(np.float64), names / names.sum(axis=1, keepdims=True)
 
 
 def thing_features(

@@ -9,6 +9,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
-from list3r.reconstruction.registry import ModelOptions, make_reconstructor
+from list3r.reconstruction.registry import ModelOptions, import_model, make_reconstructor
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,13 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
         made = _with_repeats(_with_between(made, part.between, used), repeats)
         results.append(made if last else replace(made, index=task.span.index + number * PART_STEP))
     return tuple(results)
+
+
+def get_ready(settings: BuildSettings, number: int) -> None:
+    """Import what chunks will need, in the process of that number. Weights are loaded with the first chunk."""
+    import_model(settings.reconstruction)
+    if settings.discovery == "learned":
+        import_module("list3r.instances.learned.discovery")
 
 
 PART_STEP = 1_000_000

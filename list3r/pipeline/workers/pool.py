@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
@@ -83,14 +83,24 @@ class OrderedPool(Generic[Task, Result]):
         answer: Answer = self._outcome(self._submit(work, question))
         return answer
 
+    def start(self, work: Callable[[int], object]) -> None:
+        """Start all processes now and let each call a function with its number, such as one that imports what tasks
+        will need. Nothing waits for it, and what it raises is not told.
+        """
+        for number in range(self._workers):
+            self._submit(work, number)
+
+    def keep(self, most: int) -> None:
+        """Use so many processes at most from now on; end the last ones of those that run."""
+        self._workers = min(self._workers, most)
+        spare, self._processes = self._processes[self._workers :], self._processes[: self._workers]
+        _end(spare)
+
     def stop(self) -> None:
         """End the processes of this pool at once."""
         processes, self._processes = self._processes, []
         self._waiting.clear()
-        for process in processes:
-            process.kill()
-        for process in processes:
-            process.close()
+        _end(processes)
 
     def _submit(self, work: Callable[[Any], Any], argument: object) -> WorkerJob:
         job = WorkerJob(work, argument)
@@ -125,3 +135,10 @@ class OrderedPool(Generic[Task, Result]):
         if job.error is not None:
             raise job.error
         return job.result
+
+
+def _end(processes: Sequence[Worker]) -> None:
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.close()

@@ -41,8 +41,9 @@ def adjust(
         return None
     mapper, made = mapper_with_poses(cache, T_map_cam)
     options = mapper_options(camera, "k1", settings.mapping)
-    for gate in settings.gates_px:
-        _round(mapper, made, options, gate * pixel_unit(camera), settings, pixel_unit(camera))
+    for gate, iterations in zip(settings.gates_px, (*settings.early_iterations, settings.iterations), strict=True):
+        options.mapper.filter_max_reproj_error = gate * pixel_unit(camera)
+        _round(mapper, made, options, iterations, settings.loss_px * pixel_unit(camera))
     found = sparse_map(made, problem, camera)
     kept = {k: T for k, T in found.T_map_cam.items() if len(found.seen[k].ids) >= settings.least_points}
     seen = {k: found.seen[k] for k in kept}
@@ -62,23 +63,23 @@ def agreeing_rows(
     return out
 
 
-def _round(mapper: Any, made: Any, options: Any, gate_px: float, settings: AdjustmentSettings, unit: float) -> None:
-    """Triangulate what is within a gate, adjust, and leave out what is not any more."""
+def _round(mapper: Any, made: Any, options: Any, iterations: int, loss_px: float) -> None:
+    """Triangulate what is within the gate of the options, adjust, and leave out what is not any more."""
+    gate_px = options.mapper.filter_max_reproj_error
     focal = float(next(iter(made.cameras.values())).params[0])
     triangulation = options.triangulation
     angle = float(np.degrees(np.arctan(gate_px / focal)))
     triangulation.create_max_angle_error = triangulation.continue_max_angle_error = angle
     triangulation.complete_max_reproj_error = triangulation.merge_max_reproj_error = gate_px
-    options.mapper.filter_max_reproj_error = gate_px
     for image_id in sorted(made.images):
         mapper.triangulate_image(triangulation, image_id)
     mapper.complete_and_merge_tracks(triangulation)
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.refine_focal_length = adjustment.print_summary = False
     ceres = adjustment.ceres
-    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.SOFT_L1, settings.loss_px * unit
+    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.SOFT_L1, loss_px
     ceres.solver_options.num_threads = 1
-    ceres.solver_options.max_num_iterations = settings.iterations
+    ceres.solver_options.max_num_iterations = iterations
     ceres.solver_options.function_tolerance = 1e-6
     mapper.adjust_global_bundle(options.mapper, adjustment)
     mapper.filter_points(options.mapper)
