@@ -56,7 +56,7 @@ def build(
         session = _session(target.store, job)
         with chunk_pool(job) as pool:
             plan = plan_session(target.store, session, job, watch)
-            add_chunks(target.store, job, plan, pool, watch, added=partial(_keep, target))
+            add_chunks(target.store, job, plan, pool, watch, partial(_keep, target))
         _check_posed(target.store, job.info, plan)
         with threadpool_limits(1):
             finish_session(target.store, session, job.settings.association, job.settings.carving)

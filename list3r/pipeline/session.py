@@ -191,18 +191,17 @@ def add_chunks(
     plan: Plan,
     pool: ChunkPool,
     watch: Watch,
-    *,
-    library: bool = True,
     added: Callable[[ChunkResult], None] = lambda part: None,
 ) -> None:
     """Work on the chunks side by side and add them in order, with one thread, so that sums are those of any machine.
 
-    Without `library` they are only placed. `added` hears of every part that came into the memory.
+    Those of a later session are only placed. `added` hears of every part that came into the memory.
     Raises `SourceError` when more than half of the frames cannot be decoded.
     """
     if plan.first is None:
         return
     first, session, count = plan.first, plan.session, job.info.frame_count
+    later = session != store.sessions.all()[0].session_id
     bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
     watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
@@ -216,7 +215,7 @@ def add_chunks(
             bad.update(index for index, _ in found)
             check_bad_share(len(bad), count, found[0][1] if found else "")
             for part in (p for p in results if p.index not in known):
-                due = library and _library_due(len(store.chunks.all()) + 1, how)
+                due = not later and _library_due(len(store.chunks.all()) + 1, how)
                 add_chunk(store, session, part, joint, how, library=due, debug_dir=watch.debug_dir)
                 note_lost(store, session, part)
                 added(part)

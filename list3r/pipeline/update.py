@@ -75,7 +75,7 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     try:
         with chunk_pool(job) as pool:
             plan = plan_session(store, session, job, watch)
-            add_chunks(store, job, plan, pool, watch, library=False)
+            add_chunks(store, job, plan, pool, watch)
         _check_posed(store, session, job.info)
     except BaseException:
         with suppress(MemoryFileError):  # what was wrong first is told; the next update takes it back
