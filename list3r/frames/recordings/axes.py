@@ -55,10 +55,13 @@ def quarter_turns(T_world_cam: Sequence[Array]) -> int:
 def turns_in_gravity(T_world_cam: Sequence[Array]) -> int | None:
     """Return the quarter turns of `quarter_turns` where z can be up: the pictures stand on one of their sides.
 
-    None where they stand on none of them on average, or there are no poses: then z of the poses' world is not up.
+    None where they stand on none of them on average, or there are no poses: then z of the poses' world is not up. Nor
+    is it where pictures would lie on their side, but stand upright by y and more plainly so.
     """
     up = _mean_up(T_world_cam)
-    return int(np.argmax(up)) if up.max() > _LEAST_UPRIGHT else None
+    turns = int(np.argmax(up))
+    by_y = abs(float(np.mean([T[1, 1] for T in T_world_cam]))) if turns % 2 else 0.0
+    return turns if up[turns] > max(_LEAST_UPRIGHT, by_y) else None
 
 
 def _mean_up(T_world_cam: Sequence[Array]) -> Array:
