@@ -240,7 +240,7 @@ def test_workers_end_when_their_parent_is_ended(tmp_path: Path, how: signal.Sign
 def test_processes_that_were_started_before_serve_the_tasks() -> None:
     """What they do first may fail; of those that were started only as many are kept as there are tasks."""
     with OrderedPool(later, 3) as pool:
-        pool.start(die_of_nothing)
+        pool.start(die_of_nothing, 7)
         pool.keep(2)
         found = list(pool.map(range(5)))
     assert [number for number, _ in found] == list(range(5))
@@ -248,4 +248,4 @@ def test_processes_that_were_started_before_serve_the_tasks() -> None:
 
 
 def die_of_nothing(number: int) -> None:
-    raise OptionError(f"process {number} cannot get ready")
+    raise OptionError(f"number {number} cannot get ready")

@@ -240,7 +240,7 @@ def chunk_pool(job: Job) -> ChunkPool:
     chunks = min(settings.chunks, settings.video_map.chunks, key=lambda c: c.length - c.overlap)
     most = len(plan_chunks(job.info.frame_count, chunks))
     pool = OrderedPool(process_parts, min(usual_workers(settings) if asked is None else asked, most))
-    pool.start(partial(get_ready, settings))
+    pool.start(get_ready, settings)
     return pool
 
 

@@ -91,8 +91,8 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     return tuple(results)
 
 
-def get_ready(settings: BuildSettings, number: int) -> None:
-    """Import what chunks will need, in the process of that number. Weights are loaded with the first chunk."""
+def get_ready(settings: BuildSettings) -> None:
+    """Import what chunks will need. Weights are loaded with the first chunk."""
     import_model(settings.reconstruction)
     if settings.discovery == "learned":
         import_module("list3r.instances.learned.discovery")

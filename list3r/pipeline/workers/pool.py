@@ -83,12 +83,13 @@ class OrderedPool(Generic[Task, Result]):
         answer: Answer = self._outcome(self._submit(work, question))
         return answer
 
-    def start(self, work: Callable[[int], object]) -> None:
-        """Start all processes now and let each call a function with its number, such as one that imports what tasks
-        will need. Nothing waits for it, and what it raises is not told.
+    def start(self, work: Callable[[Question], object], question: Question) -> None:
+        """Start all processes now and let each call a function first, such as one that imports what tasks will need.
+
+        Nothing waits for it, and what it raises is not told.
         """
-        for number in range(self._workers):
-            self._submit(work, number)
+        for _ in range(self._workers):
+            self._submit(work, question)
 
     def keep(self, most: int) -> None:
         """Use so many processes at most from now on; end the last ones of those that run."""

@@ -177,7 +177,7 @@ class AdjustmentSettings:
     iterations: int = 30
     """Most of the last round;"""
     early_iterations: tuple[int, ...] = (5, 10)
-    """and of those before it, whose outliers go before they are worth more: the same poses to 0.01 mm as with 30."""
+    """and of those before it, which still hold outliers: poses are as near to the truth as with 30 (decision 0145)."""
     least_points: int = 12
     """Fewest points of a keyframe whose pose is believed."""
     mapping: MappingSettings = field(default_factory=MappingSettings)
