@@ -72,7 +72,8 @@ def drifted(T_world_cam: Array, settings: DriftSettings, seed: int) -> Array:
     rng = np.random.default_rng([seed, 17])
     count, steps = len(T_world_cam), np.diff(T_world_cam[:, :3, 3], axis=0)
     walk = np.cumsum(rng.standard_normal(count))
-    yaw = np.radians(settings.yaw_deg) * (walk - walk[0]) / max(abs(walk[-1] - walk[0]), 1e-9)
+    net = max(abs(walk[-1] - walk[0]), 3.0)  # of a heading that ends where it began any drift would be blown up
+    yaw = np.radians(settings.yaw_deg) * (walk - walk[0]) / net
     tilt = np.radians(settings.tilt_deg) * np.stack([_slow(rng, count), _slow(rng, count), np.zeros(count)], axis=1)
     tilt -= tilt[0]
     stretched = (1.0 + settings.share * rng.choice([-1.0, 1.0])) * steps
